@@ -28,8 +28,7 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.compiling import part
-from surfel_mapper.kernels.grouping import U
-from surfel_mapper.kernels.lanes import highest_match, WORDS
+from surfel_mapper.kernels.lanes import highest_match, num_used, place_of_half, WORDS
 from surfel_mapper.kernels.layout import KEY
 
 SEGMENT = 512
@@ -82,25 +81,6 @@ def home_of(hashed):
 def next_bucket(bucket):
     """Return the first entry of the next bucket, cyclically within the segment."""
     return (bucket & ~(SEGMENT - 1)) | ((bucket + BUCKET) & (SEGMENT - 1))
-
-
-@njit(cache=True, nogil=True, inline='always')
-def entries_of(bucket, buckets):
-    """Return the number of entries that a bucket holds."""
-    num = np.int64(0)
-    for place in range(U(BUCKET)):
-        num += buckets[U(bucket) + place] != 0
-    return num
-
-
-@njit(cache=True, nogil=True, inline='always')
-def place_of(row, bucket, buckets):
-    """Return the place of a row in a bucket, -1 if it is elsewhere."""
-    found = np.int64(-1)
-    for place in range(U(BUCKET)):
-        is_row = (buckets[U(bucket) + place] & LOW) == row + 1
-        found = max(found, np.int64(place) if is_row else np.int64(-1))
-    return found
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -174,10 +154,10 @@ def insert_entry(hashed, row, directory, buckets, held, depth):
     """
     bucket = first_bucket(hashed, directory, depth)
     held[bucket // SEGMENT] += 1
-    place = entries_of(bucket, buckets)
+    place = num_used(buckets, bucket)
     while place == BUCKET:
         bucket = next_bucket(bucket)
-        place = entries_of(bucket, buckets)
+        place = num_used(buckets, bucket)
     buckets[bucket + place] = (hashed << 32) | (row + 1)
 
 
@@ -193,11 +173,11 @@ def remove_entry(key, row, directory, buckets, held, depth):
     """Remove a row as ``remove_row`` does, for loops that unpacked the table before."""
     bucket = first_bucket(hash_key(key), directory, depth)
     held[bucket // SEGMENT] -= 1
-    place = place_of(row, bucket, buckets)
-    while place < 0:
+    place = place_of_half(buckets, bucket, row + 1)
+    while place == BUCKET:
         bucket = next_bucket(bucket)
-        place = place_of(row, bucket, buckets)
-    last = entries_of(bucket, buckets) - 1
+        place = place_of_half(buckets, bucket, row + 1)
+    last = num_used(buckets, bucket) - 1
     buckets[bucket + place] = buckets[bucket + last]
     buckets[bucket + last] = 0
     if last == BUCKET - 1:
@@ -216,7 +196,7 @@ def take_back(bucket, buckets):
     later = bucket
     while num == BUCKET:
         later = next_bucket(later)
-        num = entries_of(later, buckets)
+        num = num_used(buckets, later)
         for place in range(later, later + num):
             home = home_of((buckets[place] >> 32) & LOW)
             if (later - home) & (SEGMENT - 1) >= (later - bucket) & (SEGMENT - 1):

@@ -96,6 +96,23 @@ def highest_match(words, at, upper):
     return np.int64(lower[chosen >> np.uint64(HIGH_BITS) == np.uint64(upper)].max(initial=0))
 
 
+def num_used(words, at):
+    """Return how many of words[at : at + 8] are not 0, int64; the index is not checked."""
+    return np.int64(np.count_nonzero(words[int(at) : int(at) + WORDS]))
+
+
+def place_of_half(words, at, lower):
+    """
+    Return the first of words[at : at + 8] with a lower half, from 0, or 8.
+
+    words  (8 M,) int64; the index is not checked
+    at     int64
+    lower  int64 in [0, 2^32)
+    """
+    equal = words[int(at) : int(at) + WORDS] & _HALF == lower
+    return np.int64(equal.argmax() if equal.any() else WORDS)
+
+
 class Lanes(types.Type):
     """Eight words in vector registers; the type that compiled kernels give them."""
 
@@ -104,7 +121,7 @@ class Lanes(types.Type):
 
 
 _LANES = Lanes()
-_HALF_WORD, _WORD = ir.IntType(32), ir.IntType(64)
+_MASK, _HALF_WORD, _WORD = ir.IntType(WORDS), ir.IntType(32), ir.IntType(64)
 _VECTOR = ir.VectorType(_WORD, WORDS)
 
 
@@ -137,6 +154,16 @@ def _type_of_sum(context):
 @type_callable(highest_match)
 def _type_of_match(context):
     return lambda words, at, upper: types.int64
+
+
+@type_callable(num_used)
+def _type_of_number(context):
+    return lambda words, at: types.int64
+
+
+@type_callable(place_of_half)
+def _type_of_place(context):
+    return lambda words, at, lower: types.int64
 
 
 @lower_builtin(load_sums, types.Array, types.Integer)
@@ -183,6 +210,22 @@ def _emit_highest_match(context, builder, signature, arguments):
     name = 'llvm.vector.reduce.umax.v16i32'
     highest = cgutils.get_or_insert_function(builder.module, takes, name)
     return builder.zext(builder.call(highest, [builder.bitcast(lower, halves)]), _WORD)
+
+
+@lower_builtin(num_used, types.Array, types.Integer)
+def _emit_num_used(context, builder, signature, arguments):
+    words = _emit_load(context, builder, signature, arguments)
+    used = builder.icmp_unsigned('!=', words, _constant([0] * WORDS))
+    return builder.zext(builder.ctpop(builder.bitcast(used, _MASK)), _WORD)
+
+
+@lower_builtin(place_of_half, types.Array, types.Integer, types.Integer)
+def _emit_place_of_half(context, builder, signature, arguments):
+    words = _emit_load(context, builder, signature, arguments)
+    lower = builder.and_(words, _constant([_HALF] * WORDS))
+    equal = builder.icmp_unsigned('==', lower, _spread(builder, arguments[2]))
+    of_zero_too = ir.Constant(ir.IntType(1), 0)
+    return builder.zext(builder.cttz(builder.bitcast(equal, _MASK), of_zero_too), _WORD)
 
 
 def _address(context, builder, signature, arguments):

@@ -70,13 +70,16 @@ AHEAD = 16
 EARLY = 64
 """Number of voxels between the early prefetch of a row and its use."""
 
-BLOCK = 32
-"""Voxels looked up together: a block is hashed and its buckets prefetched two blocks before its
-use, its rows are found and prefetched one block before. Early prefetches of rows would take less
-time at best (0.85), but 1.5 times as long in some states of the processor."""
+HASHED, FOUND = 48, 16
+"""Number of voxels between the hash of a voxel or the search of its row, and its use. Each step
+prefetches what the next one reads. One voxel at a time: hashing and searching a block of 32 at
+once asked for more lines than the processor waits for, and took up to 1.4 times as long."""
 
-RING = 4 * BLOCK
-"""Voxels whose hashes and rows are kept from one block to the next."""
+RING = 64
+"""Number of voxels whose hashes and rows are kept, a power of two."""
+
+LAST = RING - 1
+"""Mask of a place in the ring; the remainder of a signed integer would take half of a look-up."""
 
 LATER = PRODUCT
 """Column of a free row: the row that is taken AHEAD new voxels later, to be prefetched, or -1."""
@@ -86,31 +89,22 @@ SLACK = 1.0 + 1e-9
 
 
 @njit(cache=True, nogil=True, inline='always')
-def look_up(block, start, keys, flat, directory, buckets, held, depth, hashes, likely):
+def look_ahead(place, keys, flat, directory, buckets, depth, hashes, likely):
     """
-    Find and prefetch the rows of the block of voxels after this one; hash the block after that.
+    Hash the voxel HASHED places ahead; find and prefetch the row of the one FOUND places ahead.
 
-    block   int64, first voxel of the block, from start - 2 BLOCK on
-    start   int64, first voxel of all
+    place   int64, from HASHED before the first voxel on
+    keys    (K,) int64, at least one
     flat    (R * 12,) int64, the rows
-    hashes  (RING,) int64, out: hash of voxel i at i % RING
+    hashes  (RING,) int64, in and out: hash of voxel i at i & LAST
     likely  (RING,) int64, out: a row with this hash, to be confirmed by its key; -1 if not found
     """
-    for i in range(block + 2 * BLOCK, min(block + 3 * BLOCK, len(keys))):
-        hashed = hash_key(keys[i])
-        hashes[i % RING] = hashed
-        bucket = first_bucket(hashed, directory, depth)
-        prefetch_early(buckets, bucket)
-    first, last = max(block + BLOCK, start), min(block + 2 * BLOCK, len(keys))
-    for i in range(first, last):
-        bucket = first_bucket(hashes[i % RING], directory, depth)
-        prefetch(buckets, bucket)
-        prefetch(held, bucket // SEGMENT)
-    for i in range(first, last):
-        row = likely_row(hashes[i % RING], directory, buckets, depth)
-        likely[i % RING] = row
-        if row >= 0:
-            prefetch_row(flat, row)
+    hashed = hash_key(keys[min(place + HASHED, len(keys) - 1)])
+    hashes[(place + HASHED) & LAST] = hashed
+    prefetch_early(buckets, first_bucket(hashed, directory, depth))
+    row = likely_row(hashes[(place + FOUND) & LAST], directory, buckets, depth)
+    likely[(place + FOUND) & LAST] = row
+    prefetch_row(flat, row)
 
 
 @kernel()
@@ -121,17 +115,17 @@ def find_rows(keys, rows, table, state, found):
     keys   (K,) int64
     found  (K,) int32, out: row, -1 if not found
     """
-    directory, buckets, held, _ = table
+    directory, buckets, _, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
-    hashes, likely = np.empty(RING, np.int64), np.empty(RING, np.int64)
-    for block in range(-2 * BLOCK, len(keys), BLOCK):
-        look_up(block, 0, keys, flat, directory, buckets, held, depth, hashes, likely)
-        for i in range(max(block, 0), min(block + BLOCK, len(keys))):
-            row = likely[i % RING]
-            if row >= 0 and rows[row, KEY] != keys[i]:
-                row = find_row(keys[i], rows, table, depth)
-            found[i] = row
+    hashes, likely = np.zeros(RING, np.int64), np.empty(RING, np.int64)
+    for place in range(-HASHED, len(keys)):
+        look_ahead(place, keys, flat, directory, buckets, depth, hashes, likely)
+        if place >= 0:
+            row = likely[place & LAST]
+            if row >= 0 and rows[row, KEY] != keys[place]:
+                row = find_row(keys[place], rows, table, depth)
+            found[place] = row
 
 
 @kernel()
@@ -152,35 +146,34 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, 
     directory, buckets, held, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
-    hashes, likely = np.empty(RING, np.int64), np.empty(RING, np.int64)
+    hashes, likely = np.zeros(RING, np.int64), np.empty(RING, np.int64)
     num_points = np.int64(0)
-    done = start
-    for block in range(start - 2 * BLOCK, len(keys), BLOCK):
-        look_up(block, start, keys, flat, directory, buckets, held, depth, hashes, likely)
-        for place in range(max(block, start), min(block + BLOCK, len(keys))):
-            key, hashed, row = keys[place], hashes[place % RING], likely[place % RING]
-            if row >= 0 and rows[row, KEY] != key:
-                row = find_row(key, rows, table, depth)
+    for place in range(start - HASHED, len(keys)):
+        look_ahead(place, keys, flat, directory, buckets, depth, hashes, likely)
+        if place < start:
+            continue
+        key, hashed, row = keys[place], hashes[place & LAST], likely[place & LAST]
+        if row >= 0 and rows[row, KEY] != key:
+            row = find_row(key, rows, table, depth)
+        if row < 0:
+            full = is_full(hashed, directory, held, depth)
+            if not full or makes_room(hashed, table, state):
+                row = take_row(rows, flat, state)
             if row < 0:
-                full = is_full(hashed, directory, held, depth)
-                if not full or makes_room(hashed, table, state):
-                    row = take_row(rows, flat, state)
-                if row < 0:
-                    state[POINTS] += num_points
-                    set_stamps(stamps, found[start:done], stamp)
-                    return done
-                for column in range(ROW):
-                    rows[row, column] = 0
-                rows[row, KEY] = key
-                insert_entry(hashed, row, directory, buckets, held, depth)
-                state[VOXELS] += 1
-            num_points += np.int64(count[place])
-            change_row(moments, view_weight, rows, row, place, 1)
-            found[place] = row
-            done += 1
+                state[POINTS] += num_points
+                set_stamps(stamps, found[start:place], stamp)
+                return place
+            for column in range(ROW):
+                rows[row, column] = 0
+            rows[row, KEY] = key
+            insert_entry(hashed, row, directory, buckets, held, depth)
+            state[VOXELS] += 1
+        num_points += np.int64(count[place])
+        change_row(moments, view_weight, rows, row, place, 1)
+        found[place] = row
     state[POINTS] += num_points
     set_stamps(stamps, found[start:], stamp)
-    return done
+    return len(keys)
 
 
 @njit(cache=True, nogil=True, inline='always')
