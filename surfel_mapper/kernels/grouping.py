@@ -20,7 +20,7 @@ from surfel_mapper.kernels.prefetch import prefetch
 CHUNK = 1024
 """Points processed at once: their keys and places stay in the first-level cache."""
 
-AHEAD = 16
+AHEAD = 32
 """Number of runs between the prefetch of a table entry and its use."""
 
 U = np.uint64

@@ -44,7 +44,7 @@ four pieces of BITS bits, x lowest, with a 1 as the highest: the point counts it
 VIEW_SCALE = 1 << 14
 """Length of the integer vectors that point from a voxel to the sensor."""
 
-# Columns of a row. A free row has a count of 0 and the next free row in KEY.
+# Columns of a row. A free row has a key of -1 and a count of 0.
 KEY = 0
 VIEW = 1
 """Sums of the views along x and y; the lower 16 bits are the count, its lower half first."""

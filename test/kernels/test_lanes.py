@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sums in lanes and the search of eight words against Python integers."""
+"""Sums in lanes, the search of eight words and columns of rows against Python integers."""
 
 from numba import njit
 import numpy as np
@@ -11,12 +11,15 @@ from surfel_mapper.kernels.lanes import (
     highest_match,
     load_sums,
     masked_sum,
+    num_used,
+    place_of_half,
     plus_place,
     store_sums,
+    transpose_rows,
     WIDEST,
     WORDS,
 )
-from surfel_mapper.kernels.layout import BITS, HIGH_BITS
+from surfel_mapper.kernels.layout import BITS, HIGH_BITS, ROW
 from test.kernels.modes import both
 
 HIGHEST = 65535
@@ -123,3 +126,54 @@ def test_every_word_of_the_eight_is_looked_at_and_no_other(call, place):
 @both
 def test_words_of_zero_match_zero_with_zero(call):
     assert call(search, np.zeros(WORDS, np.int64), 0, 0) == 0
+
+
+@njit
+def count(entries, first):
+    return num_used(entries, first)
+
+
+@njit
+def locate(entries, first, lower):
+    return place_of_half(entries, first, lower)
+
+
+@both
+@pytest.mark.parametrize('first', [0, 8, 24])
+def test_used_words_are_counted_whatever_their_bits(call, first):
+    rng = np.random.default_rng(first)
+    for _ in range(100):
+        entries = rng.choice(np.array([0, 0, 1, -1, 1 << 32, -(1 << 63)]), 4 * WORDS)
+        assert call(count, entries, first) == sum(map(bool, entries[first : first + WORDS]))
+
+
+@both
+@pytest.mark.parametrize('lower', [0, 1, 2**31, 2**32 - 1])
+def test_the_first_word_with_a_lower_half_is_found(call, lower):
+    rng = np.random.default_rng(lower)
+    found = set()
+    for _ in range(200):
+        lows = rng.choice([0, 1, 5, 9, 2**31, 2**32 - 1], 3 * WORDS).astype(np.uint64)
+        highs = rng.integers(0, 2**32, 3 * WORDS).astype(np.uint64)
+        entries = (highs << np.uint64(32) | lows).view(np.int64)
+        place = call(locate, entries, WORDS, lower)
+        assert place == [*lows[WORDS : 2 * WORDS].tolist(), lower].index(lower)
+        found.add(int(place))
+    assert found > {0, WORDS}
+
+
+@njit
+def transpose(words, offsets, first, columns):
+    transpose_rows(words, offsets, first, columns)
+
+
+@both
+def test_eight_rows_become_columns(call):
+    words = np.random.default_rng(4).integers(-(2**63), 2**63, 40 * ROW)
+    chosen = np.array([3, 0, 39, 7, 7, 12, 25, 1, 38, 2, 5, 4, 30, 11, 9, 10])
+    columns = np.zeros((ROW, 24), np.int64)
+    for first in (0, WORDS):
+        call(transpose, words, chosen * ROW, first, columns)
+    expected = words.reshape(-1, ROW)[chosen].T
+    assert columns[:, :16].tolist() == expected.tolist()
+    assert not columns[:, 16:].any()

@@ -11,19 +11,17 @@ decomposed with vector instructions.
 
 import math
 
+from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part
-from surfel_mapper.kernels.layout import (
-    KEY,
-    PRODUCT,
-)
+from surfel_mapper.kernels.lanes import transpose_rows, WORDS
+from surfel_mapper.kernels.layout import KEY, PRODUCT, ROW
+from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
 from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work
 from surfel_mapper.mapping.kernels.rows import (
     count_of,
-    prefetch_row,
-    prefetch_row_early,
     sum_of,
     view_of,
 )
@@ -64,28 +62,28 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     A single point or identical points: eigenvalues 0; normal, planarity and curvature nan.
     """
     position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs
-    moments = np.empty((MOMENTS, CHUNK))
-    scatter = np.empty((6, CHUNK))
+    offsets, columns = make_scratch()
+    moments, scatter = np.empty((MOMENTS, CHUNK)), np.empty((6, CHUNK))
     mean, values, normals = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((3, CHUNK))
+    shape = np.empty((2, CHUNK))
     work = make_work(CHUNK)
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
-        most = gather(rows, chosen, start, num, moments, num_points, voxel_index)
+        end = start + num
+        most = gather(rows, chosen, start, num, offsets, columns, moments)
+        write_index(columns, num, num_points[start:end], voxel_index[start:end])
         center(moments, num, mean, scatter)
         if most >= many:
-            center_exactly(rows, chosen, start, num, scatter)
-        place(mean, start, num, voxel_size, bits, voxel_index, position)
+            center_exactly(columns, num, scatter)
+        place(mean, num, voxel_size, bits, voxel_index[start:end], position[start:end])
         decompose_chunk(scatter, 0, num, work, values, normals)
-        derive_shape(values, num, moments, voxel_size / (1 << bits), planarity, curvature, start)
-        turn(normals, num, moments)
-        for i in range(num):
-            out = start + i
-            # a factor instead of a branch, which would be mispredicted half of the time
-            known = math.nan if math.isnan(planarity[out]) else 1.0
-            for axis in range(3):
-                normal[out, axis] = normals[axis, i] * known
-                eigenvalues[out, axis] = values[axis, i]
+        derive_shape(values, num, moments, voxel_size / (1 << bits), shape)
+        turn(normals, num, moments, shape)
+        planarity[start:end] = shape[0, :num]
+        curvature[start:end] = shape[1, :num]
+        write_vectors(normals, num, normal[start:end])
+        write_vectors(values, num, eigenvalues[start:end])
 
 
 @kernel(error_model='numpy')
@@ -96,52 +94,68 @@ def derive_covariances(rows, chosen, voxel_size, bits, covariance):
     rows, chosen, voxel_size, bits: as of derive_surfels
     covariance  (K, 6) float64, out: xx xy xz yy yz zz, m^2
     """
+    offsets, columns = make_scratch()
     moments = np.empty((MOMENTS, CHUNK))
     mean, scatter = np.empty((3, CHUNK)), np.empty((6, CHUNK))
-    num_points, voxel_index = np.empty(len(chosen), np.int64), np.empty((len(chosen), 3), np.int32)
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     unit = voxel_size / (1 << bits)
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
-        most = gather(rows, chosen, start, num, moments, num_points, voxel_index)
+        most = gather(rows, chosen, start, num, offsets, columns, moments)
         center(moments, num, mean, scatter)
         if most >= many:
-            center_exactly(rows, chosen, start, num, scatter)
+            center_exactly(columns, num, scatter)
         for i in range(num):
             scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
             for pair in range(6):
                 covariance[start + i, pair] = scatter[pair, i] * scale
 
 
+@njit(cache=True, nogil=True, inline='always')
+def make_scratch():
+    """Return the arrays of ``gather``: offsets, int64, and columns (CHUNK, ROW) int64."""
+    return np.empty(CHUNK + EARLY, np.int64), np.empty((ROW, CHUNK), np.int64).T
+
+
 @part()
-def gather(rows, chosen, start, num, moments, num_points, voxel_index):
+def gather(rows, chosen, start, num, offsets, columns, moments):
     """
     Gather the moments of num voxels from start on; return the largest count.
 
-    moments      (MOMENTS, CHUNK) float64, out
-    num_points   (K,) int64, out
-    voxel_index  (K, 3) int32, out
+    offsets  (CHUNK + EARLY,) int64, out: first words of the rows, and of those of the next chunk
+    columns  (CHUNK, ROW) int64, columns contiguous, out: the rows; some more up to a multiple of 8
+    moments  (MOMENTS, CHUNK) float64, out
     """
-    flat = rows.ravel()
+    flat, transposed, last = rows.ravel(), columns.T, len(chosen) - 1
+    for i in range(len(offsets)):
+        offsets[i] = np.int64(chosen[min(start + i, last)]) * ROW
+    for first in range(0, num, WORDS):
+        for i in range(first, first + WORDS):
+            prefetch_early(flat, offsets[i + EARLY])
+            prefetch_early(flat, offsets[i + EARLY] + ROW - 1)
+            prefetch(flat, offsets[i + AHEAD])
+            prefetch(flat, offsets[i + AHEAD] + ROW - 1)
+        transpose_rows(flat, offsets, first, transposed)
     most = np.int64(0)
     for i in range(num):
-        out = start + i
-        if out + EARLY < len(chosen):
-            prefetch_row_early(flat, np.int64(chosen[out + EARLY]))
-        if out + AHEAD < len(chosen):
-            prefetch_row(flat, np.int64(chosen[out + AHEAD]))
-        row = np.int64(chosen[out])
-        key, n = rows[row, KEY], count_of(rows, row)
-        voxel_index[out, 0], voxel_index[out, 1], voxel_index[out, 2] = unpack(key)
-        num_points[out] = n
+        n = count_of(columns, i)
         most = max(most, n)
         moments[N, i] = n
-        moments[V, i], moments[V + 1, i], moments[V + 2, i] = view_of(rows, row)
         for axis in range(3):
-            moments[S + axis, i] = sum_of(rows, row, axis)
+            moments[S + axis, i] = sum_of(columns, i, axis)
         for pair in range(6):
-            moments[P + pair, i] = rows[row, PRODUCT + pair]
+            moments[P + pair, i] = columns[i, PRODUCT + pair]
+        moments[V, i], moments[V + 1, i], moments[V + 2, i] = view_of(columns, i)
     return most
+
+
+@part()
+def write_index(columns, num, num_points, voxel_index):
+    """Write the numbers of points (num,) and the voxel indices (num, 3) of a chunk."""
+    for i in range(num):
+        num_points[i] = count_of(columns, i)
+    for i in range(num):
+        voxel_index[i, 0], voxel_index[i, 1], voxel_index[i, 2] = unpack(columns[i, KEY])
 
 
 @part(error_model='numpy')
@@ -173,51 +187,50 @@ def center(moments, num, mean, scatter):
 
 
 @part(error_model='numpy')
-def center_exactly(rows, chosen, start, num, scatter):
+def center_exactly(columns, num, scatter):
     """Compute the scatters as ``center`` does, in int64, which is exact for any count."""
     for i in range(num):
-        row = np.int64(chosen[start + i])
-        n = count_of(rows, row)
+        n = count_of(columns, i)
         inverse = 1.0 / n
         pair = 0
         for a in range(3):
-            sa = sum_of(rows, row, a)
+            sa = sum_of(columns, i, a)
             ca = np.int64(np.rint(sa * inverse))
             da = sa - n * ca
             for b in range(a, 3):
-                sb = sum_of(rows, row, b)
+                sb = sum_of(columns, i, b)
                 cb = np.int64(np.rint(sb * inverse))
                 db = sb - n * cb
-                about = rows[row, PRODUCT + pair] - ca * sb - cb * da
+                about = columns[i, PRODUCT + pair] - ca * sb - cb * da
                 scatter[pair, i] = about - np.float64(da) * np.float64(db) * inverse
                 pair += 1
 
 
 @part(error_model='numpy')
-def place(mean, start, num, voxel_size, bits, voxel_index, position):
-    """Convert the means of a chunk to positions, m, from row start on."""
+def place(mean, num, voxel_size, bits, voxel_index, position):
+    """Convert the means of a chunk to positions (num, 3), m."""
     cell = 1.0 / (1 << bits)
     half = (1 << (bits - 1)) + 0.5  # a lattice coordinate stands for the middle of its cell
     for i in range(num):
         for axis in range(3):
             inside = (mean[axis, i] + half) * cell
-            position[start + i, axis] = (voxel_index[start + i, axis] + inside) * voxel_size
+            position[i, axis] = (voxel_index[i, axis] + inside) * voxel_size
 
 
 @part(error_model='numpy')
-def derive_shape(values, num, moments, unit, planarity, curvature, start):
+def derive_shape(values, num, moments, unit, shape):
     """
     Compute planarity and curvature of a chunk; scale eigenvalues of scatter to covariance.
 
     values  (3, CHUNK) float64, in: eigenvalues of the scatter, lattice units; out: of the
             covariance, m^2
-    start   first row of the chunk in planarity and curvature
+    shape   (2, CHUNK) float64, out: planarity and curvature
     """
     for i in range(num):
         e0, e1, e2 = values[0, i], values[1, i], values[2, i]
         inverse = 1.0 / ((e0 + e1) + e2)
-        planarity[start + i] = 2.0 * (e1 - e0) * inverse  # 0 times inf is nan, as documented
-        curvature[start + i] = e0 * inverse
+        shape[0, i] = 2.0 * (e1 - e0) * inverse  # 0 times inf is nan, as documented
+        shape[1, i] = e0 * inverse
         scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
         values[0, i] = e0 * scale
         values[1, i] = e1 * scale
@@ -225,9 +238,9 @@ def derive_shape(values, num, moments, unit, planarity, curvature, start):
 
 
 @part()
-def turn(normals, num, moments):
+def turn(normals, num, moments, shape):
     """
-    Turn the normals (3, CHUNK) of a chunk towards the sensor.
+    Turn the normals (3, CHUNK) of a chunk towards the sensor; nan where the planarity is.
 
     If its direction is unknown or orthogonal to the normal, the component of largest magnitude
     becomes positive, the first of equal ones.
@@ -238,6 +251,19 @@ def turn(normals, num, moments):
         y_or_z = ny if abs(ny) >= abs(nz) else nz
         largest = nx if (abs(nx) >= abs(ny)) & (abs(nx) >= abs(nz)) else y_or_z
         side = -1.0 if (largest if towards == 0.0 else towards) < 0.0 else 1.0
+        side = math.nan if math.isnan(shape[0, i]) else side
         normals[0, i] = nx * side
         normals[1, i] = ny * side
         normals[2, i] = nz * side
+
+
+@part()
+def write_vectors(vectors, num, out):
+    """
+    Write the vectors of a chunk, (3, CHUNK), to rows (num, 3).
+
+    One array at a time, as every loop here: with several outputs the compiler would have to test
+    too many pairs of arrays for overlap, and does not vectorise the loop.
+    """
+    for i in range(num):
+        out[i, 0], out[i, 1], out[i, 2] = vectors[0, i], vectors[1, i], vectors[2, i]

@@ -150,5 +150,14 @@ def test_normals_turn_towards_the_sensor(call, normal, view, away):
     moments[V : V + 3, 0] = view
     normals = np.zeros((3, CHUNK))
     normals[:, 0] = normal
-    call(turn, normals, 1, moments)
+    call(turn, normals, 1, moments, np.zeros((2, CHUNK)))
     assert normals[:, 0].tolist() == [(-1.0 if away else 1.0) * value for value in normal]
+
+
+@both
+def test_normals_without_a_planarity_are_nan(call):
+    shape = np.array([[0.5, np.nan], [0.1, np.nan]])
+    normals = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
+    call(turn, normals, 2, np.zeros((MOMENTS, CHUNK)), shape)
+    np.testing.assert_array_equal(normals[:, 0], [0.0, 0.0, 1.0])
+    assert np.isnan(normals[:, 1]).all()
