@@ -56,7 +56,7 @@ from surfel_mapper.kernels.layout import (
     VIEW,
     VIEW_SCALE,
 )
-from surfel_mapper.kernels.prefetch import prefetch_early
+from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
 from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.mapping.kernels.rows import (
     add_to_row,
@@ -73,9 +73,9 @@ AHEAD = 16
 EARLY = 64
 """Number of voxels between the early prefetch of a row and its use."""
 
-HASHED, FOUND = 48, 16
-"""Number of voxels between the hash of a voxel or the search of its row, and its use. Each step
-prefetches what the next one reads. One voxel at a time: hashing and searching a block of 32 at
+HASHED, NEARER, FOUND = 48, 32, 16
+"""Number of voxels between the hash of a voxel, with an early prefetch of its bucket, the later one
+and the search of its row, and its use. One voxel at a time: hashing and searching a block of 32 at
 once asked for more lines than the processor waits for, and took up to 1.4 times as long."""
 
 RING = 64
@@ -106,9 +106,11 @@ def look_ahead(place, keys, flat, directory, buckets, depth, hashes, likely):
     hashed = hash_key(keys[min(place + HASHED, len(keys) - 1)])
     hashes[(place + HASHED) & LAST] = hashed
     prefetch_early(buckets, first_bucket(hashed, directory, depth))
+    nearer = hashes[(place + NEARER) & LAST]
+    prefetch(buckets, first_bucket(nearer, directory, depth))
     row = likely_row(hashes[(place + FOUND) & LAST], directory, buckets, depth)
     likely[(place + FOUND) & LAST] = row
-    prefetch_row(flat, row)
+    prefetch_row(flat, max(row, 0))  # an address before the slab may cost a walk of page tables
 
 
 @kernel()
@@ -193,7 +195,7 @@ def take_row(rows, flat, state):
     row = state[FREE_ROW]
     if row >= 0:
         state[FREE_ROW] = (rows[row, FREE] & LOW) - 1
-        prefetch_row(flat, (rows[row, FREE] >> HIGH_BITS) - 1)
+        prefetch_row(flat, max((rows[row, FREE] >> HIGH_BITS) - 1, 0))
     elif state[ROWS_USED] < len(rows):
         row = state[ROWS_USED]
         state[ROWS_USED] = row + 1
@@ -262,9 +264,10 @@ def remove_moments(
     state[VOXELS] -= num_emptied
     for i in range(num_emptied):
         if i + EARLY < num_emptied:
-            ahead = emptied[i + EARLY]
-            bucket = first_bucket(hash_key(keys[ahead]), directory, depth)
-            prefetch_early(buckets, bucket)
+            hashed = hash_key(keys[emptied[i + EARLY]])
+            prefetch_early(buckets, first_bucket(hashed, directory, depth))
+            hashed = hash_key(keys[emptied[i + AHEAD]])
+            prefetch(buckets, first_bucket(hashed, directory, depth))
         place = emptied[i]
         row = np.int64(found[place])
         remove_entry(keys[place], row, directory, buckets, num_held, depth)
