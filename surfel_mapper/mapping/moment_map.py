@@ -129,7 +129,7 @@ class MomentMap:
         """
         self._check_lattice(moments)
         self._check_counts(moments)  # before the sums, which overflow beyond its limit
-        if not moments.is_reduced:
+        if moments.num_reduced is None:
             check_possible(moments)
         self.version += 1
         rows = self._table.add(moments, self.version)
@@ -163,7 +163,7 @@ class MomentMap:
 
         """
         self._check_lattice(moments)
-        if not moments.is_reduced:
+        if moments.num_reduced is None:
             check_possible(moments)
         least = as_whole('min_points', min_points)
         missing, rows, fallen = self._table.remove(moments, self.version + 1, least)
@@ -339,7 +339,7 @@ class MomentMap:
                 f'moments of voxel size {moments.voxel_size_m:g} m, level {moments.level}; '
                 f'this map has {self.voxel_size_m:g} m, level {self.level}'
             )
-        if not moments.is_reduced:
+        if moments.num_reduced is None:
             check_arrays(moments)
         if moments.channel_names != self._channel_names:
             raise MapError(

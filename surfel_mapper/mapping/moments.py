@@ -74,9 +74,9 @@ class ScanMoments:
     rows : (K,) int32, optional
         Rows of the voxels in the map that inserted these moments last. Only hints, which save
         the look-up at removal: a map confirms each by the key in the row.
-    is_reduced : bool
-        Whether a Reducer made these moments of points, so that a map need not test if points can
-        have them. Copies with other values are not.
+    num_reduced : int, optional
+        Number of points of which a Reducer made these moments, so that a map need not test if
+        points can have them. None for others, copies with other values too.
 
     """
 
@@ -91,7 +91,7 @@ class ScanMoments:
     channels: npt.NDArray[np.int64] = None  # type: ignore[assignment]  # none: (K, 0)
     left_out: Mapping[str, int] = field(default_factory=dict)
     rows: npt.NDArray[np.int32] | None = field(default=None, init=False, repr=False)
-    is_reduced: bool = field(default=False, init=False, repr=False)
+    num_reduced: int | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Default to zero channels for every voxel; a map tests the arrays when it takes them."""
@@ -112,6 +112,8 @@ class ScanMoments:
     @property
     def num_points(self) -> int:
         """Number of points."""
+        if self.num_reduced is not None:
+            return self.num_reduced
         return int(self.count.sum(dtype=np.int64))
 
     @property

@@ -29,13 +29,12 @@ from surfel_mapper.mapping.channels import channel_names, quantised
 from surfel_mapper.mapping.coarsening import coarse_keys
 from surfel_mapper.mapping.kernels.reduction import (
     BEYOND,
-    look_back,
     NOT_FINITE,
+    pack_moments,
     reduce_points,
     sum_channels,
     TOO_FAR,
     TOO_NEAR,
-    unpack_sums,
 )
 from surfel_mapper.mapping.moments import ScanMoments
 
@@ -55,8 +54,14 @@ CAUSES = {
 """Causes why points are left out, and the rows in which the kernel counts them."""
 
 
+IDENTITY, UNKNOWN = np.eye(4), np.full(3, np.nan)
+"""Pose of points that are in the map frame, and place of an unknown sensor."""
+
+NO_LIMITS = np.array([0.0, np.inf])
+"""Squared limits of the range by default."""
+
 Quantisation = tuple[npt.NDArray[np.float64], float, npt.NDArray[np.float64]]
-"""Pose (3, 4), lattice units a metre, smallest and largest squared range (2,)."""
+"""Pose (4, 4), lattice units a metre, smallest and largest squared range (2,)."""
 
 
 class Scratch:
@@ -133,31 +138,23 @@ class Reducer:
         points = as_points(points)
         if columns is not None and not isinstance(columns, Mapping):
             raise TypeError(f'columns: a {type(columns).__name__}, expected arrays by name')
+        pose = IDENTITY
         if T_map_sensor is not None:
             check_rigid('T_map_sensor', T_map_sensor)
-        pose = np.eye(4) if T_map_sensor is None else np.asarray(T_map_sensor, np.float64)
-        seen_from = np.full(3, np.nan) if origin is None else as_numbers('origin', origin)
-        if seen_from.shape != (3,) or (origin is not None and not np.isfinite(seen_from).all()):
-            raise ValueError('origin: expected the finite position of the sensor, x y z')
+            pose = np.ascontiguousarray(T_map_sensor, np.float64)
         values = (
             quantised({} if columns is None else columns, self._columns, len(points))
             if self._columns
             else None
         )
-        limits = as_numbers('min_range_m, max_range_m', (min_range_m, max_range_m)).tolist()
-        if not all(isinstance(limit, float) and limit >= 0.0 for limit in limits):  # also nan
-            raise ValueError(
-                f'min_range_m {min_range_m!r}, max_range_m {max_range_m!r}, expected zero or more'
-            )
-        range_sq = np.array([limit * limit for limit in limits])
         scale = (1 << BITS) / self.voxel_size_m
-        quantisation = (np.ascontiguousarray(pose[:3]), scale, range_sq)
+        quantisation = (pose, scale, squared_limits(min_range_m, max_range_m))
+        seen_from = UNKNOWN if origin is None else as_origin(origin)
         try:
             scratch = self._idle.pop()
         except IndexError:  # all in use by other threads
             scratch = Scratch()
-        moments = self._moments(points.T, quantisation, scratch)
-        look_back(moments.key, np.ascontiguousarray(seen_from), self.voxel_size_m, moments.view)
+        moments = self._moments(points.T, quantisation, seen_from, scratch)
         if values is not None:
             if ENTRIES * len(moments) > len(scratch.table):
                 scratch.reserve(1 << len(moments).bit_length())
@@ -167,42 +164,45 @@ class Reducer:
             scratch.table.fill(-1)
             moments = replace(moments, channel_names=channel_names(self._columns), channels=sums)
         self._idle.append(scratch)
-        object.__setattr__(moments, 'is_reduced', True)
+        num_reduced = len(points) - sum(moments.left_out.values())
+        object.__setattr__(moments, 'num_reduced', num_reduced)
         return moments
 
     def _moments(
-        self, xyz: npt.NDArray[Any], quantisation: Quantisation, scratch: Scratch
+        self,
+        xyz: npt.NDArray[Any],
+        quantisation: Quantisation,
+        origin: npt.NDArray[np.float64],
+        scratch: Scratch,
     ) -> ScanMoments:
-        """Return the moments of points (3, N) without views; see SurfelMap.reduce."""
+        """Return the moments of points (3, N); see SurfelMap.reduce."""
         num_points, part = xyz.shape[1], WIDEST
         if num_points <= WIDEST:
             num = scratch.fill(xyz, quantisation)
             scratch.table.fill(-1)  # faster than visiting the scattered entries in use
-            left_out = scratch.left_out
+            left_out = scratch.left_out.tolist()
             moments = ScanMoments(
                 voxel_size_m=self.voxel_size_m,
-                key=scratch.keys[2 : num + 2].copy(),
+                key=np.empty(num, np.int64),
                 count=np.empty(num, np.int32),
                 total=np.empty((num, 3), np.int32),
                 product=np.empty((num, 6), np.int64),
                 view=np.empty((num, 3), np.int16),
-                left_out={
-                    cause: int(left_out[row]) for cause, row in CAUSES.items() if left_out[row]
-                },
+                left_out={cause: left_out[row] for cause, row in CAUSES.items() if left_out[row]},
             )
-            sums = scratch.sums[1 : num + 1]
-            largest = unpack_sums(sums, moments.count, moments.total, moments.product)
+            keys, sums = scratch.keys[2 : num + 2], scratch.sums[1 : num + 1]
+            largest = pack_moments(keys, sums, origin, self.voxel_size_m, moments.arrays)
             if largest <= FULL:
                 return moments
             part = max(FULL, num_points * FULL // (2 * largest))  # half full on average
         starts = range(0, num_points, part)
-        parts = [self._moments(xyz[:, i : i + part], quantisation, scratch) for i in starts]
-        return summed_moments(parts)
+        parts = (xyz[:, i : i + part] for i in starts)
+        return summed_moments([self._moments(p, quantisation, origin, scratch) for p in parts])
 
 
 def summed_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
     """
-    Return the moments of the points of all parts of a scan, without views.
+    Return the moments of the points of all parts of a scan.
 
     Raises
     ------
@@ -225,6 +225,8 @@ def summed_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
             f'{largest} points in one voxel of one scan; '
             f'at most {MAX_SCAN_COUNT}: use smaller voxels or split the scan'
         )
+    view = np.empty((len(key), 3), np.int16)  # equal in all parts
+    view[rows] = np.concatenate([part.view for part in parts])
     causes = [cause for cause in CAUSES if any(cause in part.left_out for part in parts)]
     return replace(
         parts[0],
@@ -232,7 +234,7 @@ def summed_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
         count=count.astype(np.int32),
         total=total if largest > FULL else total.astype(np.int32),
         product=summed('product'),
-        view=np.empty((len(key), 3), np.int16),
+        view=view,
         left_out={cause: sum(part.left_out.get(cause, 0) for part in parts) for cause in causes},
     )
 
@@ -247,12 +249,36 @@ def within(
     return np.asarray(np.isfinite(range_sq) & (range_sq >= min_range_m**2) & (range_sq <= far_sq))
 
 
+def squared_limits(min_range_m: float, max_range_m: float) -> npt.NDArray[np.float64]:
+    """Return the squares of the limits of the range; ValueError unless they are zero or more."""
+    if min_range_m == 0.0 and max_range_m == math.inf:
+        return NO_LIMITS
+    limits = as_numbers('min_range_m, max_range_m', (min_range_m, max_range_m)).tolist()
+    if not all(isinstance(limit, float) and limit >= 0.0 for limit in limits):  # also nan
+        raise ValueError(
+            f'min_range_m {min_range_m!r}, max_range_m {max_range_m!r}, expected zero or more'
+        )
+    return np.array([limit * limit for limit in limits])
+
+
+def as_origin(origin: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return the position of the sensor as the kernels take it; ValueError if it is none."""
+    place = np.ascontiguousarray(as_numbers('origin', origin))
+    if place.shape != (3,) or not all(map(math.isfinite, place.tolist())):
+        raise ValueError('origin: expected the finite position of the sensor, x y z')
+    return place
+
+
 def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
     """
     Return points as the kernels take them: (N, 3) float32 or float64 in Fortran order.
 
     Arrays that fulfil this and are writeable are not copied.
     """
+    if type(points) is np.ndarray and points.dtype == np.float32 and points.ndim == 2:
+        flags = points.flags
+        if points.shape[1] == 3 and flags.f_contiguous and flags.aligned and flags.writeable:
+            return points
     array = as_array('points', points)
     if array.dtype.names:  # Surfels, or a structured array
         columns = ', '.join(array.dtype.names[:4])

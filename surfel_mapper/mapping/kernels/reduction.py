@@ -53,7 +53,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     Sum the points of a scan by voxel; return the number of voxels, or -1 if they may not fit.
 
     xyz       (3, N) float32 or float64, sensor frame, m
-    pose      (3, 4) float64, takes points of the sensor frame to the map frame
+    pose      (3, 4) or (4, 4) float64, takes points of the sensor frame to the map frame
     scale     float64, 65536 / voxel size
     range_sq  (2,) float64, m^2: smallest and largest squared distance from the sensor
     scratch   table (B,) int32, B a power of two, all -1; out: row of each key by hash;
@@ -141,7 +141,25 @@ def reason(x, y, z, range_sq):
     return TOO_FAR if distance_sq > range_sq[1] else BEYOND
 
 
-@kernel()
+@kernel(error_model='numpy')
+def pack_moments(keys, sums, origin, voxel_size, moments):
+    """
+    Write the moments of a scan; return the largest count.
+
+    keys        (K,) int64, as reduce_points leaves them
+    sums        (K, WORDS) int64
+    origin      (3,) float64, the sensor in the map frame, m; nan if unknown
+    voxel_size  float64, m
+    moments     key (K,) int64, count (K,) int32, total (K, 3) int32, product (K, 6) int64,
+                view (K, 3) int16, out
+    """
+    key, count, total, product, view = moments
+    key[:] = keys
+    look_back(keys, origin, voxel_size, view)
+    return unpack_sums(sums, count, total, product)
+
+
+@part()
 def unpack_sums(sums, count, total, product):
     """
     Unpack the sums of a scan, about the centres of the voxels; return the largest count.
@@ -171,7 +189,7 @@ def unpack_sums(sums, count, total, product):
     return largest
 
 
-@kernel(error_model='numpy')
+@part(error_model='numpy')
 def look_back(keys, origin, voxel_size, view):
     """
     Compute the direction from each voxel to the sensor.
