@@ -88,7 +88,7 @@ def share(work: Callable[[slice], object], num_rows: int, threads: int) -> None:
     Do the work on all rows, with the help of idle threads of the pool.
 
     The calling thread takes parts until none is left, so it never waits for a thread that is busy
-    with other work, only for parts that another thread has begun.
+    with other work, only for parts that another thread has begun, also if its own part fails.
     """
     helpers = pool(threads)
     if helpers is None:
@@ -101,7 +101,9 @@ def share(work: Callable[[slice], object], num_rows: int, threads: int) -> None:
             work(part)
 
     helping = [helpers.submit(take_parts) for _ in range(threads - 1)]
-    take_parts()
-    for helper in helping:
-        if not helper.cancel():
-            helper.result()
+    try:
+        take_parts()
+    finally:
+        for helper in helping:
+            if not helper.cancel():
+                helper.result()

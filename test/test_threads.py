@@ -15,7 +15,13 @@ import numpy as np
 import pytest
 
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.threads import BACKGROUND_NICE, real_time_threads, split, yield_to_others
+from surfel_mapper.threads import (
+    BACKGROUND_NICE,
+    real_time_threads,
+    share,
+    split,
+    yield_to_others,
+)
 
 ROOT = Path(__file__).parents[1]
 
@@ -43,6 +49,23 @@ def test_every_row_is_in_one_part():
     for num_rows in range(7):
         rows = [row for part in split(num_rows, 3) for row in range(num_rows)[part]]
         assert rows == list(range(num_rows))
+
+
+def test_a_failed_part_ends_the_work_of_all_threads():
+    begun, ended, may_end = threading.Event(), threading.Event(), threading.Event()
+
+    def work(part):
+        if threading.current_thread() is not threading.main_thread():
+            begun.set()
+            may_end.wait(10.0)
+            ended.set()
+        elif begun.wait(10.0):
+            threading.Timer(0.05, may_end.set).start()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        share(work, 100, 2)
+    assert ended.is_set()
 
 
 def test_no_thread_at_all_is_refused():

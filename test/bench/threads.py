@@ -39,6 +39,9 @@ TURN = 20
 
 Turn = Sequence[tuple[int, RawCloud]]
 
+Poses = Sequence[Sequence[tuple[int, Any, Any]]]
+"""Of each scan of a turn: stamps, positions and orientations of the base."""
+
 
 class ByCalls(Ours):
     """The direct calls, by one thread or two."""
@@ -51,7 +54,11 @@ class ByCalls(Ours):
         self._street = street
         self._helper = pool(threads)
 
-    def drive(self, turn: Turn) -> None:
+    def poses(self, turn: Turn) -> Poses:
+        """Return none: the moments are made at the poses of the street."""
+        return [[] for _ in turn]
+
+    def drive(self, turn: Turn, _: Poses) -> None:
         """Map some scans."""
         for moments in self._ahead(turn) if self._helper else map(self._moments, turn):
             self.put(moments)
@@ -96,14 +103,21 @@ class ByMapper:
         mount = self._drive.base_to_sensor
         self._mapper.add_pose(BASE, SENSOR, 0, mount[:3], mount[3:], static=True)
 
-    def drive(self, turn: Turn) -> None:
+    def poses(self, turn: Turn) -> Poses:
+        """Return the poses between which the scans lie; simulating them is not mapping."""
+        stamps = [to_scan(message).stamp_ns for _, message in turn]
+        before_ns = round(SWEEP_S * 1.2e9)
+        return [[(ns, *self._drive.pose(ns)) for ns in (s - before_ns, s)] for s in stamps]
+
+    def drive(self, turn: Turn, poses: Poses) -> None:
         """Map some scans."""
         num = 0
-        for left, (_, message) in enumerate(turn, 1 - len(turn)):
-            scan = to_scan(message)
-            for stamp_ns in (scan.stamp_ns - round(SWEEP_S * 1.2e9), scan.stamp_ns):
-                self._mapper.add_pose(ODOM, BASE, stamp_ns, *self._drive.pose(stamp_ns))
-            self._mapper.add_scan(scan)
+        for left, ((_, message), of_scan) in enumerate(
+            zip(turn, poses, strict=True), 1 - len(turn)
+        ):
+            for pose in of_scan:
+                self._mapper.add_pose(ODOM, BASE, *pose)
+            self._mapper.add_scan(to_scan(message))
             num += sum(1 for _ in self._mapper.insert_ready(more_follows=left < 0))
         if num != len(turn):
             raise RuntimeError(f'{num} of {len(turn)} scans mapped')
@@ -167,8 +181,9 @@ def compared(
 def in_turn(maps: Sequence[ByCalls | ByMapper], turn: Turn, *, reverse: bool) -> list[float]:
     """Give some scans to all maps, one after the other; return ms a scan of each."""
     times = [0.0] * len(maps)
+    poses = maps[0].poses(turn)
     for place in sorted(range(len(maps)), reverse=reverse):
         start = perf_counter()
-        maps[place].drive(turn)
+        maps[place].drive(turn, poses)
         times[place] = (perf_counter() - start) * 1e3 / len(turn)
     return times
