@@ -84,8 +84,9 @@ def normalise(scatter, start, num, deviators, sizes):
 
     deviators  (6, num), out: B of trace 0 and |B|^2 = 6; for a multiple of the identity, the one
                with the normal z
-    sizes      (3, num), out: trace, spread (the factor taken out of B), and the factor that undoes
-               the scaling of tiny or huge matrices, whose squares and cubes would leave float64
+    sizes      (3, num), out: mean eigenvalue, spread (the factor taken out of B), and the factor
+               that undoes the scaling of tiny or huge matrices, whose squares and cubes would
+               leave float64
     """
     for i in range(num):
         at = start + i
@@ -109,7 +110,7 @@ def normalise(scatter, start, num, deviators, sizes):
         deviators[3, i] = 1.0 if ball else byy * inverse
         deviators[4, i] = ayz * inverse
         deviators[5, i] = -2.0 if ball else bzz * inverse
-        sizes[0, i], sizes[1, i], sizes[2, i] = trace, (0.0 if ball else spread), back
+        sizes[0, i], sizes[1, i], sizes[2, i] = mean, (0.0 if ball else spread), back
 
 
 @part(error_model='numpy')
@@ -192,9 +193,9 @@ def deflate(deviators, roots, vectors, num, planes):
 def write_eigenvalues(sizes, roots, planes, start, num, eigenvalues):
     """Scale the three eigenvalues back, in ascending order."""
     for i in range(num):
-        trace, spread, back = sizes[0, i], sizes[1, i], sizes[2, i]
+        mean, spread, back = sizes[0, i], sizes[1, i], sizes[2, i]
         t, radius = roots[i], planes[0, i]
-        mean, noise = trace / 3.0, NOISE * trace
+        noise = 3.0 * NOISE * mean
         low, high = -0.5 * t - radius, -0.5 * t + radius
         e0 = mean + spread * (t if t < 0.0 else low)
         e1 = mean + spread * (low if t < 0.0 else high)
