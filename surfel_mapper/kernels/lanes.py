@@ -100,7 +100,7 @@ def highest_match(words, at, upper):
 
 
 def num_used(words, at):
-    """Return how many of words[at : at + 8] are not 0, int64; the index is not checked."""
+    """Return the number of words[at : at + 8] that are not 0; the index is not checked."""
     return np.int64(np.count_nonzero(words[int(at) : int(at) + WORDS]))
 
 

@@ -171,7 +171,7 @@ class Inserter:
         return WarmUpSteps([prepare, *first_scan, self.layers.warm_up], every_scan, rare)
 
     def scans_ahead(self, config: Config) -> int:
-        """Return how many scans another thread prepares while the one before is inserted."""
+        """Return the number of scans that another thread prepares before they are inserted."""
         runs_ahead = config.map.mode != 'frozen' and self.preparation.runs_ahead()
         return self._reduction.scans_ahead if runs_ahead else 0
 

@@ -40,7 +40,7 @@ TURN = 20
 Turn = Sequence[tuple[int, RawCloud]]
 
 Poses = Sequence[Sequence[tuple[int, Any, Any]]]
-"""Of each scan of a turn: stamps, positions and orientations of the base."""
+"""Stamps, positions and orientations of the base, by scan of a turn."""
 
 
 class ByCalls(Ours):

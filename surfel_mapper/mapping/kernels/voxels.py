@@ -74,9 +74,9 @@ EARLY = 64
 """Number of voxels between the early prefetch of a row and its use."""
 
 HASHED, NEARER, FOUND = 48, 32, 16
-"""Number of voxels between the hash of a voxel, with an early prefetch of its bucket, the later one
-and the search of its row, and its use. One voxel at a time: hashing and searching a block of 32 at
-once asked for more lines than the processor waits for, and took up to 1.4 times as long."""
+"""Number of voxels between the hash of a voxel, with an early prefetch of its bucket, the later
+prefetch, the search of its row, and its use. One voxel at a time: blocks of 32 asked for more
+lines at once than the processor waits for, and took up to 1.4 times as long."""
 
 RING = 64
 """Number of voxels whose hashes and rows are kept, a power of two."""
