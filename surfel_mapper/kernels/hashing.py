@@ -240,7 +240,7 @@ def split_segment(hashed, table, state):
     for place in range(SEGMENT):
         entry = entries[place]
         if entry != 0:
-            insert_row((entry >> 32) & LOW, (entry & LOW) - 1, table, depth)
+            insert_entry((entry >> 32) & LOW, (entry & LOW) - 1, directory, buckets, held, depth)
     return True
 
 

@@ -73,12 +73,13 @@ AHEAD = 16
 EARLY = 64
 """Number of voxels between the early prefetch of a row and its use."""
 
-HASHED, NEARER, FOUND = 48, 32, 16
-"""Number of voxels between the hash of a voxel, with an early prefetch of its bucket, the later
-prefetch, the search of its row, and its use. One voxel at a time: blocks of 32 asked for more
-lines at once than the processor waits for, and took up to 1.4 times as long."""
+HASHED, EARLIER, NEARER, FOUND = 64, 48, 32, 16
+"""Number of voxels between the steps of a look-up and the use of its row: the hash, with a prefetch
+of its entry in the directory, early and later prefetch of the bucket, search of the row. One voxel
+at a time: blocks of 32 asked for more lines at once than the processor waits for, and took up to
+1.4 times as long."""
 
-RING = 64
+RING = 2 * HASHED
 """Number of voxels whose hashes and rows are kept, a power of two."""
 
 LAST = RING - 1
@@ -105,8 +106,9 @@ def look_ahead(place, keys, flat, directory, buckets, depth, hashes, likely):
     """
     hashed = hash_key(keys[min(place + HASHED, len(keys) - 1)])
     hashes[(place + HASHED) & LAST] = hashed
-    prefetch_early(buckets, first_bucket(hashed, directory, depth))
-    nearer = hashes[(place + NEARER) & LAST]
+    prefetch(directory, hashed >> (32 - depth))
+    earlier, nearer = hashes[(place + EARLIER) & LAST], hashes[(place + NEARER) & LAST]
+    prefetch_early(buckets, first_bucket(earlier, directory, depth))
     prefetch(buckets, first_bucket(nearer, directory, depth))
     row = likely_row(hashes[(place + FOUND) & LAST], directory, buckets, depth)
     likely[(place + FOUND) & LAST] = row
@@ -263,11 +265,13 @@ def remove_moments(
     set_stamps(stamps, found, stamp)
     state[VOXELS] -= num_emptied
     for i in range(num_emptied):
-        if i + EARLY < num_emptied:
-            hashed = hash_key(keys[emptied[i + EARLY]])
-            prefetch_early(buckets, first_bucket(hashed, directory, depth))
-            hashed = hash_key(keys[emptied[i + AHEAD]])
-            prefetch(buckets, first_bucket(hashed, directory, depth))
+        if i + HASHED < num_emptied:
+            hashed = hash_key(keys[emptied[i + HASHED]])
+            prefetch(directory, hashed >> (32 - depth))
+            earlier = hash_key(keys[emptied[i + EARLIER]])
+            prefetch_early(buckets, first_bucket(earlier, directory, depth))
+            nearer = hash_key(keys[emptied[i + NEARER]])
+            prefetch(buckets, first_bucket(nearer, directory, depth))
         place = emptied[i]
         row = np.int64(found[place])
         remove_entry(keys[place], row, directory, buckets, num_held, depth)
