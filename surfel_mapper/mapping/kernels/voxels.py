@@ -74,10 +74,10 @@ EARLY = 64
 """Number of voxels between the early prefetch of a row and its use."""
 
 HASHED, EARLIER, NEARER, FOUND = 64, 48, 32, 16
-"""Number of voxels between the steps of a look-up and the use of its row: the hash, with a prefetch
-of its entry in the directory, early and later prefetch of the bucket, search of the row. One voxel
-at a time: blocks of 32 asked for more lines at once than the processor waits for, and took up to
-1.4 times as long."""
+"""Number of voxels between the steps of a look-up and the use of its row: hash, with a prefetch of
+its entry in the directory; early and later prefetch of the bucket; search of the row. One voxel at
+a time: blocks of 32 asked for more lines at once than the processor waits for, and took up to 1.4
+times as long."""
 
 RING = 2 * HASHED
 """Number of voxels whose hashes and rows are kept, a power of two."""
