@@ -90,7 +90,7 @@ def test_a_stopped_replay_writes_the_scans_so_far(bag, tmp_path):
         stopped=lambda: len(done) >= 3,
     )
     assert result.summary['interrupted']
-    assert 3 <= result.summary['scans']['mapped'] <= 4  # one may be reduced ahead
+    assert 3 <= result.summary['scans']['mapped'] <= 5  # two may be reduced ahead
 
     with pytest.raises(MapError, match='stopped before a scan was mapped'):
         replay(bag, output=tmp_path / 'none', stopped=lambda: True)
