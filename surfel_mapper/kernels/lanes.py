@@ -1,26 +1,24 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Eight words of 64 bits in vector registers: sums of a voxel, a bucket, and columns of eight rows.
+Eight words of 64 bits, a line of the cache, in vector registers: sums of a voxel, and a bucket.
 
 A reduction needs ten sums of each voxel of a scan: count, places (3) and products of places (6).
 Packed into eight words they fill one cache line, which one instruction reads and one writes where
 registers have 512 bits, two or four elsewhere. Ten sums in float64 would take two lines and ten
 instructions each.
 
-    word 0        sum of z << 32 | sum of x, with x, y, z in [0, 65536)
-    word 1        count << 32 | sum of y
+    word 0        count << 40 | sum of x, with x, y, z in [0, 65536)
+    word 1        sum of z << 32 | sum of y
     words 2 to 7  sums of xx, xy, xz, yy, yz, zz
 
-All are exact up to FULL points. With more, up to WIDEST, the upper half of word 1 is the count or
-slightly more, so that such voxels are noticed. A place arrives in one word, as quantise writes it.
-It is spread over all lanes and shifted to the factors of the products.
+All are exact up to FULL points. The count is exact up to WIDEST, so that voxels with more than
+FULL points are noticed. A place arrives in two words too, as quantise writes it. Both are spread
+over all lanes and shifted to the factors of the products; taking x, y and z apart and collecting
+them in a register makes adding twice as long.
 
 A bucket of the hash table of a map has eight entries. Compilers turn the loop over them into a
 chain of 16 conditional moves, and a look-up takes 1.2 times as long.
-
-Surfels are derived from columns of the rows of a map, eight rows at once. Exchanging blocks of
-words between rows takes three quarters of the time of moving each word to its column.
 
 Interpreted, the functions work on arrays; compiled, the sums are a type of their own. Compilers do
 not find these instructions in loops, so they are spelled in the language of LLVM here, as are
@@ -35,7 +33,7 @@ from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 import numpy as np
 
-from surfel_mapper.kernels.layout import BITS, HIGH_BITS, ROW
+from surfel_mapper.kernels.layout import HIGH_BITS
 
 WORDS = 8
 """Words of the sums of a voxel, and entries of a bucket."""
@@ -44,19 +42,16 @@ FULL = (1 << 16) - 1
 """Number of points of a voxel up to which the sums are exact."""
 
 WIDEST = (1 << 23) - 1
-"""Number of points of a voxel up to which the count does not overflow."""
+"""Number of points of a voxel up to which the count is exact."""
 
-_PRODUCTS = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
-"""Factors of words 2 to 7, as axes."""
+_X, _Y, _Z = (0, 0), (1, 0), (1, HIGH_BITS)
+"""Coordinates of a place: the word that holds it, and the bits below it."""
+
+_PRODUCTS = (_X, _X), (_X, _Y), (_X, _Z), (_Y, _Y), (_Y, _Z), (_Z, _Z)
+"""Factors of words 2 to 7."""
 
 _HALF = (1 << HIGH_BITS) - 1
 """Mask of the lower half of a word."""
-
-_Z_AND_X = ((1 << BITS) - 1) * (1 + (1 << HIGH_BITS))
-"""Mask of the pieces of a place that word 0 sums."""
-
-_ONE_AND_Y = (1 << HIGH_BITS) + (1 << BITS) - 1
-"""Mask of those that word 1 sums, of the place moved by a piece."""
 
 
 def load_sums(words, at):
@@ -79,11 +74,11 @@ def masked_sum(sums, mask, others):
     return (sums & mask) + others
 
 
-def plus_place(sums, place):
-    """Return sums with one point more; its place as an int64, see kernels/layout.py."""
-    x, y, z, one = (int(place) >> axis * BITS & (1 << BITS) - 1 for axis in range(4))
-    products = [(x, y, z)[a] * (x, y, z)[b] for a, b in _PRODUCTS]
-    return sums + np.array([z << HIGH_BITS | x, one << HIGH_BITS | y, *products])
+def plus_place(sums, first, second):
+    """Return sums with one point more; its place in two int64 words, see kernels/layout.py."""
+    words = int(first), int(second)
+    factors = [[words[word] >> below & _HALF for word, below in pair] for pair in _PRODUCTS]
+    return sums + np.array([*words, *(a * b for a, b in factors)])
 
 
 def highest_match(words, at, upper):
@@ -116,20 +111,6 @@ def place_of_half(words, at, lower):
     return np.int64(equal.argmax() if equal.any() else WORDS)
 
 
-def transpose_rows(words, offsets, first, columns):
-    """
-    Write eight rows of ROW words as columns; no index is checked.
-
-    words    (R * ROW,) int64
-    offsets  (N,) int64, first word of each row
-    first    int64, the first of the eight in offsets and columns
-    columns  (ROW, N) int64, out
-    """
-    for row in range(int(first), int(first) + WORDS):
-        at = int(offsets[row])
-        columns[:, row] = words[at : at + ROW]
-
-
 class Lanes(types.Type):
     """Eight words in vector registers; the type that compiled kernels give them."""
 
@@ -139,7 +120,7 @@ class Lanes(types.Type):
 
 _LANES = Lanes()
 _MASK, _HALF_WORD, _WORD = ir.IntType(WORDS), ir.IntType(32), ir.IntType(64)
-_VECTOR, _HALF_VECTOR = ir.VectorType(_WORD, WORDS), ir.VectorType(_WORD, WORDS // 2)
+_VECTOR = ir.VectorType(_WORD, WORDS)
 
 
 @register_model(Lanes)
@@ -165,7 +146,7 @@ def _type_of_masked_sum(context):
 
 @type_callable(plus_place)
 def _type_of_sum(context):
-    return lambda sums, place: _LANES
+    return lambda sums, first, second: _LANES
 
 
 @type_callable(highest_match)
@@ -181,11 +162,6 @@ def _type_of_number(context):
 @type_callable(place_of_half)
 def _type_of_place(context):
     return lambda words, at, lower: types.int64
-
-
-@type_callable(transpose_rows)
-def _type_of_transposed(context):
-    return lambda words, offsets, first, columns: types.none
 
 
 @lower_builtin(load_sums, types.Array, types.Integer)
@@ -205,18 +181,21 @@ def _emit_masked_sum(context, builder, signature, arguments):
     return builder.add(builder.and_(sums, _spread(builder, mask)), others)
 
 
-@lower_builtin(plus_place, Lanes, types.int64)
+@lower_builtin(plus_place, Lanes, types.int64, types.int64)
 def _emit_plus_place(context, builder, signature, arguments):
-    sums, place = arguments
-    spread = _spread(builder, place)
-    first, second = (
-        builder.lshr(spread, _constant([BITS * axis for axis in (0, 1, *axes)]))
-        for axes in zip(*_PRODUCTS, strict=True)
-    )
-    factor = _constant([0, 0, *[(1 << BITS) - 1] * len(_PRODUCTS)])
-    products = builder.mul(builder.and_(first, factor), builder.and_(second, factor))
-    halves = _constant([_Z_AND_X, _ONE_AND_Y, *[0] * len(_PRODUCTS)])
-    return builder.add(sums, builder.or_(products, builder.and_(first, halves)))
+    sums, first, second = arguments
+    place = ir.Constant(ir.VectorType(_WORD, 2), ir.Undefined)
+    place = builder.insert_element(place, first, _HALF_WORD(0))
+    place = builder.insert_element(place, second, _HALF_WORD(1))
+    lower_halves = _constant([_HALF] * WORDS)
+    factors = []
+    for coordinates in zip(*_PRODUCTS, strict=True):
+        words, below = zip(_X, _Y, *coordinates, strict=True)  # the first two lanes are not used
+        spread = builder.shuffle_vector(place, place, _indices(words))
+        factors.append(builder.and_(builder.lshr(spread, _constant(below)), lower_halves))
+    spread = builder.shuffle_vector(place, place, _indices([0, 1] * (WORDS // 2)))
+    chosen = _indices([0, 1, *range(WORDS + 2, 2 * WORDS)])
+    return builder.add(sums, builder.shuffle_vector(spread, builder.mul(*factors), chosen))
 
 
 @lower_builtin(highest_match, types.Array, types.Integer, types.Integer)
@@ -250,64 +229,14 @@ def _emit_place_of_half(context, builder, signature, arguments):
     return builder.zext(builder.cttz(builder.bitcast(equal, _MASK), of_zero_too), _WORD)
 
 
-@lower_builtin(transpose_rows, types.Array, types.Array, types.Integer, types.Array)
-def _emit_transpose_rows(context, builder, signature, arguments):
-    words_type, offsets_type, _, columns_type = signature.args
-    words, offsets, first, columns = arguments
-    wide, narrow = [], []  # words 0 to 7 of each row, words 8 to 11
-    for row in range(WORDS):
-        index = [builder.add(first, _WORD(row))]
-        at = builder.load(_pointer(context, builder, offsets_type, offsets, index, _WORD))
-        address = _pointer(context, builder, words_type, words, [at], _VECTOR)
-        wide.append(builder.load(address, align=8))
-        at = builder.add(at, _WORD(WORDS))
-        address = _pointer(context, builder, words_type, words, [at], _HALF_VECTOR)
-        narrow.append(builder.load(address, align=8))
-    paired = [
-        builder.shuffle_vector(narrow[row], narrow[row + 4], _indices(range(WORDS)))
-        for row in range(4)
-    ]
-    transposed = [*_transposed(builder, wide, 4), *_transposed(builder, paired, 2)]
-    for column, lanes in enumerate(transposed):
-        index = [_WORD(column), first]
-        address = _pointer(context, builder, columns_type, columns, index, _VECTOR)
-        builder.store(lanes, address, align=8)
-    return context.get_dummy_value()
-
-
-def _transposed(builder, rows, block):
-    """
-    Return the columns of rows that are lanes, by exchanging blocks of 1, 2, ... words.
-
-    rows   8 lanes, or 4 that hold two rows of four words each
-    block  size of the last blocks: 4, or 2 for rows of four words
-    """
-    size = 1
-    while size <= block:
-        low = [lane & ~size | (WORDS if lane & size else 0) for lane in range(WORDS)]
-        high = [lane | size if not lane & size else WORDS + lane for lane in range(WORDS)]
-        rows = list(rows)
-        for row in range(len(rows)):
-            if not row & size:
-                pair = rows[row], rows[row | size]
-                rows[row] = builder.shuffle_vector(*pair, _indices(low))
-                rows[row | size] = builder.shuffle_vector(*pair, _indices(high))
-        size *= 2
-    return rows
-
-
 def _address(context, builder, signature, arguments):
     """Return the address of the words from an index on."""
-    return _pointer(context, builder, signature.args[0], arguments[0], [arguments[1]], _VECTOR)
-
-
-def _pointer(context, builder, array_type, array, index, pointee):
-    """Return the address of an element as that of another type; the index is not checked."""
-    struct = context.make_array(array_type)(context, builder, array)
+    array_type = signature.args[0]
+    struct = context.make_array(array_type)(context, builder, arguments[0])
     address = cgutils.get_item_pointer(
-        context, builder, array_type, struct, index, wraparound=False
+        context, builder, array_type, struct, [arguments[1]], wraparound=False
     )
-    return builder.bitcast(address, pointee.as_pointer())
+    return builder.bitcast(address, _VECTOR.as_pointer())
 
 
 def _spread(builder, word):

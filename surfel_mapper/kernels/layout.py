@@ -35,11 +35,9 @@ MAX_SCAN_COUNT = 1 << 23
 MAX_MAP_COUNT = 1 << 31
 """Maximum number of points of a map in a voxel: int64 sums of their moments do not overflow."""
 
-HIGH_BITS = 32
-"""Bits of the lower half of a word.
-
-The place of a point in its voxel, x y z from its lower corner in [0, 2^BITS), is kept in a word of
-four pieces of BITS bits, x lowest, with a 1 as the highest: the point counts itself."""
+COUNT_BITS, HIGH_BITS = 40, 32
+"""The place of a point in its voxel, x y z from its lower corner in [0, 65536), is kept in two
+words: 1 << COUNT_BITS | x, and z << HIGH_BITS | y. So their sums hold count and sums of places."""
 
 VIEW_SCALE = 1 << 14
 """Length of the integer vectors that point from a voxel to the sensor."""

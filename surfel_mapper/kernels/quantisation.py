@@ -19,6 +19,8 @@ import numpy as np
 from surfel_mapper.kernels.compiling import part
 from surfel_mapper.kernels.layout import (
     BITS,
+    COUNT_BITS,
+    HIGH_BITS,
     INDEX_BITS,
     INDEX_MASK,
     INDEX_OFFSET,
@@ -45,8 +47,8 @@ def quantise(x, y, z, pose, scale, range_sq, keys, places):
 
     x, y, z  (C,) float32 or float64, sensor frame, m
     keys     (CHUNK,) int64, out: voxel keys, -1 for points that are rejected
-    places   (CHUNK,) int64, out: places in the voxels, see kernels/layout.py; any place for
-             points that are rejected
+    places   (2, CHUNK) int64, out: places in the voxels, two words each, see kernels/layout.py;
+             any place for points that are rejected
 
     pose, scale, range_sq  see reduce_points
     """
@@ -54,6 +56,7 @@ def quantise(x, y, z, pose, scale, range_sq, keys, places):
     r10, r11, r12, t1 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     r20, r21, r22, t2 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
     near_sq, far_sq = range_sq[0], range_sq[1]
+    first, second = places[0], places[1]
     for i in range(len(x)):
         px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
         distance_sq = (px * px + py * py) + pz * pz
@@ -71,8 +74,8 @@ def quantise(x, y, z, pose, scale, range_sq, keys, places):
         ix, iy, iz = qx >> BITS, qy >> BITS, qz >> BITS
         key = (ix << (2 * INDEX_BITS)) | (iy << INDEX_BITS) | iz
         keys[i] = key if enters else -1
-        y_and_z = ((qz & PLACE) << (2 * BITS)) | ((qy & PLACE) << BITS)
-        places[i] = (1 << (3 * BITS)) | y_and_z | (qx & PLACE)
+        first[i] = (1 << COUNT_BITS) | (qx & PLACE)
+        second[i] = ((qz & PLACE) << HIGH_BITS) | (qy & PLACE)
 
 
 @njit(cache=True, nogil=True, inline='always')

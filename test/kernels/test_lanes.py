@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sums in lanes, the search of eight words and columns of rows against Python integers."""
+"""Sums in lanes and the search of eight words against Python integers."""
 
 from numba import njit
 import numpy as np
@@ -15,11 +15,10 @@ from surfel_mapper.kernels.lanes import (
     place_of_half,
     plus_place,
     store_sums,
-    transpose_rows,
     WIDEST,
     WORDS,
 )
-from surfel_mapper.kernels.layout import BITS, HIGH_BITS, ROW
+from surfel_mapper.kernels.layout import COUNT_BITS, HIGH_BITS
 from test.kernels.modes import both
 
 HIGHEST = 65535
@@ -30,8 +29,9 @@ HIGHEST = 65535
 def add_at(words, at, places, mask):
     sums = load_sums(words, at)
     for i in range(len(places)):
-        place = (places[i, 2] << (2 * BITS)) | (places[i, 1] << BITS) | places[i, 0]
-        others = plus_place(load_sums(words, np.uint64(0)), (1 << (3 * BITS)) | place)
+        first = (1 << COUNT_BITS) | places[i, 0]
+        second = (places[i, 2] << HIGH_BITS) | places[i, 1]
+        others = plus_place(load_sums(words, np.uint64(0)), first, second)
         sums = masked_sum(sums, mask, others)
     store_sums(words, at, sums)
 
@@ -41,7 +41,7 @@ def expected(places):
     x, y, z = (list(map(int, column)) for column in places.T)
     pairs = (x, x), (x, y), (x, z), (y, y), (y, z), (z, z)
     products = [sum(a * b for a, b in zip(*pair, strict=True)) for pair in pairs]
-    first, second = (sum(z) << HIGH_BITS) + sum(x), (len(x) << HIGH_BITS) + sum(y)
+    first, second = (len(x) << COUNT_BITS) + sum(x), (sum(z) << HIGH_BITS) + sum(y)
     # as the bits of signed words
     return [(word + 2**63) % 2**64 - 2**63 for word in (first, second, *products)]
 
@@ -70,22 +70,18 @@ def test_a_mask_of_zero_drops_the_sums(call):
 
 
 @pytest.mark.parametrize('corner', [(0, 0, 0), (HIGHEST, 0, HIGHEST), (HIGHEST,) * 3])
-def test_words_hold_the_sums_of_a_full_voxel_and_notice_fuller_ones(corner):
+def test_words_hold_the_sums_of_a_full_voxel_and_the_count_of_the_widest(corner):
     words = np.zeros(2 * WORDS, np.int64)
     places = np.array([corner] * FULL)
     add_at(words, np.uint64(WORDS), places, -1)
     assert words[WORDS:].tolist() == expected(places)
-    low = (1 << HIGH_BITS) - 1
-    x, y, z = corner
-    assert [words[WORDS] & low, words[WORDS + 1] & low] == [FULL * x, FULL * y]
-    assert [words[WORDS] >> HIGH_BITS & low, words[WORDS + 1] >> HIGH_BITS] == [FULL * z, FULL]
-    add_at(words, np.uint64(WORDS), places[:1], -1)
-    assert words[WORDS + 1] >> HIGH_BITS > FULL
-    words[WORDS:] = expected(places)
+    x, _, z = corner
+    assert words[WORDS] & ((1 << COUNT_BITS) - 1) == FULL * x
+    assert words[WORDS + 1] >> HIGH_BITS & ((1 << HIGH_BITS) - 1) == FULL * z
     for _ in range((WIDEST - FULL) // FULL):
         add_at(words, np.uint64(WORDS), places, -1)
     add_at(words, np.uint64(WORDS), places[: (WIDEST - FULL) % FULL], -1)
-    assert 0 <= (words[WORDS + 1] >> HIGH_BITS) - WIDEST <= WIDEST >> BITS
+    assert words[WORDS] >> COUNT_BITS == WIDEST
 
 
 @njit
@@ -160,20 +156,3 @@ def test_the_first_word_with_a_lower_half_is_found(call, lower):
         assert place == [*lows[WORDS : 2 * WORDS].tolist(), lower].index(lower)
         found.add(int(place))
     assert found > {0, WORDS}
-
-
-@njit
-def transpose(words, offsets, first, columns):
-    transpose_rows(words, offsets, first, columns)
-
-
-@both
-def test_eight_rows_become_columns(call):
-    words = np.random.default_rng(4).integers(-(2**63), 2**63, 40 * ROW)
-    chosen = np.array([3, 0, 39, 7, 7, 12, 25, 1, 38, 2, 5, 4, 30, 11, 9, 10])
-    columns = np.zeros((ROW, 24), np.int64)
-    for first in (0, WORDS):
-        call(transpose, words, chosen * ROW, first, columns)
-    expected = words.reshape(-1, ROW)[chosen].T
-    assert columns[:, :16].tolist() == expected.tolist()
-    assert not columns[:, 16:].any()

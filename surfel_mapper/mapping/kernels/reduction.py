@@ -34,14 +34,12 @@ from surfel_mapper.kernels.lanes import (
     WORDS,
 )
 from surfel_mapper.kernels.layout import (
+    COUNT_BITS,
     HALF,
     HIGH_BITS,
     VIEW_SCALE,
 )
 from surfel_mapper.kernels.quantisation import quantise, unpack
-
-LOW = (1 << HIGH_BITS) - 1
-"""Mask of the lower half of a word."""
 
 NOT_FINITE, TOO_NEAR, TOO_FAR, BEYOND = range(4)
 """Rows of ``left_out``: the reason why a point is rejected."""
@@ -61,7 +59,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
               appearance, E <= B / 2;
               sums (E + 2, WORDS) int64, out: from sums[1] on those of the places in the voxel,
               as lanes.py packs them; those of more than FULL points are wrong;
-              of one chunk: chunk_keys (CHUNK + 1,) int64, places (CHUNK,) int64,
+              of one chunk: chunk_keys (CHUNK + 1,) int64, places (2, CHUNK) int64,
               starts (CHUNK + AHEAD,) int32, run_rows (CHUNK,) int32; zeros before the first use
     left_out  (4,) int64, out: number of points rejected as not finite, too near, too far, beyond
               the voxel indices
@@ -91,8 +89,8 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
         num_rows = number_runs(chunk_keys, starts, num_runs, table, keys, num_rows, run_rows)
         sums[known:num_rows] = 0
         add_places(places, len(x), chunk_keys, run_rows, words)
-        if sums[0, 1] > num_left_out:
-            num_left_out = sums[0, 1]
+        if sums[0, 0] > num_left_out:
+            num_left_out = sums[0, 0]
             for run in range(num_runs):
                 if run_rows[run] == 0:
                     for i in range(starts[run], starts[run + 1]):
@@ -105,7 +103,7 @@ def add_places(places, num, chunk_keys, run_rows, words):
     """
     Add the places of a chunk of points to the sums of their voxels.
 
-    places      (CHUNK,) int64, of which num count, at least one; see quantise
+    places      (2, CHUNK) int64, of which num count, at least one; see quantise
     chunk_keys  (CHUNK + 1,) int64, voxel key of each point
     run_rows    (CHUNK,) int32, row of the voxel of each run
     words       (8 M,) int64, in and out: sums of the voxels; the last eight are zero
@@ -115,6 +113,7 @@ def add_places(places, num, chunk_keys, run_rows, words):
     of its voxel. A point of the same run takes the zeros at the end instead, because reading
     the row that the point before it wrote would wait for that write.
     """
+    first, second = places[0], places[1]
     zeros = U(len(words) - WORDS)
     run, previous = U(0), chunk_keys[0]
     sums = load_sums(words, U(WORDS) * U(np.uint32(run_rows[run])))
@@ -124,7 +123,7 @@ def add_places(places, num, chunk_keys, run_rows, words):
         run += U(is_new)
         at = U(WORDS) * U(np.uint32(run_rows[run]))
         others = load_sums(words, at if is_new else zeros)
-        others = plus_place(others, places[i])
+        others = plus_place(others, first[i], second[i])
         sums = masked_sum(sums, np.int64(is_new) - 1, others)
         store_sums(words, at, sums)
 
@@ -171,9 +170,11 @@ def unpack_sums(sums, count, total, product):
     """
     largest = np.int64(0)
     for row in range(len(sums)):
-        x, y = sums[row, 0] & LOW, sums[row, 1] & LOW
-        z, num = (sums[row, 0] >> HIGH_BITS) & LOW, sums[row, 1] >> HIGH_BITS
+        num = sums[row, 0] >> COUNT_BITS
         half = HALF * num
+        x = sums[row, 0] & ((1 << COUNT_BITS) - 1)
+        y = sums[row, 1] & ((1 << HIGH_BITS) - 1)
+        z = (sums[row, 1] >> HIGH_BITS) & ((1 << HIGH_BITS) - 1)
         largest = max(largest, num)
         count[row] = num
         total[row, 0] = x - half
@@ -233,7 +234,7 @@ def sum_channels(xyz, pose, scale, range_sq, keys, table, values, sums):
     sums    (K, C) int64, out
     """
     chunk_keys = np.empty(CHUNK, np.int64)
-    places = np.empty(CHUNK, np.int64)
+    places = np.empty((2, CHUNK), np.int64)
     starts = np.empty(CHUNK + 1, np.int32)
     shift = hash_shift(len(table))
     sums[:, :] = 0

@@ -11,17 +11,16 @@ decomposed with vector instructions.
 
 import math
 
-from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part
-from surfel_mapper.kernels.lanes import transpose_rows, WORDS
-from surfel_mapper.kernels.layout import KEY, PRODUCT, ROW
-from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
+from surfel_mapper.kernels.layout import KEY, PRODUCT
 from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work
 from surfel_mapper.mapping.kernels.rows import (
     count_of,
+    prefetch_row,
+    prefetch_row_early,
     sum_of,
     view_of,
 )
@@ -62,20 +61,19 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     A single point or identical points: eigenvalues 0; normal, planarity and curvature nan.
     """
     position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs
-    offsets, columns = make_scratch()
-    moments, scatter = np.empty((MOMENTS, CHUNK)), np.empty((6, CHUNK))
+    keys, moments = np.empty(CHUNK, np.int64), np.empty((MOMENTS, CHUNK))
+    scatter, shape = np.empty((6, CHUNK)), np.empty((2, CHUNK))
     mean, values, normals = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((3, CHUNK))
-    shape = np.empty((2, CHUNK))
     work = make_work(CHUNK)
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
         end = start + num
-        most = gather(rows, chosen, start, num, offsets, columns, moments)
-        write_index(columns, num, num_points[start:end], voxel_index[start:end])
+        most = gather(rows, chosen, start, num, keys, moments)
+        write_index(keys, moments, num, num_points[start:end], voxel_index[start:end])
         center(moments, num, mean, scatter)
         if most >= many:
-            center_exactly(columns, num, scatter)
+            center_exactly(rows, chosen, start, num, scatter)
         place(mean, num, voxel_size, bits, voxel_index[start:end], position[start:end])
         decompose_chunk(scatter, 0, num, work, values, normals)
         derive_shape(values, num, moments, voxel_size / (1 << bits), shape)
@@ -94,68 +92,54 @@ def derive_covariances(rows, chosen, voxel_size, bits, covariance):
     rows, chosen, voxel_size, bits: as of derive_surfels
     covariance  (K, 6) float64, out: xx xy xz yy yz zz, m^2
     """
-    offsets, columns = make_scratch()
-    moments = np.empty((MOMENTS, CHUNK))
+    keys, moments = np.empty(CHUNK, np.int64), np.empty((MOMENTS, CHUNK))
     mean, scatter = np.empty((3, CHUNK)), np.empty((6, CHUNK))
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     unit = voxel_size / (1 << bits)
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
-        most = gather(rows, chosen, start, num, offsets, columns, moments)
+        most = gather(rows, chosen, start, num, keys, moments)
         center(moments, num, mean, scatter)
         if most >= many:
-            center_exactly(columns, num, scatter)
+            center_exactly(rows, chosen, start, num, scatter)
         for i in range(num):
             scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
             for pair in range(6):
                 covariance[start + i, pair] = scatter[pair, i] * scale
 
 
-@njit(cache=True, nogil=True, inline='always')
-def make_scratch():
-    """Return the arrays of ``gather``: offsets, int64, and columns (CHUNK, ROW) int64."""
-    return np.empty(CHUNK + EARLY, np.int64), np.empty((ROW, CHUNK), np.int64).T
-
-
 @part()
-def gather(rows, chosen, start, num, offsets, columns, moments):
+def gather(rows, chosen, start, num, keys, moments):
     """
     Gather the moments of num voxels from start on; return the largest count.
 
-    offsets  (CHUNK + EARLY,) int64, out: first words of the rows, and of those of the next chunk
-    columns  (CHUNK, ROW) int64, columns contiguous, out: the rows; some more up to a multiple of 8
+    keys     (CHUNK,) int64, out
     moments  (MOMENTS, CHUNK) float64, out
     """
-    flat, transposed, last = rows.ravel(), columns.T, len(chosen) - 1
-    for i in range(len(offsets)):
-        offsets[i] = np.int64(chosen[min(start + i, last)]) * ROW
-    for first in range(0, num, WORDS):
-        for i in range(first, first + WORDS):
-            prefetch_early(flat, offsets[i + EARLY])
-            prefetch_early(flat, offsets[i + EARLY] + ROW - 1)
-            prefetch(flat, offsets[i + AHEAD])
-            prefetch(flat, offsets[i + AHEAD] + ROW - 1)
-        transpose_rows(flat, offsets, first, transposed)
+    flat, last = rows.ravel(), len(chosen) - 1
     most = np.int64(0)
     for i in range(num):
-        n = count_of(columns, i)
+        prefetch_row_early(flat, np.int64(chosen[min(start + i + EARLY, last)]))
+        prefetch_row(flat, np.int64(chosen[min(start + i + AHEAD, last)]))
+        row = np.int64(chosen[start + i])
+        n = count_of(rows, row)
         most = max(most, n)
-        moments[N, i] = n
+        keys[i], moments[N, i] = rows[row, KEY], n
+        moments[V, i], moments[V + 1, i], moments[V + 2, i] = view_of(rows, row)
         for axis in range(3):
-            moments[S + axis, i] = sum_of(columns, i, axis)
+            moments[S + axis, i] = sum_of(rows, row, axis)
         for pair in range(6):
-            moments[P + pair, i] = columns[i, PRODUCT + pair]
-        moments[V, i], moments[V + 1, i], moments[V + 2, i] = view_of(columns, i)
+            moments[P + pair, i] = rows[row, PRODUCT + pair]
     return most
 
 
 @part()
-def write_index(columns, num, num_points, voxel_index):
+def write_index(keys, moments, num, num_points, voxel_index):
     """Write the numbers of points (num,) and the voxel indices (num, 3) of a chunk."""
     for i in range(num):
-        num_points[i] = count_of(columns, i)
+        num_points[i] = np.int64(moments[N, i])
     for i in range(num):
-        voxel_index[i, 0], voxel_index[i, 1], voxel_index[i, 2] = unpack(columns[i, KEY])
+        voxel_index[i, 0], voxel_index[i, 1], voxel_index[i, 2] = unpack(keys[i])
 
 
 @part(error_model='numpy')
@@ -187,21 +171,22 @@ def center(moments, num, mean, scatter):
 
 
 @part(error_model='numpy')
-def center_exactly(columns, num, scatter):
+def center_exactly(rows, chosen, start, num, scatter):
     """Compute the scatters as ``center`` does, in int64, which is exact for any count."""
     for i in range(num):
-        n = count_of(columns, i)
+        row = np.int64(chosen[start + i])
+        n = count_of(rows, row)
         inverse = 1.0 / n
         pair = 0
         for a in range(3):
-            sa = sum_of(columns, i, a)
+            sa = sum_of(rows, row, a)
             ca = np.int64(np.rint(sa * inverse))
             da = sa - n * ca
             for b in range(a, 3):
-                sb = sum_of(columns, i, b)
+                sb = sum_of(rows, row, b)
                 cb = np.int64(np.rint(sb * inverse))
                 db = sb - n * cb
-                about = columns[i, PRODUCT + pair] - ca * sb - cb * da
+                about = rows[row, PRODUCT + pair] - ca * sb - cb * da
                 scatter[pair, i] = about - np.float64(da) * np.float64(db) * inverse
                 pair += 1
 
