@@ -5,8 +5,8 @@ Reducer: reduces the points of a scan to moments.
 
 The scratch memory is kept from scan to scan; concurrent calls use separate memory, so several
 threads may reduce scans at the same time. A scan with more points of a voxel than the packed sums
-hold is reduced once more in parts: a wall 0.6 m from a camera of 640 x 480 takes 4.5 ms, at 1.2 m,
-where 48,000 points share a voxel, 1.2 ms.
+hold is reduced once more in parts: a wall 0.6 m from a camera of 640 x 480, 77,000 points a voxel,
+takes four times as long as one at 1.2 m, with 48,000 (4.8 and 1.2 ms).
 """
 
 from __future__ import annotations
