@@ -276,7 +276,7 @@ def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
     Arrays that fulfil this and are writeable are not copied.
     """
     if type(points) is np.ndarray and points.dtype == np.float32 and points.ndim == 2:
-        flags = points.flags
+        flags = points.flags  # the usual case; the general one takes 20 us in a cold cache
         if points.shape[1] == 3 and flags.f_contiguous and flags.aligned and flags.writeable:
             return points
     array = as_array('points', points)

@@ -285,8 +285,6 @@ def derive(
         outputs = tuple(values[part] for values in surfels.arrays)
         derive_surfels(rows, chosen[part], voxel_size_m, bits, outputs)
 
-    if threads > 1 and num >= FEW:
-        share(derive_part, num, threads)
-    elif num:  # else the kernel need not be compiled yet
-        derive_surfels(rows, chosen, voxel_size_m, bits, surfels.arrays)
+    if num:  # else the kernel need not be compiled yet
+        share(derive_part, num, threads if num >= FEW else 1)
     return surfels

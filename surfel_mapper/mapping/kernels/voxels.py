@@ -249,8 +249,9 @@ def remove_moments(
             fallen[num_fallen, 0], fallen[num_fallen, 1], fallen[num_fallen, 2] = unpack(key)
             num_fallen += 1
         if held == n:
-            ahead = emptied[num_emptied - AHEAD] if num_emptied >= AHEAD else np.int32(-1)
-            later = np.int64(found[ahead]) if ahead >= 0 else np.int64(-1)
+            later = np.int64(-1)
+            if num_emptied >= AHEAD:
+                later = np.int64(found[emptied[num_emptied - AHEAD]])
             rows[row, KEY] = -1
             rows[row, VIEW] = rows[row, VIEW + 1] = 0  # and with them the count
             rows[row, FREE] = ((later + 1) << HIGH_BITS) | (free + 1)
