@@ -111,4 +111,6 @@ def test_a_long_drive_gives_errors_memory_and_seconds(tmp_path, capfd):
     assert row['error_m'] < 0.01
     assert row['spool_mb'] == pytest.approx(12 * 78_000 * 12e-6, rel=0.02)
     assert row['peak_mb'] > 50.0
-    assert json.loads(capfd.readouterr().err.splitlines()[-1])['peak_mb'] <= row['peak_mb']
+    # Linux counts pages by processor, so the peak that it tells later may be some pages lower
+    before_end = json.loads(capfd.readouterr().err.splitlines()[-1])
+    assert before_end['peak_mb'] <= row['peak_mb'] + 1.0
