@@ -202,7 +202,6 @@ def select(scan: Scan, rows: Array) -> Scan:
             return scan
         points = np.empty((number, 3), scan.points.dtype, order='F')
         compact(scan.points.T, rows, points.T)
-        rows = np.flatnonzero(rows) if scan.columns or scan.times else rows
     else:
         points = np.empty((len(rows), 3), scan.points.dtype, order='F')
         for axis in range(3):

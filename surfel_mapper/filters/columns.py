@@ -68,8 +68,8 @@ class LazyColumns(Mapping[str, Array]):
     ----------
     base : mapping of str to array
         Columns to take rows from; must not change while this is in use.
-    rows : (K,) int, optional
-        Rows to take; None: all.
+    rows : (K,) int or (N,) bool, optional
+        Rows to take, or a mask over all; None: all.
     num_rows : int
         Number of rows.
     own : mapping of str to (K, ...) array
@@ -82,7 +82,7 @@ class LazyColumns(Mapping[str, Array]):
     def __init__(
         self,
         base: Mapping[str, Array],
-        rows: npt.NDArray[np.int64] | None,
+        rows: npt.NDArray[Any] | None,
         num_rows: int,
         own: Mapping[str, Array] | None = None,
     ) -> None:
@@ -111,16 +111,22 @@ class LazyColumns(Mapping[str, Array]):
         """Return the number of columns."""
         return sum(1 for _ in self)
 
-    def _origin(self, name: str) -> tuple[Array, npt.NDArray[np.int64] | None]:
+    def _origin(self, name: str) -> tuple[Array, npt.NDArray[Any] | None]:
         """Return the array that holds a column, and its rows in it; None: all rows."""
         if name in self._own:
             return self._own[name], None
         if not isinstance(self._base, LazyColumns):
-            return self._base[name], self._rows
+            return self._base[name], self._indices()
         column, rows = self._base._origin(name)
         if self._rows is None or rows is None:
-            return column, rows if self._rows is None else self._rows
+            return column, rows if self._rows is None else self._indices()
         return column, rows[self._rows]
+
+    def _indices(self) -> npt.NDArray[Any] | None:
+        """Return the rows as indices; not before a column is read, as most never are."""
+        if self._rows is not None and self._rows.dtype == np.bool_:
+            self._rows = np.flatnonzero(self._rows)
+        return self._rows
 
 
 def as_fields(

@@ -32,6 +32,7 @@ from surfel_mapper.filters.kernels.limits import (
     in_wedge,
     NEVER,
     outside_box,
+    sum_squares,
 )
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
@@ -189,15 +190,10 @@ def measure(scan: Scan, axis: int, limit_m: float) -> tuple[npt.NDArray[Any], An
 
 
 def range_sq(points: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the squared distances from the origin, in the type of the coordinates, m^2."""
-    x, y, z = points.T
-    with np.errstate(over='ignore'):  # infinite beyond the range of the dtype
-        total = x * x
-        square = y * y
-        total += square
-        np.multiply(z, z, out=square)
-        total += square
-    return np.asarray(total)
+    """Return the squared distances (N,) from the origin, in the type of the coordinates, m^2."""
+    squares = np.empty(len(points), points.dtype)
+    sum_squares(points.T, squares)
+    return squares
 
 
 @register(libpointmatcher='AngleLimitDataPointsFilter')

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.geometry import compose, inverse, q_xyzw, Transform
 from surfel_mapper.scan import PointTimes, Scan
-from surfel_mapper.sensors.kernels.deskew import move_points
+from surfel_mapper.sensors.kernels.deskew import count_from_stamp, fill_times, move_points
 
 FIELDS = ('t', 'time', 'timestamp', 'offset_time')
 """Names under which drivers write the times of points: Ouster, Velodyne, Hesai, Livox."""
@@ -76,22 +76,21 @@ def point_times(
             f'no field {field or " or ".join(FIELDS)} among {", ".join(scan.columns) or "none"}; '
             'name the times of points in deskew.field'
         )
-    values = scan.columns[name]
-    if values.ndim != 1:
-        raise CloudFormatError(f'field {name}: {values.shape[1]} values a point, expected a time')
-    measured = _measured(scan.points) & np.isfinite(values)
-    rows = np.flatnonzero(measured)
-    if not len(rows):
+    column = scan.columns[name]
+    if column.ndim != 1:
+        raise CloudFormatError(f'field {name}: {column.shape[1]} values a point, expected a time')
+    values = _valid_times(scan.points, column)
+    if values is None:
         return PointTimes(np.zeros(len(scan), np.int64), scan.stamp_ns, scan.stamp_ns)
-    values = np.where(measured, values, values[rows[0]])
-    low, high = values.min(), values.max()
-    for unit_ns, is_epoch in _readings(values.dtype, unit, reference, low, scan.stamp_ns):
-        first, last = _offsets(np.array([low, high]), unit_ns, is_epoch, scan.stamp_ns).tolist()
+    ends = np.array([values.min(), values.max()])
+    low, high = ends.astype(column.dtype)
+    for unit_ns, is_epoch in _readings(column.dtype, unit, reference, low, scan.stamp_ns):
+        first, last = _offsets(ends, unit_ns, is_epoch, scan.stamp_ns).tolist()
         if first >= -MAX_SWEEP_NS and last <= MAX_SWEEP_NS:
             offsets = _offsets(values, unit_ns, is_epoch, scan.stamp_ns)
             return PointTimes(offsets, scan.stamp_ns + first, scan.stamp_ns + last)
     raise CloudFormatError(
-        f'field {name}: times from {low} to {high} of type {values.dtype} are more than '
+        f'field {name}: times from {low} to {high} of type {column.dtype} are more than '
         f'{MAX_SWEEP_NS / 1e9:g} s from the stamp {scan.stamp_ns / 1e9:.6f} s with deskew.unit '
         f'{unit} and deskew.reference {reference}'
     )
@@ -159,19 +158,22 @@ def deskewing(
 
 
 def warm_up() -> None:
-    """Compile the kernel for all types that points may have."""
-    times = PointTimes(np.zeros(1, np.int64), 0, 1)
+    """Compile the kernels for all types that points and times may have."""
     for dtype in (np.float32, np.float64):
-        points = np.ones((1, 3), dtype)
-        deskewed(Scan(points=points, stamp_ns=0, frame_id='', times=times), lambda _: np.eye(4))
+        for time in (np.uint32, np.float32):
+            columns = {'t': np.zeros(1, time)}
+            scan = Scan(points=np.ones((1, 3), dtype), stamp_ns=0, frame_id='', columns=columns)
+            deskewed(replace(scan, times=point_times(scan)), lambda _: np.eye(4))
 
 
-def _measured(points: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
-    """Return which points are valid: finite and not in the origin."""
-    x, y, z = points.T
-    with np.errstate(over='ignore', invalid='ignore'):
-        reach = np.abs(x) + np.abs(y) + np.abs(z)
-    return np.asarray((reach > 0.0) & np.isfinite(reach))
+def _valid_times(
+    points: npt.NDArray[Any], column: npt.NDArray[Any]
+) -> npt.NDArray[Any] | None:
+    """Return times, int64 or float64, invalid ones replaced by a valid one; None if none is."""
+    values = column.astype(np.float64 if column.dtype.kind == 'f' else np.int64)
+    filled = np.empty_like(values)
+    xyz = np.require(points, None, ['F', 'A', 'W']).T
+    return filled if fill_times(xyz, values, filled) else None
 
 
 def _readings(
@@ -196,13 +198,13 @@ def _offsets(
     """Return times in nanoseconds after the stamp; the difference is taken before the factor."""
     base = stamp_ns // unit_ns if is_epoch else 0
     limit = 4 * MAX_SWEEP_NS // unit_ns  # larger ones are refused, and must not overflow
-    if values.dtype.kind == 'f':
+    number = values.dtype.type
+    if number is np.float64:
         base = int(float(base))
-        after = np.clip(values.astype(np.float64) - base, -limit, limit) * unit_ns
-        ticks = np.rint(after).astype(np.int64)
-    else:
-        ticks = np.clip(values.astype(np.int64) - base, -limit, limit) * unit_ns
-    return np.asarray(ticks + (base * unit_ns - stamp_ns) if is_epoch else ticks, np.int64)
+    shift_ns = base * unit_ns - stamp_ns if is_epoch else 0
+    offsets = np.empty(len(values), np.int64)
+    count_from_stamp(values, number(base), number(limit), number(unit_ns), shift_ns, offsets)
+    return offsets
 
 
 def _track(

@@ -15,7 +15,7 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
 from surfel_mapper.sensors.deskew import deskewed, MAX_TURN_RAD, point_times
-from surfel_mapper.sensors.kernels.deskew import move_points
+from surfel_mapper.sensors.kernels.deskew import count_from_stamp, fill_times, move_points
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.kernels.modes import both
 
@@ -102,6 +102,39 @@ def test_invalid_points_do_not_affect_the_times():
 def test_implausible_times_are_refused(scan, settings, message):
     with pytest.raises(CloudFormatError, match=message):
         point_times(scan, **settings)
+
+
+@both
+@pytest.mark.parametrize('dtype', [np.int64, np.float64])
+def test_times_of_invalid_points_are_those_of_the_first_valid_one(call, dtype):
+    rng = np.random.default_rng(6)
+    xyz = rng.normal(size=(3, 40)).astype(np.float32)
+    times = rng.integers(-(10**9), 10**9, 40).astype(dtype)
+    invalid = np.zeros(40, np.bool_)
+    invalid[[0, 1, 7, 30]] = True
+    xyz[0, 0], xyz[1, 1], xyz[:, 7] = np.nan, np.inf, 0.0
+    xyz[2, 30] = -np.inf
+    if dtype == np.float64:
+        invalid[[2, 9]] = True
+        times[2], times[9] = np.nan, -np.inf
+    filled = np.empty_like(times)
+    assert call(fill_times, xyz, times, filled)
+    expected = np.where(invalid, times[np.flatnonzero(~invalid)[0]], times)
+    np.testing.assert_array_equal(filled, expected)
+    assert not call(fill_times, xyz[:, :2], times[:2], filled[:2])
+
+
+@both
+@pytest.mark.parametrize('dtype', [np.int64, np.float64])
+def test_times_count_from_the_stamp_in_whole_nanoseconds(call, dtype):
+    values = np.array([5_000_000, 5_000_001, 4_999_000, 9 * 10**15, -(9 * 10**15)], dtype)
+    if dtype == np.float64:
+        values[1:3] = 5_000_000.125, 4_999_999.625  # a half goes to the even number
+    found = np.empty(5, np.int64)
+    base, limit, unit_ns = dtype(5_000_000), dtype(6000), dtype(4)
+    call(count_from_stamp, values, base, limit, unit_ns, 7, found)
+    near = [4, -4000] if dtype == np.int64 else [0, -2]
+    assert found.tolist() == [7, *(each + 7 for each in near), 24_007, -23_993]
 
 
 def moving(rate_hz, turn_rad_s=(0.3, -0.4, 0.9), speed_m_s=(12.0, 1.0, -0.5)):

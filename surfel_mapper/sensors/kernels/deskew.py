@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Deskewing: points are moved from the pose of the sensor at their time to that at the stamp.
+Deskewing: the times of points, and points moved from the pose at their time to that at the stamp.
 
 Between two poses the position is linear and the rotation a slerp, of + - * / and sqrt alone, so
 that node and replay get the same bits on any machine. The power series of the slerp is cut after
@@ -13,7 +13,58 @@ import math
 from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.kernels.grouping import CHUNK
+
+NEVER = np.iinfo(np.int64).max
+"""A time later than all."""
+
+
+@kernel()
+def fill_times(points, values, filled):
+    """
+    Copy the times of points, in place of those of invalid points the first valid one.
+
+    points  (3, N) float32 or float64, m; invalid in the origin, and if not finite
+    values  (N,) int64 or float64, times; that of a valid point is finite
+    filled  (N,) of the same type, out
+
+    Returns whether a point is valid; if none is, nothing is written.
+    """
+    x, y, z = points[0], points[1], points[2]
+    num, first = len(values), 0
+    while first < num and not is_valid(x[first], y[first], z[first], values[first]):
+        first += 1
+    if first == num:
+        return False
+    instead = values[first]
+    for i in range(np.uint64(num)):
+        filled[i] = values[i] if is_valid(x[i], y[i], z[i], values[i]) else instead
+    return True
+
+
+@part()
+def is_valid(x, y, z, value):
+    """Return whether a point is finite and not in the origin, and its time finite."""
+    reach = (abs(x) + abs(y)) + abs(z)
+    return (reach > 0.0) & (reach < math.inf) & (abs(value) < math.inf)
+
+
+@kernel()
+def count_from_stamp(values, base, limit, unit_ns, shift_ns, offsets):
+    """
+    Convert times to nanoseconds after the stamp: (values - base) unit_ns + shift_ns.
+
+    values         (N,) int64 or float64
+    base, limit    of the same type: what values count from, and the largest difference from it,
+                   so that a larger one does not overflow
+    unit_ns        of the same type, nanoseconds
+    shift_ns       int64, from the stamp to the base
+    offsets        (N,) int64, out
+    """
+    for i in range(np.uint64(len(values))):
+        ticks = min(max(values[i] - base, -limit), limit) * unit_ns
+        offsets[i] = np.int64(np.rint(ticks)) + shift_ns
 
 
 @njit(cache=True, nogil=True)
@@ -43,12 +94,17 @@ def move_points(points, offsets, knots, poses, turns, min_range_sq, moved):
     out_x, out_y, out_z = moved[0], moved[1], moved[2]
     for first in range(0, len(all_x), CHUNK):
         num = min(CHUNK, len(all_x) - first)
-        for i in range(num):
-            row = np.uint64(first + i)
-            x, y, z = np.float64(all_x[row]), np.float64(all_y[row]), np.float64(all_z[row])
+        chunk = slice(first, first + num)
+        xs, ys, zs, times = all_x[chunk], all_y[chunk], all_z[chunk], offsets[chunk]
+        earliest, latest = NEVER, -NEVER
+        for i in range(np.uint64(num)):
+            x, y, z = np.float64(xs[i]), np.float64(ys[i]), np.float64(zs[i])
             range_sq = (x * x + y * y) + z * z
-            near[i] = (range_sq == 0.0) | (range_sq < min_range_sq)
-            within[i] = min(max(offsets[first + i], knots[0]), knots[last])
+            is_near = (range_sq == 0.0) | (range_sq < min_range_sq)
+            time = min(max(times[i], knots[0]), knots[last])
+            near[i], within[i] = is_near, time
+            earliest = min(earliest, NEVER if is_near else time)
+            latest = max(latest, -NEVER if is_near else time)
         begin = 0
         while begin < num:
             start, end = knots[at], knots[min(at + 1, last)]
@@ -60,7 +116,8 @@ def move_points(points, offsets, knots, poses, turns, min_range_sq, moved):
                 while at < last - 1 and offset > knots[at + 1]:
                     at += 1
                 start, end = knots[at], knots[min(at + 1, last)]
-            stop = begin + 1
+            is_whole = is_placed and start <= earliest and latest <= end
+            stop = num if is_whole else begin + 1
             while stop < num and (near[stop] or (is_placed and start <= within[stop] <= end)):
                 stop += 1
             run = slice(first + begin, first + stop)

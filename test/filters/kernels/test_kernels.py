@@ -19,6 +19,7 @@ from surfel_mapper.filters.kernels.limits import (
     in_field_of_view,
     in_wedge,
     outside_box,
+    sum_squares,
 )
 from surfel_mapper.filters.kernels.sampling import choose
 from surfel_mapper.filters.kernels.shapes import group_moments, neighbour_moments
@@ -65,12 +66,24 @@ def test_filters_give_the_same_to_the_bit_without_the_compiler():
 @both
 @pytest.mark.parametrize('kept', [[], [0], [4], [0, 1, 2, 3, 4], [1, 3]])
 def test_compact_moves_the_kept_values_together(call, kept):
-    values = np.arange(10.0).reshape(2, 5)
+    values = np.arange(15.0).reshape(3, 5)
     keep = np.zeros(5, np.bool_)
     keep[kept] = True
-    out = np.full((2, len(kept)), np.nan)
+    out = np.full((3, len(kept)), np.nan)
     call(compact, values, keep, out)
     np.testing.assert_array_equal(out, values[:, kept])
+
+
+@both
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_squared_distances_are_those_of_numpy_in_the_type_of_the_points(call, dtype):
+    xyz = np.random.default_rng(4).normal(scale=30.0, size=(3, 50)).astype(dtype)
+    xyz[:, 0], xyz[1, 1], xyz[2, 2], xyz[0, 3] = 0.0, np.nan, np.inf, np.finfo(dtype).max
+    found = np.empty(50, dtype)
+    with np.errstate(over='ignore'):
+        call(sum_squares, xyz, found)
+        expected = xyz[0] ** 2 + xyz[1] ** 2 + xyz[2] ** 2
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize('number', [ROWS - 1, ROWS, ROWS + 1, 9 * ROWS])
