@@ -28,6 +28,7 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.compiling import part
+from surfel_mapper.kernels.grouping import U
 from surfel_mapper.kernels.lanes import highest_match, num_used, place_of_half, WORDS
 from surfel_mapper.kernels.layout import KEY
 
@@ -67,7 +68,7 @@ def hash_key(key):
 @njit(cache=True, nogil=True, inline='always')
 def first_bucket(hashed, directory, depth):
     """Return the first entry of the bucket where the search for a hash starts."""
-    segment = np.int64(directory[hashed >> (32 - depth)])
+    segment = np.int64(directory[U(hashed >> (32 - depth))])
     return segment * SEGMENT + home_of(hashed)
 
 
@@ -92,7 +93,7 @@ def likely_row(hashed, directory, buckets, depth):
     """
     bucket = first_bucket(hashed, directory, depth)
     row = row_of(hashed, bucket, buckets)
-    while row < 0 and buckets[bucket + BUCKET - 1] != 0:
+    while row < 0 and buckets[U(bucket + BUCKET - 1)] != 0:
         bucket = next_bucket(bucket)
         row = row_of(hashed, bucket, buckets)
     return row
@@ -113,8 +114,8 @@ def is_full(hashed, directory, held, depth):
     ratio. With an equal share all segments would split at the same time, since hashes are uniform,
     and look-ups would take twice as long before that moment as after it.
     """
-    segment = np.int64(directory[hashed >> (32 - depth)])
-    return held[segment] >= FULLEST - (segment * 79) % (SEGMENT // 4)
+    segment = np.int64(directory[U(hashed >> (32 - depth))])
+    return held[U(segment)] >= FULLEST - (segment * 79) % (SEGMENT // 4)
 
 
 @part()
@@ -153,33 +154,33 @@ def insert_entry(hashed, row, directory, buckets, held, depth):
     Unpacking it for each voxel counts references to four arrays, a quarter of an insertion.
     """
     bucket = first_bucket(hashed, directory, depth)
-    held[bucket // SEGMENT] += 1
+    held[U(bucket) // U(SEGMENT)] += 1
     place = num_used(buckets, bucket)
     while place == BUCKET:
         bucket = next_bucket(bucket)
         place = num_used(buckets, bucket)
-    buckets[bucket + place] = (hashed << 32) | (row + 1)
+    buckets[U(bucket + place)] = (hashed << 32) | (row + 1)
 
 
 @part()
 def remove_row(key, row, table, depth):
     """Remove the row of a voxel from the table."""
     directory, buckets, held, _ = table
-    remove_entry(key, row, directory, buckets, held, depth)
+    remove_entry(hash_key(key), row, directory, buckets, held, depth)
 
 
 @njit(cache=True, nogil=True, inline='always')
-def remove_entry(key, row, directory, buckets, held, depth):
-    """Remove a row as ``remove_row`` does, for loops that unpacked the table before."""
-    bucket = first_bucket(hash_key(key), directory, depth)
-    held[bucket // SEGMENT] -= 1
+def remove_entry(hashed, row, directory, buckets, held, depth):
+    """Remove a row by its hash, for loops that unpacked the table before; see ``insert_entry``."""
+    bucket = first_bucket(hashed, directory, depth)
+    held[U(bucket) // U(SEGMENT)] -= 1
     place = place_of_half(buckets, bucket, row + 1)
     while place == BUCKET:
         bucket = next_bucket(bucket)
         place = place_of_half(buckets, bucket, row + 1)
     last = num_used(buckets, bucket) - 1
-    buckets[bucket + place] = buckets[bucket + last]
-    buckets[bucket + last] = 0
+    buckets[U(bucket + place)] = buckets[U(bucket + last)]
+    buckets[U(bucket + last)] = 0
     if last == BUCKET - 1:
         take_back(bucket, buckets)
 

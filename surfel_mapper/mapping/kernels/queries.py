@@ -17,7 +17,7 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel
-from surfel_mapper.kernels.grouping import find_key, hash_shift
+from surfel_mapper.kernels.grouping import find_key, hash_shift, U
 from surfel_mapper.kernels.layout import (
     EMPTIED,
     INDEX_OFFSET,
@@ -27,7 +27,7 @@ from surfel_mapper.kernels.layout import (
 )
 from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
 from surfel_mapper.kernels.quantisation import in_range, pack, unpack
-from surfel_mapper.mapping.kernels.rows import count_of
+from surfel_mapper.mapping.kernels.rows import count_of, first_word
 
 AHEAD = 16
 """Number of rows between the prefetch of a row and its use."""
@@ -132,12 +132,13 @@ def reach(coordinate, radius, voxel_size):
 def keys_in_box(rows, used, low, high):
     """Return the keys of occupied voxels with indices from low to high, (3,) int64 each."""
     kept = np.empty(used, np.int64)
+    flat = rows.ravel()
     num = 0
     for row in range(used):
-        key = rows[row, KEY]
+        key = flat[first_word(row) + U(KEY)]
         kx, ky, kz = unpack(key)
         inside = low[0] <= kx <= high[0] and low[1] <= ky <= high[1] and low[2] <= kz <= high[2]
-        if inside and count_of(rows, row) > 0:
+        if inside and count_of(flat, first_word(row)) > 0:
             kept[num] = key
             num += 1
     return kept[:num].copy()
@@ -158,13 +159,13 @@ def rows_changed_at(rows, stamps, changed, stamp, min_points):
     """
     kept = np.empty(len(changed), np.int32)
     ignored = EMPTIED if min_points < 1 else 0
-    num = 0
-    for place in range(len(changed)):
-        if place + EARLY < len(changed):
-            prefetch_early(stamps, np.int64(changed[place + EARLY]))
+    num, num_changed = U(0), U(len(changed))
+    for place in range(num_changed):
+        if place + U(EARLY) < num_changed:
+            prefetch_early(stamps, np.int64(changed[place + U(EARLY)]))
         row = changed[place]
-        kept[num] = row
-        num += (stamps[row] ^ stamp) <= ignored  # a branch would be mispredicted half of the time
+        kept[num] = row  # a branch would be mispredicted half of the time
+        num += U((stamps[U(row)] ^ stamp) <= ignored)
     return kept[:num] if min_points <= 1 else kept[: keep_full(rows, kept, num, min_points)]
 
 
@@ -178,7 +179,7 @@ def keep_full(rows, kept, num, min_points):
             prefetch(flat, np.int64(kept[place + AHEAD]) * ROW)
         row = kept[place]
         kept[num_full] = row
-        num_full += count_of(rows, row) >= min_points
+        num_full += count_of(flat, first_word(row)) >= min_points
     return num_full
 
 
@@ -234,11 +235,13 @@ def rows_held(rows, used, min_points, chosen, mixed):
     chosen  (R,) int32, out
     mixed   (R,) uint64, out
     """
+    flat = rows.ravel()
     num = 0
     for row in range(used):
-        if count_of(rows, row) >= min_points:
+        at = first_word(row)
+        if count_of(flat, at) >= min_points:
             chosen[num] = row
-            mixed[num] = mix(rows[row, KEY])
+            mixed[num] = mix(flat[at + U(KEY)])
             num += 1
     return num
 

@@ -14,11 +14,13 @@ import math
 import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.grouping import U
 from surfel_mapper.kernels.layout import KEY, PRODUCT
 from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work
 from surfel_mapper.mapping.kernels.rows import (
     count_of,
+    first_word,
     prefetch_row,
     prefetch_row_early,
     sum_of,
@@ -121,15 +123,15 @@ def gather(rows, chosen, start, num, keys, moments):
     for i in range(num):
         prefetch_row_early(flat, np.int64(chosen[min(start + i + EARLY, last)]))
         prefetch_row(flat, np.int64(chosen[min(start + i + AHEAD, last)]))
-        row = np.int64(chosen[start + i])
-        n = count_of(rows, row)
+        at = first_word(chosen[start + i])
+        n = count_of(flat, at)
         most = max(most, n)
-        keys[i], moments[N, i] = rows[row, KEY], n
-        moments[V, i], moments[V + 1, i], moments[V + 2, i] = view_of(rows, row)
+        keys[i], moments[N, i] = flat[at + U(KEY)], n
+        moments[V, i], moments[V + 1, i], moments[V + 2, i] = view_of(flat, at)
         for axis in range(3):
-            moments[S + axis, i] = sum_of(rows, row, axis)
+            moments[S + axis, i] = sum_of(flat, at, axis)
         for pair in range(6):
-            moments[P + pair, i] = rows[row, PRODUCT + pair]
+            moments[P + pair, i] = flat[at + U(PRODUCT) + U(pair)]
     return most
 
 
@@ -173,20 +175,21 @@ def center(moments, num, mean, scatter):
 @part(error_model='numpy')
 def center_exactly(rows, chosen, start, num, scatter):
     """Compute the scatters as ``center`` does, in int64, which is exact for any count."""
+    flat = rows.ravel()
     for i in range(num):
-        row = np.int64(chosen[start + i])
-        n = count_of(rows, row)
+        at = first_word(chosen[start + i])
+        n = count_of(flat, at)
         inverse = 1.0 / n
         pair = 0
         for a in range(3):
-            sa = sum_of(rows, row, a)
+            sa = sum_of(flat, at, a)
             ca = np.int64(np.rint(sa * inverse))
             da = sa - n * ca
             for b in range(a, 3):
-                sb = sum_of(rows, row, b)
+                sb = sum_of(flat, at, b)
                 cb = np.int64(np.rint(sb * inverse))
                 db = sb - n * cb
-                about = rows[row, PRODUCT + pair] - ca * sb - cb * da
+                about = flat[at + U(PRODUCT) + U(pair)] - ca * sb - cb * da
                 scatter[pair, i] = about - np.float64(da) * np.float64(db) * inverse
                 pair += 1
 

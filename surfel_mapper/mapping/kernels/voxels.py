@@ -25,7 +25,7 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part
-from surfel_mapper.kernels.grouping import hash_shift, home
+from surfel_mapper.kernels.grouping import hash_shift, home, U
 from surfel_mapper.kernels.hashing import (
     DEPTH,
     find_row,
@@ -61,6 +61,7 @@ from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.mapping.kernels.rows import (
     add_to_row,
     count_of,
+    first_word,
     prefetch_row,
     prefetch_row_early,
     sum_of,
@@ -104,14 +105,14 @@ def look_ahead(place, keys, flat, directory, buckets, depth, hashes, likely):
     hashes  (RING,) int64, in and out: hash of voxel i at i & LAST
     likely  (RING,) int64, out: a row with this hash, to be confirmed by its key; -1 if not found
     """
-    hashed = hash_key(keys[min(place + HASHED, len(keys) - 1)])
-    hashes[(place + HASHED) & LAST] = hashed
+    hashed = hash_key(keys[U(min(place + HASHED, len(keys) - 1))])
+    hashes[U((place + HASHED) & LAST)] = hashed
     prefetch(directory, hashed >> (32 - depth))
-    earlier, nearer = hashes[(place + EARLIER) & LAST], hashes[(place + NEARER) & LAST]
+    earlier, nearer = hashes[U((place + EARLIER) & LAST)], hashes[U((place + NEARER) & LAST)]
     prefetch_early(buckets, first_bucket(earlier, directory, depth))
     prefetch(buckets, first_bucket(nearer, directory, depth))
-    row = likely_row(hashes[(place + FOUND) & LAST], directory, buckets, depth)
-    likely[(place + FOUND) & LAST] = row
+    row = likely_row(hashes[U((place + FOUND) & LAST)], directory, buckets, depth)
+    likely[U((place + FOUND) & LAST)] = row
     prefetch_row(flat, max(row, 0))  # an address before the slab may cost a walk of page tables
 
 
@@ -130,10 +131,10 @@ def find_rows(keys, rows, table, state, found):
     for place in range(-HASHED if len(keys) else 0, len(keys)):
         look_ahead(place, keys, flat, directory, buckets, depth, hashes, likely)
         if place >= 0:
-            row = likely[place & LAST]
-            if row >= 0 and rows[row, KEY] != keys[place]:
-                row = find_row(keys[place], rows, table, depth)
-            found[place] = row
+            row, key = likely[U(place & LAST)], keys[U(place)]
+            if row >= 0 and flat[first_word(row) + U(KEY)] != key:
+                row = find_row(key, rows, table, depth)
+            found[U(place)] = row
 
 
 @kernel()
@@ -151,6 +152,7 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, 
     and continue from there.
     """
     keys, count, _, _, _ = moments
+    words = words_of(moments)
     directory, buckets, held, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
@@ -160,23 +162,24 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, 
         look_ahead(place, keys, flat, directory, buckets, depth, hashes, likely)
         if place < start:
             continue
-        key, hashed, row = keys[place], hashes[place & LAST], likely[place & LAST]
-        if row >= 0 and rows[row, KEY] != key:
+        voxel, slot = U(place), U(place & LAST)
+        key, hashed, row = keys[voxel], hashes[slot], likely[slot]
+        if row >= 0 and flat[first_word(row) + U(KEY)] != key:
             row = find_row(key, rows, table, depth)
         if row < 0:
             full = is_full(hashed, directory, held, depth)
             if not full or makes_room(hashed, table, state):
-                row = take_row(rows, flat, state)
+                row = take_row(flat, len(rows), state)
             if row < 0:
                 state[POINTS] += num_points
                 set_stamps(stamps, found[start:place], stamp)
                 return place
             insert_entry(hashed, row, directory, buckets, held, depth)
             state[VOXELS] += 1
-            clear_row(rows, row, key)
-        num_points += np.int64(count[place])
-        change_row(moments, view_weight, rows, row, place, 1)
-        found[place] = row
+            clear_row(flat, first_word(row), key)
+        num_points += np.int64(count[voxel])
+        change_row(words, view_weight, flat, first_word(row), voxel, 1)
+        found[voxel] = row
     state[POINTS] += num_points
     set_stamps(stamps, found[start:], stamp)
     return len(keys)
@@ -185,20 +188,22 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, 
 @njit(cache=True, nogil=True, inline='always')
 def set_stamps(stamps, found, stamp):
     """Stamp the rows (K,) int32."""
-    for place in range(len(found)):
-        if place + EARLY < len(found):
-            prefetch_early(stamps, np.int64(found[place + EARLY]))
-        stamps[found[place]] = stamp
+    num = U(len(found))
+    for place in range(num):
+        if place + U(EARLY) < num:
+            prefetch_early(stamps, np.int64(found[place + U(EARLY)]))
+        stamps[U(found[place])] = stamp
 
 
 @njit(cache=True, nogil=True, inline='always')
-def take_row(rows, flat, state):
+def take_row(flat, num_rows, state):
     """Return a free row and prefetch a later one; -1 if there is none."""
     row = state[FREE_ROW]
     if row >= 0:
-        state[FREE_ROW] = (rows[row, FREE] & LOW) - 1
-        prefetch_row(flat, max((rows[row, FREE] >> HIGH_BITS) - 1, 0))
-    elif state[ROWS_USED] < len(rows):
+        links = flat[first_word(row) + U(FREE)]
+        state[FREE_ROW] = (links & LOW) - 1
+        prefetch_row(flat, max((links >> HIGH_BITS) - 1, 0))
+    elif state[ROWS_USED] < num_rows:
         row = state[ROWS_USED]
         state[ROWS_USED] = row + 1
     return row
@@ -225,108 +230,121 @@ def remove_moments(
     failure: a pass of checks before it would read every row from memory twice.
     """
     keys, count, _, _, _ = moments
+    words = words_of(moments)
     directory, buckets, num_held, _ = table
     used, depth = state[ROWS_USED], state[DEPTH]
     flat = rows.ravel()
-    emptied = np.empty(len(keys), np.int32)
+    emptied, hashes = np.empty(len(keys), np.int32), np.empty(len(keys), np.int64)
     num_emptied = num_fallen = 0
     num_points = np.int64(0)
     free = state[FREE_ROW]
-    for place in range(len(keys)):
-        if place + EARLY < len(keys):
-            prefetch_row_early(flat, np.int64(found[place + EARLY]))
-            prefetch_row(flat, np.int64(found[place + AHEAD]))
+    num = U(len(keys))
+    for place in range(num):
+        if place + U(EARLY) < num:
+            prefetch_row_early(flat, np.int64(found[place + U(EARLY)]))
+            prefetch_row(flat, np.int64(found[place + U(AHEAD)]))
         key, n = keys[place], np.int64(count[place])
         row = np.int64(found[place])
-        if not (0 <= row < used and rows[row, KEY] == key and count_of(rows, row) > 0):
+        if not (0 <= row < used and is_voxel(flat, first_word(row), key)):
             row = find_row(key, rows, table, depth)
             found[place] = row
-        held = count_of(rows, row) if row >= 0 else np.int64(-1)
-        if held < n or (held == n and not holds_exactly(moments, view_weight, rows, row, place)):
-            put_back(moments, view_weight, rows, found, place)
-            return place, 0
+        at = first_word(max(row, 0))
+        held = count_of(flat, at) if row >= 0 else np.int64(-1)
+        if held < n or (held == n and not holds_exactly(words, view_weight, flat, at, place)):
+            put_back(keys, words, view_weight, flat, found, place)
+            return np.int64(place), 0
         if held >= min_points > held - n:
             fallen[num_fallen, 0], fallen[num_fallen, 1], fallen[num_fallen, 2] = unpack(key)
             num_fallen += 1
         if held == n:
             later = np.int64(-1)
             if num_emptied >= AHEAD:
-                later = np.int64(found[emptied[num_emptied - AHEAD]])
-            rows[row, KEY] = -1
-            rows[row, VIEW] = rows[row, VIEW + 1] = 0  # and with them the count
-            rows[row, FREE] = ((later + 1) << HIGH_BITS) | (free + 1)
+                later = np.int64(found[U(emptied[U(num_emptied - AHEAD)])])
+            flat[at + U(KEY)] = -1
+            flat[at + U(VIEW)] = flat[at + U(VIEW + 1)] = 0  # and with them the count
+            flat[at + U(FREE)] = ((later + 1) << HIGH_BITS) | (free + 1)
             free = row
-            emptied[num_emptied] = place
+            emptied[U(num_emptied)], hashes[U(num_emptied)] = place, hash_key(key)
             num_emptied += 1
         else:
-            change_row(moments, view_weight, rows, row, place, -1)
+            change_row(words, view_weight, flat, at, place, -1)
         num_points += n
     state[POINTS] -= num_points
     state[FREE_ROW] = free
     set_stamps(stamps, found, stamp)
     state[VOXELS] -= num_emptied
-    for i in range(num_emptied):
-        if i + HASHED < num_emptied:
-            hashed = hash_key(keys[emptied[i + HASHED]])
-            prefetch(directory, hashed >> (32 - depth))
-            earlier = hash_key(keys[emptied[i + EARLIER]])
+    num = U(num_emptied)
+    for i in range(num):
+        if i + U(HASHED) < num:
+            prefetch(directory, hashes[i + U(HASHED)] >> (32 - depth))
+            earlier, nearer = hashes[i + U(EARLIER)], hashes[i + U(NEARER)]
             prefetch_early(buckets, first_bucket(earlier, directory, depth))
-            nearer = hash_key(keys[emptied[i + NEARER]])
             prefetch(buckets, first_bucket(nearer, directory, depth))
-        place = emptied[i]
-        row = np.int64(found[place])
-        remove_entry(keys[place], row, directory, buckets, num_held, depth)
-        stamps[row] = stamp | EMPTIED
-    return -1, num_fallen
+        row = np.int64(found[U(emptied[i])])
+        remove_entry(hashes[i], row, directory, buckets, num_held, depth)
+        stamps[U(row)] = stamp | EMPTIED
+    return np.int64(-1), num_fallen
+
+
+@njit(cache=True, nogil=True, inline='always')
+def is_voxel(flat, at, key):
+    """Return whether the row that begins at a word holds points of the voxel with a key."""
+    return (flat[at + U(KEY)] == key) & (count_of(flat, at) > 0)
 
 
 @part()
-def put_back(moments, view_weight, rows, found, num):
+def put_back(keys, words, view_weight, flat, found, num):
     """Add the moments of the first num voxels, which were subtracted, to their rows (K,) again."""
-    keys, _, _, _, _ = moments
-    for place in range(num):
-        row = np.int64(found[place])
-        if count_of(rows, row) == 0:
-            clear_row(rows, row, keys[place])
-        change_row(moments, view_weight, rows, row, place, 1)
+    for place in range(U(num)):
+        at = first_word(found[place])
+        if count_of(flat, at) == 0:
+            clear_row(flat, at, keys[place])
+        change_row(words, view_weight, flat, at, place, 1)
 
 
 @njit(cache=True, nogil=True, inline='always')
-def clear_row(rows, row, key):
+def clear_row(flat, at, key):
     """Set a row to a key and zeros."""
-    for column in range(ROW):
-        rows[row, column] = 0
-    rows[row, KEY] = key
+    for column in range(U(ROW)):
+        flat[at + column] = 0
+    flat[at + U(KEY)] = key
 
 
 @njit(cache=True, nogil=True, inline='always')
-def change_row(moments, view_weight, rows, row, place, sign):
-    """Add the moments of a voxel to its row, or subtract them with a sign of -1."""
+def words_of(moments):
+    """Return the moments of a scan without keys, tables as their words one after another."""
     _, count, total, product, view = moments
+    return count, total.ravel(), product.ravel(), view.ravel()
+
+
+@njit(cache=True, nogil=True, inline='always')
+def change_row(words, view_weight, flat, at, place, sign):
+    """Add the moments of a voxel, as words_of returns them, to its row; subtract with sign -1."""
+    count, total, product, view = words
     n = np.int64(count[place])
     weight = sign * (n if view_weight == 0 else np.int64(1))
-    sx, sy, sz = total[place, 0], total[place, 1], total[place, 2]
-    vx, vy, vz = view[place, 0], view[place, 1], view[place, 2]
-    sums = sign * np.int64(sx), sign * np.int64(sy), sign * np.int64(sz)
-    views = weight * np.int64(vx), weight * np.int64(vy), weight * np.int64(vz)
-    add_to_row(rows, row, sign * n, sums, views)
-    for pair in range(6):
-        rows[row, PRODUCT + pair] += sign * product[place, pair]
+    x, y, z = U(3) * place, U(3) * place + U(1), U(3) * place + U(2)
+    sums = sign * np.int64(total[x]), sign * np.int64(total[y]), sign * np.int64(total[z])
+    views = weight * np.int64(view[x]), weight * np.int64(view[y]), weight * np.int64(view[z])
+    add_to_row(flat, at, sign * n, sums, views)
+    for pair in range(U(6)):
+        flat[at + U(PRODUCT) + pair] += sign * product[U(6) * place + pair]
 
 
 @part()
-def holds_exactly(moments, view_weight, rows, row, place):
-    """Return whether the sums of a row are the moments of a voxel."""
-    _, count, total, product, view = moments
+def holds_exactly(words, view_weight, flat, at, place):
+    """Return whether the sums of a row are the moments of a voxel, as words_of returns them."""
+    count, total, product, view = words
     weight = np.int64(count[place]) if view_weight == 0 else np.int64(1)
-    x, y, z = view_of(rows, row)
-    equal = x == weight * view[place, 0]
-    equal &= y == weight * view[place, 1]
-    equal &= z == weight * view[place, 2]
+    x, y, z = view_of(flat, at)
+    first = U(3) * place
+    equal = x == weight * view[first]
+    equal &= y == weight * view[first + U(1)]
+    equal &= z == weight * view[first + U(2)]
     for axis in range(3):
-        equal &= sum_of(rows, row, axis) == total[place, axis]
-    for pair in range(6):
-        equal &= rows[row, PRODUCT + pair] == product[place, pair]
+        equal &= sum_of(flat, at, axis) == total[first + U(axis)]
+    for pair in range(U(6)):
+        equal &= flat[at + U(PRODUCT) + pair] == product[U(6) * place + pair]
     return equal
 
 

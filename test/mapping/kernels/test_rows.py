@@ -67,12 +67,19 @@ def test_sums_are_added_to_a_row_and_subtracted_again(call):
     added = []
     for step in random_moments(200) // 256:  # their sums stay within the limits
         n, total, view = int(step[0]), tuple(step[1:4].tolist()), tuple(step[10:].tolist())
-        call(add_to_row, rows, 0, n, total, view)
+        call(add_to_row, rows.ravel(), np.uint64(0), n, total, view)
         added.append((n, total, view))
         for column, value in zip([0, 1, 2, 3, 10, 11, 12], [n, *total, *view], strict=True):
             expected[column] += value
         assert unpacked(rows[0]) == expected
     for place in rng.permutation(len(added)):
         n, total, view = added[place]
-        call(add_to_row, rows, 0, -n, tuple(-t for t in total), tuple(-v for v in view))
+        call(
+            add_to_row,
+            rows.ravel(),
+            np.uint64(0),
+            -n,
+            tuple(-t for t in total),
+            tuple(-v for v in view),
+        )
     np.testing.assert_array_equal(rows, before)
