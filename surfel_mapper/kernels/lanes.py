@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Eight words of 64 bits, a line of the cache, in vector registers: sums of a voxel, and a bucket.
+Numbers in vector registers: eight words of 64 bits, sums of a voxel or a bucket; 32 floats.
 
 A reduction needs ten sums of each voxel of a scan: count, places (3) and products of places (6).
 Packed into eight words they fill one cache line, which one instruction reads and one writes where
@@ -20,6 +20,8 @@ them in a register makes adding twice as long.
 A bucket of the hash table of a map has eight entries. Compilers turn the loop over them into a
 chain of 16 conditional moves, and a look-up takes 1.2 times as long.
 
+A search for neighbours counts how many of up to 32 distances are below each of them.
+
 Interpreted, the functions work on arrays; compiled, the sums are a type of their own. Compilers do
 not find these instructions in loops, so they are spelled in the language of LLVM here, as are
 those of prefetch.py.
@@ -37,6 +39,9 @@ from surfel_mapper.kernels.layout import HIGH_BITS
 
 WORDS = 8
 """Words of the sums of a voxel, and entries of a bucket."""
+
+FLOATS = 32
+"""Number of floats that are compared at once."""
 
 FULL = (1 << 16) - 1
 """Number of points of a voxel up to which the sums are exact."""
@@ -111,6 +116,16 @@ def place_of_half(words, at, lower):
     return np.int64(equal.argmax() if equal.any() else WORDS)
 
 
+def num_below(floats, limit):
+    """
+    Return the number of floats[:32] that are below a limit.
+
+    floats  (32,) float32, no nan
+    limit   float32
+    """
+    return np.int64(np.count_nonzero(floats[:FLOATS] < limit))
+
+
 class Lanes(types.Type):
     """Eight words in vector registers; the type that compiled kernels give them."""
 
@@ -162,6 +177,11 @@ def _type_of_number(context):
 @type_callable(place_of_half)
 def _type_of_place(context):
     return lambda words, at, lower: types.int64
+
+
+@type_callable(num_below)
+def _type_of_number_below(context):
+    return lambda floats, limit: types.int64
 
 
 @lower_builtin(load_sums, types.Array, types.Integer)
@@ -227,6 +247,22 @@ def _emit_place_of_half(context, builder, signature, arguments):
     equal = builder.icmp_unsigned('==', lower, _spread(builder, arguments[2]))
     of_zero_too = ir.Constant(ir.IntType(1), 0)
     return builder.zext(builder.cttz(builder.bitcast(equal, _MASK), of_zero_too), _WORD)
+
+
+@lower_builtin(num_below, types.Array, types.float32)
+def _emit_num_below(context, builder, signature, arguments):
+    struct = context.make_array(signature.args[0])(context, builder, arguments[0])
+    eight = ir.VectorType(ir.FloatType(), WORDS)
+    address = builder.bitcast(struct.data, eight.as_pointer())
+    limit = builder.insert_element(ir.Constant(eight, ir.Undefined), arguments[1], _HALF_WORD(0))
+    limit = builder.shuffle_vector(limit, limit, _indices([0] * WORDS))
+    bits = _HALF_WORD(0)
+    for part in range(FLOATS // WORDS):  # eight at once: compilers have one instruction for that
+        floats = builder.load(builder.gep(address, [_HALF_WORD(part)]), align=4)
+        below = builder.bitcast(builder.fcmp_ordered('<', floats, limit), _MASK)
+        shifted = builder.shl(builder.zext(below, _HALF_WORD), _HALF_WORD(WORDS * part))
+        bits = builder.or_(bits, shifted)
+    return builder.zext(builder.ctpop(bits), _WORD)
 
 
 def _address(context, builder, signature, arguments):

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from surfel_mapper.kernels.lanes import (
+    FLOATS,
     FULL,
     highest_match,
     load_sums,
     masked_sum,
+    num_below,
     num_used,
     place_of_half,
     plus_place,
@@ -156,3 +158,23 @@ def test_the_first_word_with_a_lower_half_is_found(call, lower):
         assert place == [*lows[WORDS : 2 * WORDS].tolist(), lower].index(lower)
         found.add(int(place))
     assert found > {0, WORDS}
+
+
+@njit
+def count_below(floats, limit):
+    return num_below(floats, limit)
+
+
+@both
+def test_floats_below_a_limit_are_counted_wherever_they_are(call):
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        floats = np.full(FLOATS + 8, -1.0, np.float32)  # those past the last are not counted
+        floats[:FLOATS] = rng.choice(np.float32([0.0, 0.5, 1.0, 1e30, np.inf]), FLOATS)
+        for limit in np.float32([0.0, 0.25, 1.0, np.inf]):
+            expected = sum(value < limit for value in floats[:FLOATS].tolist())
+            assert call(count_below, floats, limit) == expected
+    for place in range(FLOATS):
+        floats = np.ones(FLOATS, np.float32)
+        floats[place] = 0.0
+        assert call(count_below, floats, np.float32(1.0)) == 1

@@ -21,6 +21,7 @@ import numpy as np
 from surfel_mapper.filters.kernels.search_tree import FIRST, LEAF, PARENT, RIGHT, U
 from surfel_mapper.filters.kernels.smallest import keep_least, largest, sort, VECTORS
 from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.lanes import FLOATS
 
 GATHERED = 256
 """Maximum number of leaves gathered for one leaf; if there are more, its points are searched for
@@ -118,19 +119,21 @@ def scan(xs, ys, zs, base, x, y, z, bound, count, squares, found, apart):
 
 
 @part()
-def search(xs, ys, zs, links, boxes, node, x, y, z, k, bound, squares, found, apart, stack):
+def search(xs, ys, zs, links, boxes, node, x, y, z, k, bound, held, apart, stack):
     """
     Search from a leaf upwards; return the number of points held and the bound.
 
-    squares  (C,) float64, out: squared distances of the points held; C at least k + 2 LEAF, a
-             multiple of VECTORS
-    found    (C,) int32, out: their places in the order of the tree
+    held  squares (C,) float64, out: squared distances of the points held; C at least k + 2 LEAF,
+          a multiple of VECTORS;
+          found (C,) int32, out: their places in the order of the tree;
+          floats (FLOATS,) float32, overwritten
     """
+    squares, found, floats = held
     full = U(len(squares) - LEAF)
     base = U(links[FIRST, node]) * U(LEAF)
     count = scan(xs, ys, zs, base, x, y, z, bound, U(0), squares, found, apart)
     if count > k:
-        bound = keep_least(squares, found, count, k, bound)
+        bound = keep_least(squares, found, count, k, bound, floats)
         count = k
     while links[PARENT, node] >= 0:
         node, stack[0] = sibling_of(links, node)
@@ -145,7 +148,7 @@ def search(xs, ys, zs, links, boxes, node, x, y, z, k, bound, squares, found, ap
                 base = U(links[FIRST, other]) * U(LEAF)
                 count = scan(xs, ys, zs, base, x, y, z, bound, count, squares, found, apart)
                 if count > full:
-                    bound = keep_least(squares, found, count, k, bound)
+                    bound = keep_least(squares, found, count, k, bound, floats)
                     count = k
             else:
                 left = other + 1
@@ -210,6 +213,8 @@ def find_nearest(tree, block, within_sq, ordered, rows, ids, squared):
     size = (max(U(2) * k, k + U(32)) + U(LEAF + VECTORS - 1)) & ~U(VECTORS - 1)
     full = size - U(LEAF)
     squares, found, apart = np.empty(size), np.empty(size, np.int32), np.empty(LEAF)
+    floats = np.empty(FLOATS, np.float32)
+    held = squares, found, floats
     stack, near = np.empty(128, np.int64), np.empty((6, GATHERED))
     low_x, low_y, low_z = near[0], near[1], near[2]
     high_x, high_y, high_z = near[3], near[4], near[5]
@@ -228,7 +233,7 @@ def find_nearest(tree, block, within_sq, ordered, rows, ids, squared):
             last_x, last_y, last_z = x, y, z
             if num_near < 0:
                 count, bound = search(
-                    xs, ys, zs, links, boxes, node, x, y, z, k, bound, squares, found, apart, stack
+                    xs, ys, zs, links, boxes, node, x, y, z, k, bound, held, apart, stack
                 )
             else:
                 for i in range(U(num_near)):
@@ -238,7 +243,7 @@ def find_nearest(tree, block, within_sq, ordered, rows, ids, squared):
                     gaps[i] = square(dx, dy, dz)
                 count = scan(xs, ys, zs, start, x, y, z, bound, U(0), squares, found, apart)
                 if count > k:
-                    bound = keep_least(squares, found, count, k, bound)
+                    bound = keep_least(squares, found, count, k, bound, floats)
                     count = k
                 num_taken = U(0)
                 for i in range(U(1), U(num_near)):
@@ -250,10 +255,10 @@ def find_nearest(tree, block, within_sq, ordered, rows, ids, squared):
                             xs, ys, zs, taken[i], x, y, z, bound, count, squares, found, apart
                         )
                         if count > full:
-                            bound = keep_least(squares, found, count, k, bound)
+                            bound = keep_least(squares, found, count, k, bound, floats)
                             count = k
             if count > k:
-                bound = keep_least(squares, found, count, k, bound)
+                bound = keep_least(squares, found, count, k, bound, floats)
             else:
                 bound = largest(squares, k) if count == k else within_sq
             count = min(count, k)

@@ -4,8 +4,8 @@
 The smallest of the squared distances that a search holds, and their order.
 
 A search holds some dozens of squares and the places of their points, and keeps the k smallest each
-time it holds too many. To avoid mispredicted branches, many squares are split by a limit that k of
-them are below, and a few by partitions.
+time it holds too many. To avoid mispredicted branches, up to 32 are selected by their ranks, and
+more are split by a limit that k of them are below. Equal ones are partitioned.
 
 Source: interpolation search, Peterson 1957; selection by partitions, Hoare 1961.
 """
@@ -16,31 +16,32 @@ import numpy as np
 
 from surfel_mapper.filters.kernels.search_tree import move_below, move_up_to, U
 from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.lanes import FLOATS, num_below
 
 VECTORS = 32
 """Squares are counted in steps of this number: four vectors of 512 bits."""
-
-FEW = 24
-"""Number of squares up to which partitions are faster than counting."""
 
 TRIALS = 8
 """Maximum number of limits tried; three or four are usual."""
 
 
 @kernel(error_model='numpy', fastmath={'nnan'})
-def keep_least(squares, found, count, k, high):
+def keep_least(squares, found, count, k, high, floats):
     """
     Move the k smallest of the first count squares to the front; return the largest of them.
 
     squares  (C,) float64, in and out; C a multiple of VECTORS, those past count are overwritten
     found    (C,) int32, in and out: places, moved with the squares
     high     float64: none of the squares is larger
+    floats   (FLOATS,) float32, overwritten
 
     On a surface the number of points within a distance grows with its square, so a limit with k
-    squares below it is found by a few interpolations, and counted with vector instructions. A few
-    squares, or equal ones, which no limit parts, are selected.
+    of many squares below it is found by a few interpolations, counted with vector instructions.
     """
-    if count <= U(FEW) or high == math.inf:
+    if count <= U(FLOATS):
+        count = U(keep_ranked(squares, found, count, k, floats))
+        return largest(squares, k) if count == k else select(squares, found, count, k)
+    if high == math.inf:
         return select(squares, found, count, k)
     end = (count + U(VECTORS - 1)) & ~U(VECTORS - 1)
     for i in range(count, end):
@@ -64,6 +65,22 @@ def keep_least(squares, found, count, k, high):
         else:
             high, num_high = limit, below
     return select(squares, found, count, k)
+
+
+@part()
+def keep_ranked(squares, found, count, k, floats):
+    """
+    Move the squares of rank below k, as float32, to the front; return their number.
+
+    The k smallest are among them. There are more if the next one is rounded to the same number.
+    """
+    for i in range(U(FLOATS)):
+        floats[i] = np.float32(squares[i]) if i < count else np.float32(math.inf)
+    kept = U(0)
+    for i in range(count):
+        squares[kept], found[kept] = squares[i], found[i]
+        kept += U(num_below(floats, floats[i]) < np.int64(k))
+    return kept
 
 
 @kernel(error_model='numpy', fastmath={'nnan'})

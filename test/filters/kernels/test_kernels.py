@@ -26,6 +26,7 @@ from surfel_mapper.filters.kernels.shapes import group_moments, neighbour_moment
 from surfel_mapper.filters.kernels.smallest import keep_least, VECTORS
 from surfel_mapper.filters.shapes import PAIRS
 from surfel_mapper.kernels.grouping import CHUNK
+from surfel_mapper.kernels.lanes import FLOATS
 from surfel_mapper.kernels.selection import compact
 from surfel_mapper.kernels.voxel_grid import group_points, ROWS
 from test.kernels.modes import both, compiled, printed_alike
@@ -252,7 +253,8 @@ def test_the_smallest_squares_are_kept_with_their_places(call, draw, number, k):
         squares = np.full(-(-number // VECTORS) * VECTORS, np.nan)
         squares[:number] = given
         found = np.arange(len(squares), dtype=np.int32)
-        bound = call(keep_least, squares, found, np.uint64(number), np.uint64(k), high)
+        floats = np.empty(FLOATS, np.float32)
+        bound = call(keep_least, squares, found, np.uint64(number), np.uint64(k), high, floats)
         assert bound == np.sort(given)[k - 1]
         np.testing.assert_array_equal(np.sort(squares[:k]), np.sort(given)[:k])
         np.testing.assert_array_equal(squares[:k], given[found[:k]])
