@@ -17,12 +17,16 @@ from functools import partial
 
 from numba import njit
 from numba.core.event import install_listener, install_recorder, Listener
+import numpy as np
 
 kernel = partial(njit, cache=True, nogil=True, no_cfunc_wrapper=True)
 """Compile a function that Python calls; takes the options of njit."""
 
 part = partial(kernel, inline='always')
 """Compile a function as lines of each kernel that calls it, with the options of that kernel."""
+
+U = np.uint64
+"""Unsigned indices: numba tests signed ones for being negative, and loops are not vectorised."""
 
 
 @contextmanager

@@ -14,7 +14,7 @@ Source: Fibonacci hashing, Knuth, The Art of Computer Programming, vol. 3, 6.4.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.prefetch import prefetch
 
 CHUNK = 1024
@@ -23,8 +23,6 @@ CHUNK = 1024
 AHEAD = 32
 """Number of runs between the prefetch of a table entry and its use."""
 
-U = np.uint64
-"""Unsigned indices: numba tests signed ones for being negative."""
 
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 

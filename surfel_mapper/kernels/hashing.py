@@ -27,8 +27,7 @@ Source: Fagin et al. 1979, Extendible hashing; deletion after algorithm R of Knu
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import part
-from surfel_mapper.kernels.grouping import U
+from surfel_mapper.kernels.compiling import part, U
 from surfel_mapper.kernels.lanes import highest_match, num_used, place_of_half, WORDS
 from surfel_mapper.kernels.layout import KEY
 

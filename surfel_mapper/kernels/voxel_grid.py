@@ -15,15 +15,8 @@ the scan. There is no dense grid.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
-from surfel_mapper.kernels.grouping import (
-    AHEAD,
-    CHUNK,
-    enlarged_table,
-    find_runs,
-    number_runs,
-    U,
-)
+from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.grouping import AHEAD, CHUNK, enlarged_table, find_runs, number_runs
 
 ROWS = 4096
 """Initial number of voxels that the table has room for."""

@@ -18,9 +18,9 @@ import math
 
 import numpy as np
 
-from surfel_mapper.filters.kernels.search_tree import FIRST, LEAF, PARENT, RIGHT, U
+from surfel_mapper.filters.kernels.search_tree import FIRST, LEAF, PARENT, RIGHT
 from surfel_mapper.filters.kernels.smallest import keep_least, largest, sort, VECTORS
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.lanes import FLOATS
 
 GATHERED = 256

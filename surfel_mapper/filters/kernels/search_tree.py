@@ -19,15 +19,12 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import kernel, part, U
 
 LEAF = 16
 """Points of a leaf; 8 and 12 were slower."""
 
 FIRST, RIGHT, PARENT = range(3)
-
-U = np.uint64
-"""Unsigned indices: numba tests signed ones for being negative, and loops are not vectorised."""
 
 
 @kernel(fastmath={'nnan'})

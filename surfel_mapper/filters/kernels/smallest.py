@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from surfel_mapper.filters.kernels.search_tree import move_below, move_up_to, U
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.filters.kernels.search_tree import move_below, move_up_to
+from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.lanes import FLOATS, num_below
 
 VECTORS = 32

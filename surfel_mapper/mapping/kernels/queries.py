@@ -16,8 +16,8 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel
-from surfel_mapper.kernels.grouping import find_key, hash_shift, U
+from surfel_mapper.kernels.compiling import kernel, U
+from surfel_mapper.kernels.grouping import find_key, hash_shift
 from surfel_mapper.kernels.layout import (
     EMPTIED,
     INDEX_OFFSET,

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.grouping import (
     CHUNK,
     find_key,
@@ -24,7 +24,6 @@ from surfel_mapper.kernels.grouping import (
     hash_shift,
     home,
     number_runs,
-    U,
 )
 from surfel_mapper.kernels.lanes import (
     load_sums,

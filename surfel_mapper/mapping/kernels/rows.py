@@ -15,8 +15,7 @@ tests for negative indices: adding a scan took 1.1 times as long.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel
-from surfel_mapper.kernels.grouping import U
+from surfel_mapper.kernels.compiling import kernel, U
 from surfel_mapper.kernels.layout import KEY, PIECE, PRODUCT, ROW, SUM, VIEW
 from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
 

@@ -13,8 +13,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
-from surfel_mapper.kernels.grouping import U
+from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.layout import KEY, PRODUCT
 from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work

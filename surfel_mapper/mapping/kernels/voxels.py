@@ -24,8 +24,8 @@ One module: all work on the moments of a scan and the rows of the same voxels.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
-from surfel_mapper.kernels.grouping import hash_shift, home, U
+from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.grouping import hash_shift, home
 from surfel_mapper.kernels.hashing import (
     DEPTH,
     find_row,
