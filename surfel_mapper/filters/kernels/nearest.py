@@ -9,7 +9,7 @@ leaves that can matter to any point of the leaf are gathered once, and each poin
 bound with their boxes, with vector instructions. That bound follows from the one of the point
 before by the triangle inequality. Distances below the bound are appended without a branch, and the
 k smallest are kept when the buffer is full and at the end. 120,000 points of a lidar, k = 10:
-0.07 s; scipy's tree takes 0.4 s.
+0.06 s; scipy's tree takes 0.24 s.
 
 Source: Friedman, Bentley and Finkel 1977 for the search by bounds.
 """
