@@ -167,7 +167,7 @@ def warm_up() -> None:
 
 
 def _valid_times(points: npt.NDArray[Any], column: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
-    """Return times, int64 or float64, invalid ones replaced by a valid one; None if none is."""
+    """Return times as int64 or float64, of invalid points that of a valid one; None if none is."""
     values = column.astype(np.float64 if column.dtype.kind == 'f' else np.int64)
     filled = np.empty_like(values)
     xyz = np.require(points, None, ['F', 'A', 'W']).T

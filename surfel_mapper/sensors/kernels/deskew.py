@@ -23,7 +23,7 @@ NEVER = np.iinfo(np.int64).max
 @kernel()
 def fill_times(points, values, filled):
     """
-    Copy the times of points, in place of those of invalid points the first valid one.
+    Copy the times of points; an invalid point gets the time of the first valid one.
 
     points  (3, N) float32 or float64, m; invalid in the origin, and if not finite
     values  (N,) int64 or float64, times; that of a valid point is finite
@@ -37,9 +37,9 @@ def fill_times(points, values, filled):
         first += 1
     if first == num:
         return False
-    instead = values[first]
+    valid = values[first]
     for i in range(np.uint64(num)):
-        filled[i] = values[i] if is_valid(x[i], y[i], z[i], values[i]) else instead
+        filled[i] = values[i] if is_valid(x[i], y[i], z[i], values[i]) else valid
     return True
 
 
