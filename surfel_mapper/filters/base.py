@@ -122,7 +122,11 @@ class Filter(Settings):
         """Check conditions on several parameters; raise ConfigError."""
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay, (N,) bool; not called for filters that implement ``apply``."""
+        """
+        Return which points stay, (N,) bool; not called for filters that implement ``apply``.
+
+        The array must not be changed later: columns are selected by it when they are read.
+        """
         # not abstract, because filters with apply have no keep; register refuses one with neither
         raise NotImplementedError(f'{type(self).__name__}: implement keep or apply')
 
