@@ -158,12 +158,13 @@ def deskewing(
 
 
 def warm_up() -> None:
-    """Compile the kernels for all types that points and times may have."""
+    """Compile the kernels, but for reading the times of points in double precision: too rare."""
+    scan = Scan(points=np.ones((1, 3), np.float32), stamp_ns=0, frame_id='')
+    for dtype in (np.uint32, np.float32):
+        times = point_times(replace(scan, columns={'t': np.zeros(1, dtype)}))
     for dtype in (np.float32, np.float64):
-        for time in (np.uint32, np.float32):
-            columns = {'t': np.zeros(1, time)}
-            scan = Scan(points=np.ones((1, 3), dtype), stamp_ns=0, frame_id='', columns=columns)
-            deskewed(replace(scan, times=point_times(scan)), lambda _: np.eye(4))
+        points = scan.points.astype(dtype)
+        deskewed(replace(scan, points=points, times=times), lambda _: np.eye(4))
 
 
 def _valid_times(points: npt.NDArray[Any], column: npt.NDArray[Any]) -> npt.NDArray[Any] | None:

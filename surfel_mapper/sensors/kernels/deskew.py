@@ -67,7 +67,7 @@ def count_from_stamp(values, base, limit, unit_ns, shift_ns, offsets):
         offsets[i] = np.int64(np.rint(ticks)) + shift_ns
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def move_points(points, offsets, knots, poses, turns, min_range_sq, moved):
     """
     Move points to the pose of the scan.
@@ -135,7 +135,7 @@ def move_points(points, offsets, knots, poses, turns, min_range_sq, moved):
             begin = stop
 
 
-@njit(cache=True, nogil=True)
+@part()
 def move_run(points, offsets, near, start, end, pair, turn, moved):
     """
     Move the points of a run, all between the same two knots.
