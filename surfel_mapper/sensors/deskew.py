@@ -160,8 +160,8 @@ def deskewing(
 def warm_up() -> None:
     """Compile the kernels, but for reading the times of points in double precision: too rare."""
     scan = Scan(points=np.ones((1, 3), np.float32), stamp_ns=0, frame_id='')
-    for dtype in (np.uint32, np.float32):
-        times = point_times(replace(scan, columns={'t': np.zeros(1, dtype)}))
+    for column in (np.zeros(1, np.uint32), np.zeros(1, np.float32)):
+        times = point_times(replace(scan, columns={'t': column}))
     for dtype in (np.float32, np.float64):
         points = scan.points.astype(dtype)
         deskewed(replace(scan, points=points, times=times), lambda _: np.eye(4))
