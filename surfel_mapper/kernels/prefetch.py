@@ -8,10 +8,10 @@ knows some iterations ahead. Prefetching hides most of the cache misses.
 
 A line may be prefetched twice: early into the second level of the cache, which waits for more
 lines at once, and later into the first. With the first level alone a look-up of 100,000 voxels in
-a map of 10^6 took 1.6 times as long as with the second alone. But processors may ignore the early
-one, for some milliseconds after other work has used much of the bandwidth of the memory, or in one
-process in five as long as it runs, so the later one is needed too. Prefetch no address outside of
-an array: translating it takes longer than a miss.
+a map of 10^6 took 1.6 times as long as with the second alone. With the early one alone adding took
+twice as long for some milliseconds after other work had used much of the bandwidth of the memory,
+and in some processes as long as they ran, so the later one is needed too. Prefetch no address
+outside of an array: translating it takes longer than a miss.
 
 Stands alone: one of the two places that emit instructions of LLVM.
 """
