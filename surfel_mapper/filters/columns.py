@@ -9,7 +9,7 @@ times are ordinary columns here. Clouds often carry the normal as three fields; 
 turns these into ``normals``.
 
 Columns are picked lazily. A cloud carries intensity, ring and time, mostly unused: only the
-coordinates are mapped. Picking one column from the bytes of the message costs as much as
+coordinates are mapped. Picking one column from the bytes of the message takes twice as long as
 filtering the coordinates (0.3 ms for 131,072 points), and that at every filter of a chain. The
 columns of points that a filter merges are in merging.py.
 """

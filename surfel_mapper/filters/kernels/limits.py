@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Points inside a box that is rotated against their frame, or seen in certain directions; ranges.
+Distances of points, and points inside a box turned against their frame, or seen in a direction.
 
 One pass without branches over three arrays, several points at once, and sides of edges in place of
 angles: 0.1 ms for 131,072 points. numpy needs a pass and memory for each of 18 products and sums,
