@@ -36,8 +36,8 @@ MAX_MAP_COUNT = 1 << 31
 """Maximum number of points of a map in a voxel: int64 sums of their moments do not overflow."""
 
 COUNT_BITS, HIGH_BITS = 40, 32
-"""The place of a point in its voxel, x y z from its lower corner in [0, 65536), is kept in two
-words: 1 << COUNT_BITS | x, and z << HIGH_BITS | y. So their sums hold count and sums of places."""
+"""Sums of the places of points in their voxel take two words: count << COUNT_BITS | sum of x, and
+sum of z << HIGH_BITS | sum of y."""
 
 VIEW_SCALE = 1 << 14
 """Length of the integer vectors that point from a voxel to the sensor."""

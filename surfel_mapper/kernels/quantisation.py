@@ -19,8 +19,6 @@ import numpy as np
 from surfel_mapper.kernels.compiling import part
 from surfel_mapper.kernels.layout import (
     BITS,
-    COUNT_BITS,
-    HIGH_BITS,
     INDEX_BITS,
     INDEX_MASK,
     INDEX_OFFSET,
@@ -39,6 +37,9 @@ INDEX_AND_PLACE = (1 << (INDEX_BITS + BITS)) - 1
 PLACE = (1 << BITS) - 1
 """Mask of the place in X."""
 
+ONE = 1 << (3 * BITS)
+"""The highest quarter of a place: a count of one point."""
+
 
 @part(error_model='numpy')
 def quantise(x, y, z, pose, scale, range_sq, keys, places):
@@ -47,8 +48,8 @@ def quantise(x, y, z, pose, scale, range_sq, keys, places):
 
     x, y, z  (C,) float32 or float64, sensor frame, m
     keys     (CHUNK,) int64, out: voxel keys, -1 for points that are rejected
-    places   (2, CHUNK) int64, out: places in the voxels, two words each, see kernels/layout.py;
-             any place for points that are rejected
+    places   (CHUNK,) int64, out: ONE | z << 32 | y << 16 | x, with x, y, z in [0, 65536) from the
+             lower corner of the voxel; any place for points that are rejected
 
     pose, scale, range_sq  see reduce_points
     """
@@ -56,7 +57,6 @@ def quantise(x, y, z, pose, scale, range_sq, keys, places):
     r10, r11, r12, t1 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     r20, r21, r22, t2 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
     near_sq, far_sq = range_sq[0], range_sq[1]
-    first, second = places[0], places[1]
     for i in range(len(x)):
         px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
         distance_sq = (px * px + py * py) + pz * pz
@@ -74,8 +74,7 @@ def quantise(x, y, z, pose, scale, range_sq, keys, places):
         ix, iy, iz = qx >> BITS, qy >> BITS, qz >> BITS
         key = (ix << (2 * INDEX_BITS)) | (iy << INDEX_BITS) | iz
         keys[i] = key if enters else -1
-        first[i] = (1 << COUNT_BITS) | (qx & PLACE)
-        second[i] = ((qz & PLACE) << HIGH_BITS) | (qy & PLACE)
+        places[i] = ((qz & PLACE) << (2 * BITS)) | ((qy & PLACE) << BITS) | (qx & PLACE) | ONE
 
 
 @njit(cache=True, nogil=True, inline='always')

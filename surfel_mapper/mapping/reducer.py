@@ -71,7 +71,7 @@ class Scratch:
         self.left_out = np.zeros(4, np.int64)
         self._chunk = (
             np.zeros(CHUNK + 1, np.int64),
-            np.empty((2, CHUNK), np.int64),
+            np.empty(CHUNK, np.int64),
             np.zeros(CHUNK + AHEAD, np.int32),
             np.zeros(CHUNK + AHEAD, np.int32),
         )

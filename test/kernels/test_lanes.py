@@ -31,9 +31,8 @@ HIGHEST = 65535
 def add_at(words, at, places, mask):
     sums = load_sums(words, at)
     for i in range(len(places)):
-        first = (1 << COUNT_BITS) | places[i, 0]
-        second = (places[i, 2] << HIGH_BITS) | places[i, 1]
-        others = plus_place(load_sums(words, np.uint64(0)), first, second)
+        place = (1 << 48) | (places[i, 2] << 32) | (places[i, 1] << 16) | places[i, 0]
+        others = plus_place(load_sums(words, np.uint64(0)), place)
         sums = masked_sum(sums, mask, others)
     store_sums(words, at, sums)
 

@@ -29,6 +29,7 @@ from surfel_mapper.kernels.lanes import (
     load_sums,
     masked_sum,
     plus_place,
+    stay_apart,
     store_sums,
     WORDS,
 )
@@ -58,7 +59,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
               appearance, E <= B / 2;
               sums (E + 2, WORDS) int64, out: from sums[1] on those of the places in the voxel,
               as lanes.py packs them; those of more than FULL points are wrong;
-              of one chunk: chunk_keys (CHUNK + 1,) int64, places (2, CHUNK) int64,
+              of one chunk: chunk_keys (CHUNK + 1,) int64, places (CHUNK,) int64,
               starts (CHUNK + AHEAD,) int32, run_rows (CHUNK,) int32; zeros before the first use
     left_out  (4,) int64, out: number of points rejected as not finite, too near, too far, beyond
               the voxel indices
@@ -97,12 +98,12 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     return num_rows - 1
 
 
-@part()
+@kernel()
 def add_places(places, num, chunk_keys, run_rows, words):
     """
     Add the places of a chunk of points to the sums of their voxels.
 
-    places      (2, CHUNK) int64, of which num count, at least one; see quantise
+    places      (CHUNK,) int64, of which num count, at least one; see quantise
     chunk_keys  (CHUNK + 1,) int64, voxel key of each point
     run_rows    (CHUNK,) int32, row of the voxel of each run
     words       (8 M,) int64, in and out: sums of the voxels; the last eight are zero
@@ -112,7 +113,7 @@ def add_places(places, num, chunk_keys, run_rows, words):
     of its voxel. A point of the same run takes the zeros at the end instead, because reading
     the row that the point before it wrote would wait for that write.
     """
-    first, second = places[0], places[1]
+    stay_apart()
     zeros = U(len(words) - WORDS)
     run, previous = U(0), chunk_keys[0]
     sums = load_sums(words, U(WORDS) * U(np.uint32(run_rows[run])))
@@ -122,7 +123,7 @@ def add_places(places, num, chunk_keys, run_rows, words):
         run += U(is_new)
         at = U(WORDS) * U(np.uint32(run_rows[run]))
         others = load_sums(words, at if is_new else zeros)
-        others = plus_place(others, first[i], second[i])
+        others = plus_place(others, places[i])
         sums = masked_sum(sums, np.int64(is_new) - 1, others)
         store_sums(words, at, sums)
 
@@ -233,7 +234,7 @@ def sum_channels(xyz, pose, scale, range_sq, keys, table, values, sums):
     sums    (K, C) int64, out
     """
     chunk_keys = np.empty(CHUNK, np.int64)
-    places = np.empty((2, CHUNK), np.int64)
+    places = np.empty(CHUNK, np.int64)
     starts = np.empty(CHUNK + 1, np.int32)
     shift = hash_shift(len(table))
     sums[:, :] = 0

@@ -31,7 +31,7 @@ def attach_surfels(xyz, quantisation, surfels, keys, table, floats, counts):
     x, y, z = xyz
     shift = hash_shift(len(table))
     chunk_keys = np.empty(CHUNK, np.int64)
-    places = np.empty((2, CHUNK), np.int64)
+    places = np.empty(CHUNK, np.int64)
     for start in range(0, len(x), CHUNK):
         end = min(start + CHUNK, len(x))
         quantise(

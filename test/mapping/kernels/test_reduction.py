@@ -55,7 +55,7 @@ def scratch_for(num_voxels):
     size = 1 << (2 * num_voxels - 1).bit_length()
     keys = np.full(num_voxels + 2, -7, np.int64)
     sums = np.full((num_voxels + 2, WORDS), -9, np.int64)
-    chunk_keys, places = np.zeros(CHUNK + 1, np.int64), np.empty((2, CHUNK), np.int64)
+    chunk_keys, places = np.zeros(CHUNK + 1, np.int64), np.empty(CHUNK, np.int64)
     starts, run_rows = np.zeros(CHUNK + AHEAD, np.int32), np.empty(CHUNK, np.int32)
     return np.full(size, -1, np.int32), keys, sums, chunk_keys, places, starts, run_rows
 
@@ -66,7 +66,7 @@ def scratch_for(num_voxels):
 def test_points_are_quantised_as_by_python(call, dtype, turned):
     pose = pose_matrix([3.0, 1e4, -2.0], [0.5, -0.5, 0.1, 0.7]) if turned else np.eye(4)
     points = some_points(300, dtype)
-    keys, places = np.empty(CHUNK, np.int64), np.empty((2, CHUNK), np.int64)
+    keys, places = np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int64)
 
     call(quantise, *points.T.copy(), pose[:3], 65536 / 0.2, ANY_RANGE, keys, places)
 
@@ -78,7 +78,7 @@ def test_points_are_quantised_as_by_python(call, dtype, turned):
             voxel, place = expected
             assert keys[row] == pack_keys(np.array([voxel]))[0]
             x, y, z = (coordinate + HALF for coordinate in place)
-            assert places[:, row].tolist() == [2**40 + x, z * 2**32 + y]
+            assert places[row] == 2**48 + z * 2**32 + y * 2**16 + x
 
 
 @both
@@ -91,20 +91,19 @@ def test_points_enter_up_to_the_last_voxel_and_no_farther(call, axis):
     points = np.full((len(values), 3), 0.1)
     points[:, axis] = values
     points[:, axis] *= 0.5
-    keys, places = np.empty(CHUNK, np.int64), np.empty((2, CHUNK), np.int64)
+    keys, places = np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int64)
     with np.errstate(all='ignore'):
         call(quantise, *points.T.copy(), IDENTITY, 131072.0, ANY_RANGE, keys, places)
     enters = (keys[: len(values)] >= 0).tolist()
     assert enters == [-(2**20) <= value < 2**20 for value in values]
     assert [keys[row] >> (42 - 21 * axis) & 0x1FFFFF for row in (0, 1)] == [0x1FFFFF, 0]
-    word, below = [(0, 0), (1, 0), (1, 32)][axis]
-    assert places[word, 0] >> below & 65535 == 65535
+    assert places[0] >> 16 * axis & 65535 == 65535
 
 
 @both
 def test_points_outside_of_the_range_get_no_key(call):
     points = np.array([[1.0, 0, 0], [0, 2.0, 0], [0, 0, -3.0], [0.9, 0, 0], [0, -3.1, 0]])
-    keys, places = np.empty(CHUNK, np.int64), np.empty((2, CHUNK), np.int64)
+    keys, places = np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int64)
     limits = np.array([1.0, 9.0])
     call(quantise, *points.T.copy(), IDENTITY, 131072.0, limits, keys, places)
     assert (keys[:5] >= 0).tolist() == [True, True, True, False, False]
@@ -122,9 +121,9 @@ def test_runs_are_those_of_groupby(call, keys):
 
 
 def packed(places):
-    """Return places (3, C) in words, (2, C) int64."""
+    """Return places (3, C) as quantise writes them, (C,) int64."""
     x, y, z = places
-    return np.array([2**40 + x, z * 2**32 + y])
+    return 2**48 + z * 2**32 + y * 2**16 + x
 
 
 def unpacked(call, sums):
