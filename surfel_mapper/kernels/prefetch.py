@@ -30,7 +30,7 @@ def prefetch(array, index):
     Prefetch the cache line of array[index]; changes nothing. The index is not checked.
 
     array  one-dimensional, contiguous
-    index  int64
+    index  int64 or uint64
     """
 
 
@@ -38,7 +38,12 @@ def prefetch_early(array, index):
     """Prefetch as ``prefetch`` does, but into the second level of the cache, if at all."""
 
 
+def prefetch_to_write(array, index):
+    """Prefetch as ``prefetch`` does, for writing where the processor tells it from reading."""
+
+
 @type_callable(prefetch)
+@type_callable(prefetch_to_write)
 @type_callable(prefetch_early)
 def _returns_nothing(context):
     return lambda array, index: types.none
@@ -56,7 +61,12 @@ def _emit_prefetch_early(context, builder, signature, arguments):
     return _emit(context, builder, signature, arguments, SECOND_LEVEL)
 
 
-def _emit(context, builder, signature, arguments, level):
+@lower_builtin(prefetch_to_write, types.Array, types.Integer)
+def _emit_prefetch_to_write(context, builder, signature, arguments):
+    return _emit(context, builder, signature, arguments, FIRST_LEVEL, is_written=True)
+
+
+def _emit(context, builder, signature, arguments, level, is_written=False):
     array_type, _ = signature.args
     struct = context.make_array(array_type)(context, builder, arguments[0])
     pointer = cgutils.get_item_pointer(
@@ -66,6 +76,6 @@ def _emit(context, builder, signature, arguments, level):
     number = ir.IntType(32)
     takes = ir.FunctionType(ir.VoidType(), [pointer.type, number, number, number])
     function = builder.module.declare_intrinsic('llvm.prefetch', [pointer.type], takes)
-    for_reading, data = number(0), number(1)
-    builder.call(function, [pointer, for_reading, number(level), data])
+    data = number(1)
+    builder.call(function, [pointer, number(int(is_written)), number(level), data])
     return context.get_dummy_value()

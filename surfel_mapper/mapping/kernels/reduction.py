@@ -39,7 +39,11 @@ from surfel_mapper.kernels.layout import (
     HIGH_BITS,
     VIEW_SCALE,
 )
+from surfel_mapper.kernels.prefetch import prefetch
 from surfel_mapper.kernels.quantisation import quantise, unpack
+
+LINE = 16
+"""Coordinates of 32 bits in a cache line."""
 
 NOT_FINITE, TOO_NEAR, TOO_FAR, BEYOND = range(4)
 """Rows of ``left_out``: the reason why a point is rejected."""
@@ -88,7 +92,9 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
         known = num_rows
         num_rows = number_runs(chunk_keys, starts, num_runs, table, keys, num_rows, run_rows)
         sums[known:num_rows] = 0
-        add_places(places, len(x), chunk_keys, run_rows, words)
+        later = slice(start + CHUNK, start + 2 * CHUNK)
+        points = all_x[later], all_y[later], all_z[later]
+        add_places(places, len(x), chunk_keys, run_rows, words, points)
         if sums[0, 0] > num_left_out:
             num_left_out = sums[0, 0]
             for run in range(num_runs):
@@ -99,7 +105,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
 
 
 @kernel()
-def add_places(places, num, chunk_keys, run_rows, words):
+def add_places(places, num, chunk_keys, run_rows, words, later):
     """
     Add the places of a chunk of points to the sums of their voxels.
 
@@ -107,6 +113,9 @@ def add_places(places, num, chunk_keys, run_rows, words):
     chunk_keys  (CHUNK + 1,) int64, voxel key of each point
     run_rows    (CHUNK,) int32, row of the voxel of each run
     words       (8 M,) int64, in and out: sums of the voxels; the last eight are zero
+    later       x, y, z (L,) of the points of the next chunk, to be prefetched: the first ones of
+                each chunk are read too late otherwise, as chunks are too short for the processor
+                to foresee
 
     Without branches, which real lidars would mispredict at every third to eighth point: sums stay
     in registers and are stored after each point. A new run drops them, by a mask, and takes those
@@ -114,10 +123,15 @@ def add_places(places, num, chunk_keys, run_rows, words):
     the row that the point before it wrote would wait for that write.
     """
     stay_apart()
+    x, y, z = later
     zeros = U(len(words) - WORDS)
     run, previous = U(0), chunk_keys[0]
     sums = load_sums(words, U(WORDS) * U(np.uint32(run_rows[run])))
     for i in range(U(num)):
+        if i % U(LINE) == U(0) and i < U(len(x)):
+            prefetch(x, i)
+            prefetch(y, i)
+            prefetch(z, i)
         is_new = chunk_keys[i] != previous
         previous = chunk_keys[i]
         run += U(is_new)

@@ -145,7 +145,7 @@ def test_runs_add_count_sums_and_products_to_their_voxels(call, lengths):
     sums = np.zeros((6, WORDS), np.int64)
     run_rows = np.array([*rows, 4, 4], np.int32)  # those at the end do not count
     for _ in range(2):  # the second time on top of the first
-        call(add_places, packed(places), 17, keys, run_rows, sums.ravel())
+        call(add_places, packed(places), 17, keys, run_rows, sums.ravel(), tuple(np.ones((3, 20))))
     found = unpacked(call, sums)
     for row, voxel in ((1, 70), (3, 20)):
         of_row = np.flatnonzero(keys == voxel)
