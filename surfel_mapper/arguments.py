@@ -23,6 +23,8 @@ def as_array(name: str, values: npt.ArrayLike) -> npt.NDArray[Any]:
     Lists of unequal rows and tensors on a graphics card are refused. Masked values become nan:
     NumPy would return the values under the mask.
     """
+    if type(values) is np.ndarray:  # the usual case, in a cold cache too
+        return values
     if isinstance(values, np.ma.MaskedArray):
         kept: Any = values if values.dtype.kind == 'f' else values.astype(np.float64)
         return np.asarray(kept.filled(np.nan))

@@ -106,7 +106,8 @@ class VoxelTable:
         """
         arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)
         self._version = version
-        found = np.full(num, -1, np.int32)
+        found = np.empty(num, np.int32)
+        found.fill(-1)  # np.full takes 10 us more in a cold cache
         reserve = np.empty(num * UNDO_BYTES, np.uint8)
         done = 0
         try:
