@@ -2,17 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prefetching changes no value, compiled and interpreted, and compiled emits its instruction."""
 
+import re
+
 from numba import njit
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.prefetch import prefetch
+from surfel_mapper.kernels.prefetch import prefetch, prefetch_early, prefetch_to_write
 
 
 def total_of(values, ahead):
     total = values[0] * 0
     for row in range(len(values)):
         prefetch(values, row + ahead)
+        prefetch_early(values, row + ahead)
+        prefetch_to_write(values, row + ahead)
         total += values[row]
     return total
 
@@ -26,4 +30,6 @@ def test_sums_with_prefetching_are_those_of_numpy(dtype):
         assert summed(values, ahead) == total_of(values, ahead) == values.sum()
     assert np.array_equal(values, before)
     (code,) = summed.inspect_llvm().values()
-    assert 'llvm.prefetch' in code
+    calls = re.findall(r'call void @.*llvm.prefetch.*, i32 (\d), i32 (\d), i32 (\d)\)', code)
+    kinds = {tuple(map(int, each)) for each in calls}  # written or read, level of the cache, data
+    assert kinds == {(0, 3, 1), (0, 2, 1), (1, 3, 1)}
