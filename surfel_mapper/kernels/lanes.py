@@ -92,15 +92,6 @@ def plus_place(sums, place):
     return sums + np.array([*words, x * x, x * y, x * z, y * y, y * z, z * z])
 
 
-def stay_apart():
-    """
-    Compile the function that calls this as one of its own, never as lines of its callers.
-
-    In a long kernel a loop competes for registers with the loops around it: adding points took
-    1.1 times as long, as the addresses of constants were moved from register to register.
-    """
-
-
 def highest_match(words, at, upper):
     """
     Return the highest lower half among words[at : at + 8] that have an upper half, or 0.
@@ -179,11 +170,6 @@ def _type_of_sum(context):
     return lambda sums, place: _LANES
 
 
-@type_callable(stay_apart)
-def _type_of_nothing(context):
-    return lambda: types.none
-
-
 @type_callable(highest_match)
 def _type_of_match(context):
     return lambda words, at, upper: types.int64
@@ -229,13 +215,7 @@ def _emit_plus_place(context, builder, signature, arguments):
     lower_halves = _constant([_HALF] * WORDS)  # the compiler has to know that factors are short
     product = builder.mul(builder.and_(first, lower_halves), builder.and_(second, lower_halves))
     words = _pick(builder, spread, (*_PLACES, *[()] * (WORDS - 2)))
-    return _finished(builder, builder.add(builder.add(sums, words), product))
-
-
-@lower_builtin(stay_apart)
-def _emit_stay_apart(context, builder, signature, arguments):
-    builder.function.attributes.add('noinline')
-    return context.get_dummy_value()
+    return _fenced(builder, builder.add(builder.add(sums, words), product))
 
 
 @lower_builtin(highest_match, types.Array, types.Integer, types.Integer)
@@ -305,14 +285,14 @@ def _pick(builder, spread, bytes_of_lanes):
     return builder.bitcast(builder.shuffle_vector(spread, zeros, _indices(chosen)), _VECTOR)
 
 
-def _finished(builder, lanes):
+def _fenced(builder, lanes):
     """
-    Return lanes that are computed before anything is added to them.
+    Return lanes behind a fence: the compiler may not reorder additions across it.
 
-    The compiler would change the order of additions, and a point wait for the product of the one
-    before it: adding took 1.8 times as long.
+    It would compute the product last, in the chain of sums, so that each point waits for the
+    product of the one before it: adding took 1.8 times as long.
     """
-    floats = ir.VectorType(ir.DoubleType(), WORDS)  # the barrier exists for these only
+    floats = ir.VectorType(ir.DoubleType(), WORDS)  # the fence exists for these only
     takes = ir.FunctionType(floats, [floats])
     name = 'llvm.arithmetic.fence.v8f64'
     fence = cgutils.get_or_insert_function(builder.module, takes, name)

@@ -13,6 +13,9 @@ twice as long for some milliseconds after other work had used much of the bandwi
 and in some processes as long as they ran, so the later one is needed too. Prefetch no address
 outside of an array: translating it takes longer than a miss.
 
+Kernels that work in chunks read and write arrays in pieces too short for the hardware prefetcher.
+Prefetches of the next piece must be spread over a loop: all at once gain a third, or nothing.
+
 Stands alone: one of the two places that emit instructions of LLVM.
 """
 
@@ -20,6 +23,9 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import lower_builtin, type_callable
+
+LINE_BYTES = 64
+"""Bytes of a cache line."""
 
 FIRST_LEVEL, SECOND_LEVEL = 3, 2
 """Localities of llvm.prefetch."""

@@ -25,6 +25,7 @@ from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels.grouping import AHEAD, build_table, CHUNK
 from surfel_mapper.kernels.lanes import FULL, WIDEST, WORDS
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
+from surfel_mapper.kernels.prefetch import LINE_BYTES
 from surfel_mapper.mapping.channels import channel_names, quantised
 from surfel_mapper.mapping.coarsening import coarse_keys
 from surfel_mapper.mapping.kernels.reduction import (
@@ -41,9 +42,6 @@ from surfel_mapper.mapping.moments import ScanMoments
 ENTRIES = 4
 """Table entries for each voxel: real lidars change the voxel with almost every point, and a table
 at most a quarter full instead of half saves 10 % of a reduction."""
-
-LINE_BYTES = 64
-"""Bytes of a cache line."""
 
 CAUSES = {
     'not_finite': NOT_FINITE,

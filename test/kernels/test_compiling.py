@@ -3,12 +3,13 @@
 """Kernels and their parts: callers, and options of the compilation."""
 
 import math
+import re
 
 import numba
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.compiling import before_compiling, kernel, part
+from surfel_mapper.kernels.compiling import before_compiling, kernel, part, stay_apart
 
 needs_compiler = pytest.mark.skipif(
     numba.config.DISABLE_JIT, reason='kernels are interpreted in this run'
@@ -53,6 +54,31 @@ def test_a_kernel_is_no_function_of_c():
 
     assert any(name.startswith('_ZN7cpython') for name in names)
     assert not any(name.startswith('cfunc.') for name in names)
+
+
+@kernel(cache=False)
+def increased(value):
+    """Return 4 more."""
+    return value + 4
+
+
+@kernel(cache=False)
+def increased_apart(value):
+    """Return 4 more, as a function of its own."""
+    stay_apart()
+    return value + 4
+
+
+@needs_compiler
+@pytest.mark.parametrize(('increase', 'num_calls'), [(increased, 0), (increased_apart, 2)])
+def test_a_kernel_that_stays_apart_is_called(increase, num_calls):
+    @numba.njit
+    def twice(value):
+        return increase(increase(value))
+
+    assert twice(3) == twice.py_func(3) == 11
+    (code,) = twice.inspect_llvm().values()
+    assert len(re.findall(r'call .*increased', code)) == num_calls
 
 
 @needs_compiler

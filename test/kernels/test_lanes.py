@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sums in lanes and the search of eight words against Python integers."""
 
-import re
-
 from numba import njit
 import numpy as np
 import pytest
@@ -18,7 +16,6 @@ from surfel_mapper.kernels.lanes import (
     num_used,
     place_of_half,
     plus_place,
-    stay_apart,
     store_sums,
     WIDEST,
     WORDS,
@@ -86,29 +83,6 @@ def test_words_hold_the_sums_of_a_full_voxel_and_the_count_of_the_widest(corner)
         add_at(words, np.uint64(WORDS), places, -1)
     add_at(words, np.uint64(WORDS), places[: (WIDEST - FULL) % FULL], -1)
     assert words[WORDS] >> COUNT_BITS == WIDEST
-
-
-@njit
-def increased(value):
-    return value + 4
-
-
-@njit
-def increased_apart(value):
-    stay_apart()
-    return value + 4
-
-
-@both
-@pytest.mark.parametrize(('increase', 'num_calls'), [(increased, 0), (increased_apart, 2)])
-def test_a_function_that_stays_apart_is_called(call, increase, num_calls):
-    def twice(value):
-        return increase(increase(value))
-
-    compiled = njit(twice)
-    assert call(compiled, 3) == compiled(3) == 11
-    (code,) = compiled.inspect_llvm().values()
-    assert len(re.findall(r'call .*increased', code)) == num_calls
 
 
 @njit

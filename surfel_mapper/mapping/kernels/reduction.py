@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.compiling import kernel, part, stay_apart, U
 from surfel_mapper.kernels.grouping import (
     CHUNK,
     find_key,
@@ -29,7 +29,6 @@ from surfel_mapper.kernels.lanes import (
     load_sums,
     masked_sum,
     plus_place,
-    stay_apart,
     store_sums,
     WORDS,
 )
@@ -39,10 +38,10 @@ from surfel_mapper.kernels.layout import (
     HIGH_BITS,
     VIEW_SCALE,
 )
-from surfel_mapper.kernels.prefetch import prefetch
+from surfel_mapper.kernels.prefetch import LINE_BYTES, prefetch
 from surfel_mapper.kernels.quantisation import quantise, unpack
 
-LINE = 16
+LINE = LINE_BYTES // 4
 """Coordinates of 32 bits in a cache line."""
 
 NOT_FINITE, TOO_NEAR, TOO_FAR, BEYOND = range(4)
@@ -113,9 +112,7 @@ def add_places(places, num, chunk_keys, run_rows, words, later):
     chunk_keys  (CHUNK + 1,) int64, voxel key of each point
     run_rows    (CHUNK,) int32, row of the voxel of each run
     words       (8 M,) int64, in and out: sums of the voxels; the last eight are zero
-    later       x, y, z (L,) of the points of the next chunk, to be prefetched: the first ones of
-                each chunk are read too late otherwise, as chunks are too short for the processor
-                to foresee
+    later       x, y, z (L,) float32 or float64 of the points of the next chunk, to be prefetched
 
     Without branches, which real lidars would mispredict at every third to eighth point: sums stay
     in registers and are stored after each point. A new run drops them, by a mask, and takes those

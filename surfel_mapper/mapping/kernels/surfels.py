@@ -15,7 +15,7 @@ import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.layout import KEY, PRODUCT
-from surfel_mapper.kernels.prefetch import prefetch_to_write
+from surfel_mapper.kernels.prefetch import LINE_BYTES, prefetch_to_write
 from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work
 from surfel_mapper.mapping.kernels.rows import (
@@ -36,7 +36,7 @@ AHEAD = 16
 EARLY = CHUNK
 """Number of rows between the early prefetch of a row and its use."""
 
-LINE = 8
+LINE = LINE_BYTES // 8
 """Numbers of 64 bits in a cache line."""
 
 EXACT_BITS = 54
@@ -151,8 +151,8 @@ def prefetch_outputs(written, row):
     written  position, normal and eigenvalues, each (3 K,) float64; planarity and curvature (K,)
              float64; num_points (K,) int64; voxel_index (3 K,) int32
 
-    Outputs are written in pieces of a chunk, too short for the processor to foresee: where they do
-    not fit the second level of the cache, deriving takes 1.15 times as long without.
+    If the outputs do not fit the second level of the cache, deriving takes 1.15 times as long
+    without.
     """
     vectors, numbers, num_points, voxel_index = written
     for vector in vectors:
