@@ -5,14 +5,14 @@ Fifteen seconds of a drive as an animation: the surfels of the last scans, from 
 
 A lidar in a simulated street gives ten scans a second, one a frame. Each is added to the map and
 the one 60 scans before is removed, so the map moves with the sensor. Surfels are ellipses shaded
-by normal and light, the points of the scan are orange, the trajectory red. A second argument is
-the number of scans, 150 by default.
+by normal and light, the points of the scan are orange, the trajectory red.
 
     python examples/drive_animation.py drive.webp
 """
 
+import argparse
 from collections import deque
-import sys
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
@@ -51,10 +51,17 @@ def frame(surfels, points, poses):
     return Image.fromarray(np.rint(image).clip(0, 255).astype(np.uint8))
 
 
-def main(path, num_scans='150'):
+def main():
     """Drive, map, draw."""
+    parser = argparse.ArgumentParser(description=str(__doc__).strip().partition('\n')[0])
+    parser.add_argument('path', type=Path, help='picture to write, .webp or .gif')
+    parser.add_argument(
+        'scans', type=int, nargs='?', default=150, help='length of the drive (%(default)s)'
+    )
+    args = parser.parse_args()
+
     world, lidar = World.street(seed=1, length_m=160.0), Lidar(beams=64, columns=1024)
-    street = Simulation(world, lidar, num_scans=int(num_scans))
+    street = Simulation(world, lidar, num_scans=args.scans)
     surfel_map = SurfelMap(VOXEL_SIZE_M)
     window, poses, frames = deque(), deque(maxlen=WINDOW), []
     for scan in street.scans():
@@ -67,9 +74,9 @@ def main(path, num_scans='150'):
         points = points @ pose[:3, :3].T + pose[:3, 3]
         frames.append(frame(surfel_map.surfels(min_points=3), points, poses))
     pages = {'save_all': True, 'append_images': frames[1:], 'duration': FRAME_MS, 'loop': 0}
-    frames[0].save(path, **pages, quality=QUALITY)
-    print(f'{path}: {len(frames)} frames, {len(surfel_map.surfels(min_points=3)):,} surfels')
+    frames[0].save(args.path, **pages, quality=QUALITY)
+    print(f'{args.path}: {len(frames)} frames, {len(surfel_map.surfels(min_points=3)):,} surfels')
 
 
 if __name__ == '__main__':
-    main(*sys.argv[1:])
+    main()

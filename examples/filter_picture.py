@@ -9,8 +9,8 @@ ground, which is drawn in another colour.
     python examples/filter_picture.py filters.png
 """
 
+import argparse
 from pathlib import Path
-import sys
 
 import matplotlib
 import numpy as np
@@ -38,8 +38,12 @@ def draw(axes, points, colours, title):
     axes.set_axis_off()
 
 
-def main(path):
+def main():
     """Filter a scan and draw both."""
+    parser = argparse.ArgumentParser(description=str(__doc__).strip().partition('\n')[0])
+    parser.add_argument('path', type=Path, help='picture to write, .png or .svg')
+    args = parser.parse_args()
+
     matplotlib.use('Agg')
     from matplotlib import pyplot
 
@@ -53,9 +57,10 @@ def main(path):
     draw(left, before, np.full(len(before), GREY), f'before: {len(before):,} points within 25 m')
     colours = np.where(is_ground, TEAL, AMBER)
     draw(right, after.points, colours, f'after: {len(after):,} points, ground in green')
-    figure.savefig(path, dpi=80)
-    print(f'{path}: {len(before)} -> {len(after)} points, {np.count_nonzero(is_ground)} ground')
+    figure.savefig(args.path, dpi=80)
+    num_ground = np.count_nonzero(is_ground)
+    print(f'{args.path}: {len(before)} -> {len(after)} points, {num_ground} ground')
 
 
 if __name__ == '__main__':
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else 'filters.png'))
+    main()

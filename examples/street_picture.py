@@ -4,16 +4,15 @@
 The picture of the README: a street as surfels, as its report shows it in a browser.
 
 A simulated lidar drives 80 m; the bag is replayed, and its ``report.html`` opened in Chromium
-without a window, turned, and drawn. Needs Chromium and playwright (extra ``test``). A second
-argument is the number of scans, 160 by default.
+without a window, turned, and drawn. Needs Chromium and playwright (extra ``test``).
 
     python examples/street_picture.py street.png
 """
 
+import argparse
 import os
 from pathlib import Path
 import shutil
-import sys
 import tempfile
 
 from surfel_mapper import Config, replay
@@ -56,16 +55,23 @@ def draw(report, path):
         chromium.close()
 
 
-def main(path, num_scans='160'):
+def main():
     """Simulate, replay, draw."""
+    parser = argparse.ArgumentParser(description=str(__doc__).strip().partition('\n')[0])
+    parser.add_argument('path', type=Path, help='picture to write, .png')
+    parser.add_argument(
+        'scans', type=int, nargs='?', default=160, help='length of the drive (%(default)s)'
+    )
+    args = parser.parse_args()
+
     with tempfile.TemporaryDirectory() as folder:
         bag, output = Path(folder) / 'bag', Path(folder) / 'map'
         street = World.street(seed=1, length_m=160.0)
-        record(Simulation(street, Lidar(beams=64, columns=1024), num_scans=int(num_scans)), bag)
+        record(Simulation(street, Lidar(beams=64, columns=1024), num_scans=args.scans), bag)
         result = replay(bag, output=output, config=SETTINGS)
-        draw(output / 'report.html', path)
-    print(f'{path}: {len(result.mapper.map.surfels()):,} surfels')
+        draw(output / 'report.html', args.path)
+    print(f'{args.path}: {len(result.mapper.map.surfels()):,} surfels')
 
 
 if __name__ == '__main__':
-    main(*sys.argv[1:])
+    main()

@@ -313,7 +313,9 @@ def settings_table() -> str:
 
 
 def allowed(declared: Declaration) -> str:
-    """Return the bounds of a number as a sentence; empty if its meaning states them."""
+    """Return the bounds or choices as a sentence; empty if the meaning states them."""
+    if not all(choice in declared.meaning for choice in declared.choices):
+        return f'One of {", ".join(declared.choices)}.'
     if not declared.is_number:
         return ''
     if declared.high >= LARGE:

@@ -213,8 +213,8 @@ class TsdfConfig(Stage):
     )
     semantics: str = setting(
         'none',
-        'How labels are fused: majority of counts; weights of the first_k labels; one label by '
-        'weighted majority vote; binary, label 0 against all others.',
+        'How labels are fused: none; majority of counts; weights of the first_k labels; single, '
+        'one label by weighted majority vote; binary, label 0 against all others.',
         choices=SEMANTICS,
     )
     num_labels: int = setting(0, 'Majority: labels are 0 to num_labels - 1.', low=0, high=4096)

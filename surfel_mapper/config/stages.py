@@ -61,8 +61,9 @@ class MapConfig(Stage):
     )
     load: str = setting(
         '',
-        'Map to start from, a .npz file of ~/save_map; its surfels stay. latest: the newest map '
-        'or checkpoint in output.directory, if any, with its window. Empty: none.',
+        'Map to start from: an .npz file of ~/save_map, the output directory of a replay, or '
+        'tiles; its surfels stay. latest: the newest map or checkpoint in output.directory, if '
+        'any, with its window. Empty: none.',
     )
     max_bytes: int = setting(
         -1,
@@ -341,7 +342,7 @@ class ViewerConfig(Stage):
 
     enabled: bool = setting(
         False,
-        'Serve the page at http://127.0.0.1:PORT, for this machine only; see docs/report.md.',
+        'Serve the page at http://127.0.0.1:PORT, for this machine only.',
     )
     port: int = setting(
         9090, 'Port of the page; the data are on the next one.', low=1024, high=65534

@@ -202,6 +202,14 @@ def test_the_picture_of_a_street_has_road_and_walls_in_colours_of_their_own(tmp_
     assert (red > green + 30).sum() > 500  # walls along the street
 
 
+@pytest.mark.parametrize('name', ['drive_animation', 'filter_picture', 'street_picture'])
+def test_examples_that_draw_explain_their_arguments(name, tmp_path, run):
+    text = run(f'{name}.py', '--help', folder=tmp_path)
+    assert text.startswith(f'usage: {name}.py [-h] path')
+    assert 'picture to write' in text
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_animation_of_a_drive_has_a_frame_a_scan_and_moves(tmp_path, run):
     text = run('drive_animation.py', 'drive.webp', '3', folder=tmp_path)
     assert int(re.search(r': 3 frames, ([\d,]+) surfels', text)[1].replace(',', '')) > 1000
