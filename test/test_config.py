@@ -15,6 +15,9 @@ from surfel_mapper.config import (
     declarations,
     load_config,
     MapConfig,
+    register_stage,
+    setting,
+    Stage,
     stage_fields,
     WindowConfig,
 )
@@ -255,6 +258,19 @@ def test_a_map_name_that_could_leave_its_directory_is_refused(name):
 @pytest.mark.parametrize('name', ['map', 'hall 3', 'hall..3', 'Gebaeude-1_b'])
 def test_a_plain_map_name_is_accepted(name):
     assert configured('output.map_name', name).output.map_name == name
+
+
+def test_a_refused_stage_is_not_registered():
+    @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+    class OtherConfig(Stage):
+        STAGE = 'map'
+        margin_m: float = setting(0.0, 'A margin.')
+
+    before = Config().to_mapping()
+    with pytest.raises(ConfigError, match=r"^stage 'map' of test\.test_config: another stage"):
+        register_stage(OtherConfig)
+    assert Config().to_mapping() == before
+    assert Config().replace({'map.min_points': 3}).map.min_points == 3
 
 
 @pytest.mark.parametrize(

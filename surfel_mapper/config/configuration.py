@@ -205,7 +205,7 @@ def register_stage(stage: type[Stage]) -> type[Stage]:
 
     """
     name = stage_name(stage)
-    other = _LAYER_STAGES.setdefault(name, stage)
+    other = _LAYER_STAGES.get(name, stage)
     if name in stage_fields() or other.__qualname__ != stage.__qualname__:
         raise ConfigError(f'stage {name!r} of {stage.__module__}: another stage has this name')
     _LAYER_STAGES[name] = stage

@@ -16,7 +16,7 @@ import io
 import itertools
 import json
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,9 +28,6 @@ from surfel_mapper.files.parquet import import_pyarrow
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.outlines import outline
 from surfel_mapper.models.shapes import shape_of
-
-if TYPE_CHECKING:
-    pass
 
 FORMAT, VERSION = 'surfel_mapper models', 1
 

@@ -163,14 +163,20 @@ def wire_of(ocp: Any, surface: Any, patch: Plane, ring: Array) -> Any:
 
 
 def parts(rings: Sequence[Array]) -> list[tuple[Array, list[Array]]]:
-    """Return each outer ring (M, 2) with the holes in it."""
+    """
+    Return each outer ring (M, 2) with the holes in it.
+
+    A hole belongs to the smallest outer ring that is larger and contains one of its corners. The
+    mean of the corners may lie in an island, or outside of all outer rings if the hole is bent.
+    """
     outer = [ring for ring in rings if signed_area(ring) > 0.0]
     found: list[tuple[Array, list[Array]]] = [(ring, []) for ring in outer]
+    areas = [signed_area(ring) for ring in outer]
     for hole in rings:
-        if signed_area(hole) <= 0.0:
-            around = [k for k, ring in enumerate(outer) if is_inside(hole.mean(axis=0), ring)]
-            least = min(around, key=lambda k: signed_area(outer[k]))
-            found[least][1].append(hole)
+        if (area := signed_area(hole)) <= 0.0:
+            larger = [k for k, each in enumerate(areas) if each > -area]
+            around = [k for k in larger if is_inside(hole[0], outer[k])]
+            found[min(around, key=areas.__getitem__)][1].append(hole)
     return found
 
 

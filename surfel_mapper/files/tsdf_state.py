@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import FileFormatError, MapLimitError, refusing
+from surfel_mapper.files.atomic import cannot_write
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.tsdf.blocks import block_index, block_keys, BlockMap, Blocks
 
@@ -106,8 +107,8 @@ def save_tsdf_parts(
     found = [np.empty(0, np.int64), *(block_keys(part.index) for part in parts())]
     keys = np.sort(np.concatenate(found))
     empty = BlockMap(config)
-    with ExitStack() as files:
-        try:
+    try:  # outside of the stack: to close a file writes the rest of its buffer
+        with ExitStack() as files:
             channels = {
                 name: Channel(
                     files, Path(path).parent, getattr(empty, name).shape[1:], ARRAYS[name]
@@ -121,13 +122,13 @@ def save_tsdf_parts(
                 stamp_ns[place] = part.stamp_ns
                 for name, channel in channels.items():
                     channel.write(place, getattr(part, name))
-        except OSError as error:
-            raise FileFormatError(f'{path}: cannot be written: {error.strerror}') from error
-        arrays = {'index': block_index(keys), 'stamp_ns': stamp_ns}
-        for name in CHANNELS:
-            missing = np.empty((0, *getattr(empty, name).shape[1:]), ARRAYS[name])
-            arrays[name] = channels[name].read(len(keys)) if name in channels else missing
-        save_state(path, arrays, attributes_of(config), copies=COPIES)
+            arrays = {'index': block_index(keys), 'stamp_ns': stamp_ns}
+            for name in CHANNELS:
+                missing = np.empty((0, *getattr(empty, name).shape[1:]), ARRAYS[name])
+                arrays[name] = channels[name].read(len(keys)) if name in channels else missing
+            save_state(path, arrays, attributes_of(config), copies=COPIES)
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 class Channel:

@@ -154,7 +154,7 @@ def merged(kind: Kind, column: Array, groups: PointGroups) -> Array:
         return np.asarray(column[groups.first])
     if kind is Kind.TIME:
         return by_component(mean_time, column, groups)
-    if kind is Kind.COLOUR:
+    if kind is Kind.COLOUR and column.dtype.itemsize == 4 and column.ndim == 1:
         return mean_colour(column, groups)
     means = by_component(mean, column, groups)
     if kind is Kind.DIRECTION:
@@ -204,8 +204,6 @@ def mean_time(values: Array, groups: PointGroups) -> Array:
 
 def mean_colour(column: Array, groups: PointGroups) -> Array:
     """Return the mean colours of 32-bit values with one channel per byte."""
-    if column.dtype.itemsize != 4 or column.ndim != 1:
-        return by_component(mean, column, groups).astype(column.dtype)
     channels = np.ascontiguousarray(column).view(np.uint8).reshape(-1, 4)
     means = np.stack([mean(channels[:, i], groups) for i in range(4)], axis=1)
     return np.rint(means).astype(np.uint8).view(column.dtype).reshape(-1)

@@ -258,8 +258,9 @@ def azimuth_steps(angles: Angles, beam: npt.NDArray[np.int64]) -> int:
     if not same.any():
         return 2
     steps = steps[same]
-    # around the median, because holes are long and repeated returns are short
-    median = float(np.median(steps))
+    # around the median, because holes are long and repeated returns are short; the lower one,
+    # because the mean of two very different steps is near neither
+    median = float(np.quantile(steps, 0.5, method='lower'))
     step = float(np.mean(steps[(steps > 0.6 * median) & (steps < 1.4 * median)]))
     return int(np.clip(round(360.0 / step), 2, MAX_COLUMNS))
 

@@ -184,6 +184,17 @@ def test_colours_are_averaged_by_channel():
     assert merged(packed, name='rgb').view(np.uint32).tolist() == [0x00800080, 0x00010000]
 
 
+@pytest.mark.parametrize('dtype', [np.uint8, np.uint16, np.int32])
+def test_unpacked_colours_are_averaged_and_rounded(dtype):
+    values = np.array([[254, 0], [1, 7], [255, 0], [2, 7], [255, 1]], dtype)
+    assert merged(values, name='rgb').tolist() == [[2, 7], [255, 0]]  # 3/2 to even, 764/3, 1/3
+
+
+def test_unpacked_colours_of_floats_are_averaged():
+    values = np.array([[0.5], [0.25], [0.5], [0.5], [0.125]], np.float32)
+    assert merged(values, name='rgb').tolist() == [[0.375], [0.375]]
+
+
 def test_first_values_are_kept_without_averaging():
     assert merged(np.array([1.0, 2.0, 3.0, 4.0, 5.0]), average=False).tolist() == [2.0, 1.0]
 

@@ -184,6 +184,13 @@ def test_a_voxel_of_each_axis_has_its_own_size():
     np.testing.assert_allclose(found.points, [[1.1 / 3, 4.1 / 3, 0.1], [0.1, 0.1, 0.3]])
 
 
+def test_unpacked_colours_of_a_voxel_are_rounded():
+    red = np.zeros((3, 3), np.uint8)
+    red[:, 0] = [254, 255, 255]
+    found = filter_of('voxel_grid').apply(scan_of(np.full((3, 3), 0.5), rgb=red))
+    assert found.columns['rgb'].tolist() == [[255, 0, 0]]
+
+
 def test_columns_of_the_first_point_are_kept_without_averaging():
     scan = scan_of([[0.1, 0.0, 0.0], [0.3, 0.0, 0.0]], intensity=[1.0, 3.0], label=[4, 5])
     averaged = filter_of('voxel_grid').apply(scan).columns

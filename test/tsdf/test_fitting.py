@@ -111,6 +111,13 @@ def test_columns_go_through_the_points(share, rows):
     assert found.first_azimuth_deg == pytest.approx(first, abs=1e-3 * step)
 
 
+def test_two_very_different_steps_give_the_columns_of_the_smaller():
+    azimuth, elevation = np.radians([[0.0, 1.0, 0.0, 3.0], [10.0, 10.0, -10.0, -10.0]])
+    flat = np.cos(elevation)
+    unit = np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], axis=1)
+    assert fitted_lidar(5.0 * unit, **RANGES).columns == 360
+
+
 def test_rings_of_missing_points_do_not_count():
     points, ring = points_of(LidarModel(rows=16, columns=1024, vertical_fov_deg=30.0))
     missing = np.full((50_000, 3), np.nan, np.float32)
