@@ -4,7 +4,8 @@
 Checkpoints of a map: saved every ``output.checkpoint_s``, and found again after a restart.
 
 A checkpoint is a file as ~/save_map writes it, whole or not at all. The previous one is kept, so
-that a complete checkpoint exists at any moment, also while one is written.
+that a complete checkpoint exists at any moment, also while one is written. A map and its layers
+cannot be renamed at once, so layers get their second name before the map and lose the first after.
 """
 
 from __future__ import annotations
@@ -12,12 +13,13 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
+import shutil
 import time
 from zipfile import is_zipfile
 
 from surfel_mapper.config import OutputConfig
 from surfel_mapper.errors import FileFormatError, MapError
-from surfel_mapper.files.atomic import make_directory
+from surfel_mapper.files.atomic import make_directory, replace_file
 from surfel_mapper.pipeline.mapper import Mapper
 from surfel_mapper.pipeline.saved_state import layer_files, load_mapper, save_mapper
 
@@ -75,11 +77,22 @@ class Checkpoints:
             for new, old in layers:
                 old.unlink(missing_ok=True)
                 if new.exists():
-                    os.replace(new, old)
+                    duplicate(new, old)
             os.replace(newest, before)
+            for new, _ in layers:
+                new.unlink(missing_ok=True)
         save_mapper(newest, mapper)
         self._version = version
         return newest
+
+
+def duplicate(path: Path, name: Path) -> None:
+    """Give a file a second name, or a copy if the file system has no hard links, as FAT."""
+    try:
+        os.link(path, name)
+    except OSError:
+        with open(path, 'rb') as source, replace_file(name) as target:
+            shutil.copyfileobj(source, target)
 
 
 def checkpoint_paths(output: OutputConfig) -> tuple[Path, Path]:

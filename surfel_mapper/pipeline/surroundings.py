@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-SurroundingMotion that seem to move along with the sensor, as trucks on all sides do.
+Surroundings that seem to move along with the sensor, as trucks on all sides do.
 
 They fit the map well, at a pose that hardly moves, while the world between them streams past: scan
 after scan has voxels that the map does not know, more than the motion explains. Boxed in by nine

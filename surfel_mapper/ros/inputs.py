@@ -81,7 +81,8 @@ class Inputs:
     cloud_topics : list of str
         The full names of the topics of clouds, or of depth images.
     lost : dict of str to int
-        Clouds lost on the way, by topic, as far as the middleware reports them.
+        Clouds lost on the way, by topic, as far as the middleware reports them; of all
+        subscriptions so far. The mapping thread reads it, so that no topic is added later.
 
     Raises
     ------
@@ -101,7 +102,7 @@ class Inputs:
             transform_message()
         names = config.input.topics or (DEFAULT_TOPICS[config.input.kind],)
         self.cloud_topics: list[str] = [node.resolve_topic_name(name) for name in names]
-        self.lost: dict[str, int] = {}
+        self.lost = dict.fromkeys(self.cloud_topics, 0)
         self._received_s = dict.fromkeys(self.cloud_topics, time.monotonic())
         self._largest_bytes = dict.fromkeys(self.cloud_topics, 0)
         self._images = DepthImages()
@@ -155,7 +156,7 @@ class Inputs:
 
     def loss(self) -> str:
         """Return the number of lost clouds and the remedy, as text; empty if none was lost."""
-        return '; '.join(self._loss_of(topic) for topic in self.lost)
+        return '; '.join(self._loss_of(topic) for topic, number in self.lost.items() if number)
 
     def _loss_of(self, topic: str) -> str:
         size = self._largest_bytes[topic]
@@ -194,7 +195,7 @@ class Inputs:
 
     def _subscribe_clouds(self, topic: str) -> None:
         """Subscribe to the clouds or images of one sensor."""
-        on_lost = partial(self._on_lost, topic)
+        on_lost = partial(self._on_lost, topic, self.lost[topic])
         subscribe = partial(self._subscriptions.subscribe, qos=CLOUDS)
         if self._config.input.kind == 'cloud':
             on_cloud = partial(self._on_cloud, topic)
@@ -270,8 +271,9 @@ class Inputs:
         else:
             self._thread.put_poses(poses, static=topic == STATIC_TOPIC)
 
-    def _on_lost(self, topic: str, total: int) -> None:
-        self.lost[topic] = total
+    def _on_lost(self, topic: str, before: int, number: int) -> None:
+        """Take the number that a subscription has lost; those of earlier ones are ``before``."""
+        self.lost[topic] = before + number
         self._node.get_logger().warning(self.loss(), throttle_duration_sec=10.0)
 
 

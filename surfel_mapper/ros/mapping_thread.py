@@ -11,10 +11,11 @@ needs, although these have arrived.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from functools import partial
+from itertools import chain
 import threading
 from typing import Any, NamedTuple, TypeVar
 
@@ -24,12 +25,16 @@ from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.drops import described, INTERNAL, REMEDIES
 from surfel_mapper.pipeline.scan_images import MAX_IMAGES
+from surfel_mapper.poses.buffer import MAX_EDGES
 from surfel_mapper.ros.turns import take_turns
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import SceneImage
 
 MAX_POSES = 10_000
-"""Most poses in the queue, 10 s of odometry at 1 kHz; then the oldest is dropped."""
+"""
+Most poses in the queue, 10 s of odometry at 1 kHz; then the oldest is dropped. Static ones are
+kept apart, as they do not come again.
+"""
 
 TOO_FAST = f'clouds come faster than they can be mapped; {REMEDIES["overload"]}'
 
@@ -98,8 +103,9 @@ class MappingThread:
         self._on_failure = on_failure
         self._changed = threading.Condition()
         self._max_clouds = mapper.config.input.max_waiting_clouds
-        self._poses: deque[tuple[StampedPose, bool]] = deque()
-        self._images: deque[SceneImage] = deque(maxlen=MAX_IMAGES)
+        self._static: dict[tuple[str, str], StampedPose] = {}  # by parent and child
+        self._poses: deque[StampedPose] = deque()
+        self._images: defaultdict[str, deque[SceneImage]] = defaultdict(deque)  # by kind
         self._work: deque[QueuedCloud | Call] = deque()
         self._num_clouds = 0
         self._lost: Counter[LostCloud | LostPose] = Counter()
@@ -122,11 +128,17 @@ class MappingThread:
             self._thread.join()
 
     def put_poses(self, poses: Iterable[StampedPose], *, static: bool = False) -> None:
-        """Queue poses for the mapper."""
+        """Queue poses for the mapper; of the static ones of an edge, the latest."""
         with self._changed:
-            self._poses.extend((pose, static) for pose in poses)
+            if static:
+                self._static.update(((pose.parent, pose.child), pose) for pose in poses)
+            else:
+                self._poses.extend(poses)
             while len(self._poses) > MAX_POSES:
                 self._poses.popleft()
+                self._lost[TOO_MANY_POSES] += 1
+            while len(self._static) > MAX_EDGES:  # the buffer of the mapper holds no more
+                self._static.popitem()
                 self._lost[TOO_MANY_POSES] += 1
             self._changed.notify()
 
@@ -147,9 +159,18 @@ class MappingThread:
         self._lose(LostPose(INTERNAL, f'{task} failed: {described(error)}'))
 
     def put_image(self, image: SceneImage) -> None:
-        """Queue an image of colours or labels; like poses, they overtake clouds."""
+        """
+        Queue an image of colours or labels; like poses, they overtake clouds.
+
+        Beyond MAX_IMAGES of a kind the oldest of this kind is dropped: ScanImages keeps no more.
+        """
         with self._changed:
-            self._images.append(image)
+            images = self._images[image.kind]
+            images.append(image)
+            if len(images) > MAX_IMAGES:
+                images.popleft()
+                reason = f'{image.kind} images dropped: too many are waiting'
+                self._lost[LostPose('overload', reason)] += 1
             self._changed.notify()
 
     def put_cloud(
@@ -215,17 +236,21 @@ class MappingThread:
             self._changed.wait_for(lambda: self._stopping or self._has_input())
             if not self._has_input():
                 return False
+            static, self._static = self._static, {}
             poses, self._poses = self._poses, deque()
-            images = [self._images.popleft() for _ in range(len(self._images))]
+            images, self._images = self._images, defaultdict(deque)
             item = self._work.popleft() if self._work else None
             self._num_clouds -= isinstance(item, QueuedCloud)
             lost, self._lost = self._lost, Counter()
         with self._mapper.guarded('counting of drops'):
             self._count(lost)
-        for pose, static in poses:
+        for pose in static.values():
             with self._mapper.guarded('a pose'):
-                self._mapper.add_pose(*pose, static=static)
-        for image in images:
+                self._mapper.add_pose(*pose, static=True)
+        for pose in poses:
+            with self._mapper.guarded('a pose'):
+                self._mapper.add_pose(*pose)
+        for image in chain.from_iterable(images.values()):
             with self._mapper.guarded('an image'):
                 self._mapper.add_image(image)
         if isinstance(item, QueuedCloud):
@@ -242,7 +267,7 @@ class MappingThread:
 
     def _has_input(self) -> bool:
         """Return whether any input waits; called with the lock held."""
-        return bool(self._poses or self._images or self._work or self._lost)
+        return any((self._static, self._poses, self._images, self._work, self._lost))
 
     def _lose(self, lost: LostCloud | LostPose) -> None:
         with self._changed:

@@ -7,6 +7,7 @@ from __future__ import annotations
 from concurrent.futures import CancelledError
 import threading
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
@@ -14,7 +15,9 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from surfel_mapper.config import Config
 from surfel_mapper.messages.poses import poses_in, StampedPose
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.poses.buffer import MAX_EDGES
 from surfel_mapper.ros.mapping_thread import MappingThread, MAX_POSES
+from surfel_mapper.sensors.depth import SceneImage
 from test.ros.live import cloud, odometry, room, START_NS
 
 PERIOD_NS = 100_000_000
@@ -29,8 +32,8 @@ TIMEOUT_S = 120
 class Bench:
     """A running mapping thread, which can be blocked, and its results."""
 
-    def __init__(self, on_update=None):
-        self.mapper = Mapper(CONFIG)
+    def __init__(self, on_update=None, config=CONFIG):
+        self.mapper = Mapper(config)
         self.stamps = []
         self.failures = []
         self.thread = MappingThread(self.mapper, self.failures.append)
@@ -106,6 +109,72 @@ def test_a_full_queue_drops_and_counts_the_oldest_poses(bench):
     bench.thread.stop()
 
     assert bench.mapper.counters.messages_ignored == {'overload': 1}
+
+
+def static_pose(child, x=0.0):
+    return StampedPose('base_link', child, START_NS, (x, 0.0, 0.0), UNTURNED)
+
+
+def test_a_full_queue_drops_no_static_pose(bench):
+    """Joints fill the queue within a second; a static transform is published once."""
+    joint = StampedPose('base_link', 'joint', START_NS, (0.0, 0.0, 0.0), UNTURNED)
+    bench.hold()
+    bench.thread.put_poses([static_pose('lidar', 1.0), static_pose('lidar', 2.0)], static=True)
+    bench.thread.put_poses([joint._replace(stamp_ns=START_NS + i) for i in range(MAX_POSES + 5)])
+    bench.release()
+    bench.thread.stop()
+
+    x, y, z = bench.mapper.transforms.lookup('base_link', 'lidar', START_NS)[:3, 3]
+    assert (x, y, z) == (2.0, 0.0, 0.0)  # the latest holds
+    assert bench.mapper.transforms.num_transforms == MAX_POSES
+    assert bench.mapper.counters.messages_ignored == {'overload': 5}
+
+
+def test_static_poses_beyond_the_edges_of_a_mapper_are_counted(bench):
+    """New names without end must not fill the memory while the thread is busy."""
+    bench.hold()
+    bench.thread.put_poses(map(static_pose, map(str, range(MAX_EDGES + 3))), static=True)
+    bench.release()
+    bench.thread.stop()
+
+    assert bench.mapper.counters.messages_ignored == {'overload': 3}
+    bench.mapper.transforms.lookup('0', str(MAX_EDGES - 1), START_NS)
+
+
+COLORED = Config.from_mapping(
+    {
+        'pose.source': 'identity',
+        'input.kind': 'depth',
+        'layers.tsdf.enabled': True,
+        'layers.tsdf.color': True,
+        'layers.tsdf.color_topic': 'rgb',
+        'layers.tsdf.semantics': 'single',
+        'layers.tsdf.label_topic': 'labels',
+    }
+)
+
+
+def image(kind, stamp_ns, pixels):
+    return SceneImage(kind=kind, stamp_ns=stamp_ns, frame_id='camera', camera=None, pixels=pixels)
+
+
+def test_images_of_two_kinds_do_not_displace_each_other():
+    """A map is saved for 2 s: 60 images of each kind wait, as many as scans are joined with."""
+    bench = Bench(config=COLORED)
+    bench.hold()
+    stamps = [START_NS + i * PERIOD_NS for i in range(63)]
+    for number, stamp_ns in enumerate(stamps):
+        if number < 60:
+            bench.thread.put_image(image('color', stamp_ns, np.zeros((2, 2, 3), np.uint8)))
+        bench.thread.put_image(image('label', stamp_ns, np.zeros((2, 2), np.int32)))
+    bench.release()
+    bench.thread.stop()
+
+    images = bench.mapper._inserter.images._images
+    assert [found.stamp_ns for found in images['color']] == stamps[:60]
+    assert [found.stamp_ns for found in images['label']] == stamps[3:]
+    assert bench.mapper.counters.messages_ignored == {'overload': 3}
+    assert bench.failures == []
 
 
 def test_a_call_follows_the_queued_clouds_and_returns_result_or_error(bench):
