@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from surfel_mapper.errors import PoseError, PoseNotYetError
+from surfel_mapper.errors import PoseError, PoseNotYetError, PosesLateError
 from surfel_mapper.geometry import compose, inverse, pose_matrix
 from surfel_mapper.poses import buffer as buffer_module
 from surfel_mapper.poses import TransformBuffer
@@ -487,3 +487,25 @@ def test_nothing_is_interpolated_across_a_long_gap():
 
 def test_a_gap_as_long_as_the_limit_is_bridged():
     assert drive(max_gap_s=1.0).lookup('odom', 'base', EPOCH + S // 2)[0, 3] == 5.0
+
+
+def test_a_span_is_held_if_every_stamp_within_is():
+    buffer = TransformBuffer(max_gap_s=0.5)
+    for tenth in (0, 2, 4, 9, 10, 12, 16, 20):  # 0.5 s between the third and the fourth
+        buffer.add('odom', 'base', tenth * S // 10, np.eye(4))
+    buffer.add_static('base', 'lidar', np.eye(4))
+    buffer.check_span('odom', 'lidar', 0, 2 * S)
+    buffer.check_span('lidar', 'odom', S // 10, S)
+
+    buffer.max_gap_s = 0.45
+    buffer.check_span('odom', 'lidar', 0, 4 * S // 10)
+    buffer.check_span('odom', 'lidar', 9 * S // 10, 2 * S)
+    for first, last in ((0, 2 * S), (S // 10, S), (4 * S // 10, S), (5 * S // 10, 6 * S // 10)):
+        with pytest.raises(PoseNotYetError, match=r'gap of 0\.500 s'):
+            buffer.check_span('odom', 'lidar', first, last)
+    with pytest.raises(PosesLateError, match='newer than all'):
+        buffer.check_span('odom', 'lidar', 9 * S // 10, 2 * S + 1)
+    with pytest.raises(PoseError, match='older than all'):
+        buffer.check_span('odom', 'lidar', -1, 0)
+    with pytest.raises(PoseNotYetError, match='no transform of camera yet'):
+        buffer.check_span('odom', 'camera', 0, 1)

@@ -101,6 +101,15 @@ class Drops:
             f'{f"; {remedy}" if remedy else ""}',
         )
 
+    def failure(self, scan: Scan, error: Exception, *, is_used: bool) -> None:
+        """Count an unexpected error of a scan: as a drop, unless the map has the scan."""
+        if is_used:
+            at = f'scan at {scan.stamp_ns / 1e9:.6f} s'
+            self.message(INTERNAL, f'{at} is mapped, but not reported: {described(error)}')
+        else:
+            self.scan(scan, INTERNAL, described(error))
+        _log.debug('scan at %d ns', scan.stamp_ns, exc_info=error)
+
     def message(self, cause: str, reason: str, number: int = 1) -> None:
         """Count messages other than scans as ignored for a cause."""
         self.counters.messages_ignored[cause] += number

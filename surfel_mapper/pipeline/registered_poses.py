@@ -225,6 +225,8 @@ class RegisteredPoses:
 
         """
         scan = prepared.filtered
+        if not surfel_map.num_voxels:
+            self.finish()  # nothing is left that a part could be joined to
         # Deskewed by a velocity that is off, a sweep is right in its middle and off at both
         # ends: followed at its stamp, which is one of them, pose and velocity would swing.
         middle_ns = (times.first_ns + times.last_ns) // 2 if times else scan.stamp_ns

@@ -142,8 +142,13 @@ class ScanPoses:
             self.registered.learn_motion(scan, following)
         pose = self._at(scan.frame_id, scan.stamp_ns)
         if scan.times is not None:  # the poses of all points have to be there
-            self._at(scan.frame_id, scan.times.first_ns)
-            self._at(scan.frame_id, scan.times.last_ns)
+            first_ns, last_ns = scan.times.first_ns, scan.times.last_ns
+            if self.registered is None:
+                fixed = self._config.frames.fixed
+                self.transforms.check_span(fixed, scan.frame_id, first_ns, last_ns)
+            else:
+                self._at(scan.frame_id, first_ns)
+                self._at(scan.frame_id, last_ns)
         return pose
 
     def deskewing(self, scan: Scan, times: PointTimes) -> Callable[[], Scan]:

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-ScanQueue: scans that wait for their poses and images, in the order of their stamps.
+ScanQueue: scans that wait for their poses and images, in the order in which they came in.
 
 Time is the stamps of the data alone, never the clock, so a bag replayed at any speed waits and
-drops alike. Every sensor has its own order: the stamps of one lidar say nothing about another's.
+drops alike. Stamps ascend within each frame only: those of one lidar say nothing about another's.
 A scan whose pose cannot come any more, or did not within ``pose.max_wait_s`` of the newest data,
 is dropped and counted. The wait is longer, ``pose.max_delay_s``, while the scan is newer than all
 poses: these are on the way.
@@ -66,6 +66,14 @@ class ScanQueue:
     def newest_ns(self) -> int | None:
         """The newest stamp that came in, whether its scan still waits or not."""
         return max(self._newest_ns.values(), default=None)
+
+    def newest_of(self, frame_id: str) -> int | None:
+        """Return the newest stamp of a frame; of a new one the older of all scans' and poses'."""
+        scan_ns = self._newest_ns.get(frame_id, self.newest_ns)
+        pose_ns = self._poses.transforms.newest_ns
+        if frame_id in self._newest_ns or scan_ns is None or pose_ns is None:
+            return scan_ns
+        return min(scan_ns, pose_ns)
 
     @property
     def stamps(self) -> dict[str, int]:

@@ -15,20 +15,29 @@ scan should wait; after any other PoseError none can, so it should be dropped.
 
 Frames and stamps come from messages, so the numbers of edges and transforms and the depth of the
 tree are limited, and a lookup costs the same however many other frames there are.
+
+The module is long because growth, limits and lookups share the rules of the tree.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
-from itertools import islice
+from itertools import islice, pairwise
 import math
 
 import numpy as np
 
-from surfel_mapper.errors import PoseError, PoseNotYetError, PosesLateError
+from surfel_mapper.errors import PoseError, PoseNotYetError
 from surfel_mapper.geometry import compose, inverse, Transform
-from surfel_mapper.poses.pose_track import NS_PER_S, PoseTrack, rigid, seconds
+from surfel_mapper.poses.pose_track import (
+    check_gap,
+    check_held,
+    NS_PER_S,
+    PoseTrack,
+    rigid,
+    seconds,
+)
 
 MAX_EDGES = 10_000
 """Largest number of edges; a robot has some hundred, and new names must not fill the memory."""
@@ -187,17 +196,9 @@ class TransformBuffer:
             If the stamp is before the oldest transform held of an edge between them.
 
         """
-        up, down = list(self._edges_above(source)), list(self._edges_above(target))
-        # Both lists end at the root; edges that they share at the end cancel.
-        while up and down and up[-1] is down[-1]:
-            up.pop()
-            down.pop()
-        if (up[-1].parent if up else source) != (down[-1].parent if down else target):
-            raise PoseNotYetError(
-                f'{_request(target, source, stamp_ns)}: {self._why_not_connected(target, source)}'
-            )
+        up, down = self._edges_between(target, source, stamp_ns)
         try:
-            _check_held([*up, *down], stamp_ns, self.max_gap_s)
+            check_held([*up, *down], stamp_ns, self.max_gap_s)
         except PoseError as error:
             raise type(error)(f'{_request(target, source, stamp_ns)}: {error}') from None
         T_common_source, T_common_target = _chained(up, stamp_ns), _chained(down, stamp_ns)
@@ -207,6 +208,27 @@ class TransformBuffer:
         if T_common_source is None:
             return T_target_common
         return compose(T_target_common, T_common_source)
+
+    def check_span(self, target: str, source: str, start_ns: int, end_ns: int) -> None:
+        """
+        Raise an error unless ``lookup`` gives the transform at every stamp of a span.
+
+        Raises
+        ------
+        PoseNotYetError, PosesLateError, PoseError
+            As lookup does.
+
+        """
+        up, down = self._edges_between(target, source, start_ns)
+        edges, stamp_ns = [*up, *down], start_ns
+        try:
+            for stamp_ns in (start_ns, end_ns):
+                check_held(edges, stamp_ns, self.max_gap_s)
+            for edge in edges:
+                for stamp_ns, newer_ns in pairwise(_within(edge.stamps, start_ns, end_ns)):
+                    check_gap(edge, newer_ns - stamp_ns, self.max_gap_s)
+        except PoseError as error:
+            raise type(error)(f'{_request(target, source, stamp_ns)}: {error}') from None
 
     def stamps(self, target: str, source: str, start_ns: int, end_ns: int) -> list[int]:
         """Return the stamps of transforms between two frames in a span, ends included."""
@@ -295,6 +317,21 @@ class TransformBuffer:
             raise PoseError(f'{name}: known as {found}, a {came} transform came')
         return edge
 
+    def _edges_between(
+        self, target: str, source: str, stamp_ns: int
+    ) -> tuple[list[PoseTrack], list[PoseTrack]]:
+        """Return the edges from source and from target up to the frame where they meet."""
+        up, down = list(self._edges_above(source)), list(self._edges_above(target))
+        # Both lists end at the root; edges that they share at the end cancel.
+        while up and down and up[-1] is down[-1]:
+            up.pop()
+            down.pop()
+        if (up[-1].parent if up else source) != (down[-1].parent if down else target):
+            raise PoseNotYetError(
+                f'{_request(target, source, stamp_ns)}: {self._why_not_connected(target, source)}'
+            )
+        return up, down
+
     def _edges_above(self, frame: str) -> Iterator[PoseTrack]:
         """Yield the edges from a frame up to the root of its tree."""
         edge = self._edges.get(frame)
@@ -316,24 +353,6 @@ class TransformBuffer:
 def _request(target: str, source: str, stamp_ns: int) -> str:
     """Return the request of a lookup, for errors."""
     return f'{target} <- {source} at {seconds(stamp_ns)} s'
-
-
-def _check_held(edges: list[PoseTrack], stamp_ns: int, max_gap_s: float) -> None:
-    """Raise if a dynamic edge has no transforms around a stamp; too old comes before too new."""
-    dynamic = [edge for edge in edges if not edge.is_static]
-    for edge in dynamic:
-        if stamp_ns < edge.stamps[0]:
-            raise PoseError(f'older than all of {edge}')
-    for edge in dynamic:
-        if stamp_ns > edge.stamps[-1]:
-            raise PosesLateError(f'newer than all of {edge}')
-    for edge in dynamic:
-        gap_s = edge.gap_ns(stamp_ns) / NS_PER_S
-        if gap_s > max_gap_s:
-            raise PoseNotYetError(
-                f'in a gap of {gap_s:.3f} s of {edge}, longer than {max_gap_s:g} s '
-                '(pose.max_gap_s)'
-            )
 
 
 def _within(stamps: list[int], start_ns: int, end_ns: int) -> list[int]:

@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.errors import PoseError
+from surfel_mapper.errors import PoseError, PoseNotYetError, PosesLateError
 from surfel_mapper.geometry import interpolate, Transform
 
 NS_PER_S = 1_000_000_000
@@ -122,3 +122,25 @@ def seconds(stamp_ns: int) -> str:
     """Return a stamp in seconds with all its digits."""
     whole, rest = divmod(abs(stamp_ns), NS_PER_S)
     return f'{"-" if stamp_ns < 0 else ""}{whole}.{rest:09d}'
+
+
+def check_held(edges: list[PoseTrack], stamp_ns: int, max_gap_s: float) -> None:
+    """Raise if a dynamic edge has no transforms around a stamp; too old comes before too new."""
+    dynamic = [edge for edge in edges if not edge.is_static]
+    for edge in dynamic:
+        if stamp_ns < edge.stamps[0]:
+            raise PoseError(f'older than all of {edge}')
+    for edge in dynamic:
+        if stamp_ns > edge.stamps[-1]:
+            raise PosesLateError(f'newer than all of {edge}')
+    for edge in dynamic:
+        check_gap(edge, edge.gap_ns(stamp_ns), max_gap_s)
+
+
+def check_gap(edge: PoseTrack, gap_ns: int, max_gap_s: float) -> None:
+    """Raise if two transforms of an edge are too far apart to interpolate between them."""
+    gap_s = gap_ns / NS_PER_S
+    if gap_s > max_gap_s:
+        raise PoseNotYetError(
+            f'in a gap of {gap_s:.3f} s of {edge}, longer than {max_gap_s:g} s (pose.max_gap_s)'
+        )

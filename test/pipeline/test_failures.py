@@ -14,13 +14,15 @@ import logging
 import pytest
 
 from surfel_mapper import layers
-from surfel_mapper.errors import CloudFormatError, MapError
+from surfel_mapper.errors import AlignmentError, CloudFormatError, MapError
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.layers import Layer
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow
 from surfel_mapper.pipeline import inserter
 from surfel_mapper.pipeline.drops import described
+from surfel_mapper.pipeline.layer_stack import LayerStack
+from surfel_mapper.pipeline.loop_closer import LoopCloser
 from surfel_mapper.pipeline.preparation import Preparation
 from surfel_mapper.pipeline.reduction import Reduction
 from surfel_mapper.pipeline.saved_state import save_mapper
@@ -32,6 +34,11 @@ BEFORE = {
     'reduce': (Reduction, 'reduce'),
     'window': (SlidingWindow, 'insert'),
     'map': (SurfelMap, 'insert'),
+}
+AFTER = {
+    'clear': (LayerStack, 'voxels_to_clear'),
+    'layers': (LayerStack, 'follow'),
+    'derive': (SurfelMap, 'surfels_changed'),
 }
 
 
@@ -68,11 +75,12 @@ def test_a_failure_before_the_map_costs_one_scan(monkeypatch, caplog, stage, err
     assert_counts_add_up(mapper)
 
 
+@pytest.mark.parametrize('stage', AFTER)
 @pytest.mark.parametrize('error', ERRORS, ids=lambda error: type(error).__name__)
-def test_changes_that_could_not_be_derived_come_with_the_next_scan(monkeypatch, error):
+def test_changes_of_a_mapped_scan_whose_update_fails_come_with_the_next(monkeypatch, stage, error):
     mapper, expected = mapper_with(window__max_scans=2), mapper_with(window__max_scans=2)
     drive(mapper, 1.0, 2.0)
-    fail_once(monkeypatch, SurfelMap, 'surfels_changed', error)
+    fail_once(monkeypatch, *AFTER[stage], error)
     assert drive(mapper, 3.0) == []
     (update,) = drive(mapper, 4.0)
 
@@ -85,6 +93,19 @@ def test_changes_that_could_not_be_derived_come_with_the_next_scan(monkeypatch, 
     assert mapper.counters.mapped == 4
     assert mapper.counters.messages_ignored == {'internal_error': 1}
     assert_counts_add_up(mapper)
+
+
+def test_a_scan_that_loops_cannot_keep_is_mapped_and_loops_are_off(monkeypatch, caplog):
+    mapper = mapper_with(loops__enabled=True)
+    drive(mapper, 1.0)
+    fail_once(monkeypatch, LoopCloser, 'add', MemoryError())
+    updates = drive(mapper, 2.0, 3.0)
+    assert [update.stamp_ns // 10**9 for update in updates] == [2, 3]
+    assert mapper.counters.mapped == 3
+    assert mapper.counters.dropped == {}
+    assert 'MemoryError; loops are not closed' in caplog.text
+    with pytest.raises(AlignmentError, match=r'loops\.enabled'):
+        mapper.close_loops()
 
 
 class Fragile(Layer):

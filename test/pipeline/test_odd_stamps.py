@@ -91,6 +91,23 @@ def test_a_sensor_with_another_clock_does_not_clear_the_map():
     assert_counts_add_up(mapper)
 
 
+def test_a_sensor_whose_scans_come_late_does_not_clear_the_map():
+    mapper = mapper_with()
+    late_s = 1.1  # more than input.reset_after_s, but near to the poses
+    add_pose(mapper, 98.0)
+    for k in range(20):
+        stamp_s = 100.0 + 0.1 * k
+        add_pose(mapper, stamp_s - 0.2)
+        insert(mapper, scan_at(stamp_s, 'front'))
+        insert(mapper, scan_at(stamp_s - late_s, 'rear'))
+    add_pose(mapper, 103.0)
+    list(mapper.insert_ready())
+    assert mapper.counters.resets == 0
+    assert mapper.counters.mapped == 40
+    assert mapper.counters.dropped == {}
+    assert_counts_add_up(mapper)
+
+
 def test_a_message_that_is_held_at_the_end_is_counted():
     mapper = mapper_with()
     drive(mapper, 100.0)

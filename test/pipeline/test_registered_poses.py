@@ -13,6 +13,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw, se3_exp
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.scan import Scan
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.alignment.test_registration import CORRIDOR, map_of, NOISE_M, points_on, ROOM, TRUE
@@ -179,6 +180,21 @@ def test_scans_of_another_place_stay_apart_and_are_named():
     states = found['tracking']
     assert states['lost']['scans'] + states['unconfirmed']['scans'] == 6
     assert states['lost']['seconds'] + states['unconfirmed']['seconds'] == pytest.approx(0.6)
+
+
+def test_when_the_map_is_emptied_a_part_ends_and_the_motion_goes_on():
+    mapper = mapper_with()
+    feed(mapper, [scan_at(number) for number in range(4)])
+    assert feed(mapper, [in_hall(4 + n, np.eye(4)) for n in range(2)]) == []
+    mapper.clear_region(Ball(center=(0.0, 0.0, 0.0), radius_m=1000.0))
+    assert mapper.map.num_voxels == 0
+
+    (update,) = feed(mapper, [scan_at(6)])
+    expected = compose(inverse(TRUE), pose_at(6))  # by constant velocity, 0.3 s on
+    np.testing.assert_allclose(update.T_map_sensor, expected, atol=0.15)  # the part is 0.5 m off
+    assert mapper.counters.dropped == {'not_aligned': 2}
+    mapper.finish()
+    assert mapper.summary()['registration']['parts_apart'] == 0
 
 
 def test_after_a_loss_scans_are_joined_once_the_next_ones_agree():

@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mapper: scans wait for poses in the time of the data, and time may be set back."""
 
+from dataclasses import replace
 import logging
 
+import numpy as np
 import pytest
 
 from surfel_mapper.geometry import pose_matrix
@@ -207,6 +209,47 @@ def test_a_scan_in_a_long_gap_of_poses_waits_and_is_dropped(caplog):
     ]
     assert mapper.counters.dropped == {'no_pose': 1}
     assert 'in a gap of 8.600 s' in caplog.text
+
+
+def sweep_at(stamp_s):
+    """Return a scan of 40 points that were measured within 0.1 s."""
+    scan = scan_at(stamp_s)
+    return replace(scan, columns={'t': np.linspace(0, 10**8, len(scan)).astype(np.uint32)})
+
+
+@pytest.mark.parametrize('threads', [1, 2])
+def test_a_sweep_with_a_gap_of_poses_in_its_middle_waits_for_them(threads, caplog):
+    mapper = mapper_with(pose__max_gap_s=0.03, deskew__enabled=True, map__threads=threads)
+    early = [0.90 + 0.01 * step for step in range(13)]  # to 1.02
+    late = [1.08 + 0.01 * step for step in range(13)]  # to 1.20
+    for stamp_s in (*early, *late):
+        angle = 0.5 * (stamp_s - 0.9)
+        add_pose(mapper, stamp_s, q_xyzw=(0.0, 0.0, np.sin(angle), np.cos(angle)))
+    for stamp_s in (0.91, 1.0, 1.09):  # the second has the gap within, and ends at 1.1
+        mapper.add_scan(sweep_at(stamp_s))
+    assert [update.stamp_ns for update in mapper.insert_ready()] == [round(0.91 * S)]
+    assert_counts_add_up(mapper, waiting=2)
+
+    add_pose(mapper, 3.0)
+    mapper.add_scan(sweep_at(2.9))
+    assert [update.stamp_ns for update in mapper.insert_ready()] == [round(1.09 * S)]
+    assert dropped(mapper) == {'no_pose': 1}
+    assert 'in a gap of 0.060 s' in caplog.text
+
+
+def test_poses_of_a_sweep_that_are_forgotten_cost_this_scan_alone():
+    mapper = mapper_with(deskew__enabled=True, map__threads=2)
+    for step in range(5):
+        add_pose(mapper, 1.0 + 0.1 * step, x=0.1 * step)
+    for stamp_s in (1.0, 1.1, 1.2):
+        mapper.add_scan(sweep_at(stamp_s))
+    updates = mapper.insert_ready()
+    found = [next(updates)]  # meanwhile the other thread has begun with the second
+    mapper.transforms.clear()
+    found += updates
+    assert [update.stamp_ns for update in found] == [S, round(1.1 * S)]
+    assert dropped(mapper) == {'no_pose': 1}
+    assert_counts_add_up(mapper)
 
 
 def test_a_pose_that_comes_late_into_a_gap_is_used():
