@@ -17,6 +17,7 @@ from typing import Any, TYPE_CHECKING
 from surfel_mapper.cli._arguments import positive_float, positive_int
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.atomic import finite_or_none
 
 if TYPE_CHECKING:
     from surfel_mapper.evaluation.map_files import Discs
@@ -87,17 +88,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare and report."""
-    if args.map.suffix in TRAJECTORIES:
-        result, lines = trajectories(args)
-    else:
-        result, lines = maps(args)
+    is_trajectory = args.map.suffix in TRAJECTORIES
+    result = finite_or_none(trajectories(args) if is_trajectory else maps(args))
     content = {'map': str(args.map), 'truth': str(args.truth), **result}
-    show_lines(json.dumps(content) if args.json else '\n'.join(lines))
+    lines = trajectory_lines(result) if is_trajectory else map_lines(result)
+    show_lines(json.dumps(content, allow_nan=False) if args.json else '\n'.join(lines))
     return 0
 
 
-def maps(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
-    """Return the errors of a map, and lines that state them."""
+def maps(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the errors of a map."""
     from surfel_mapper.evaluation.comparison import CloudTruth, evaluate, Truth
     from surfel_mapper.evaluation.frames import (
         find_motion,
@@ -125,12 +125,11 @@ def maps(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
         surfels = moved_discs(surfels, motion.T_truth_map)
     elif reason := looks_needed(surfels, truth, max_distance_m):
         _log.warning('%s, %s: one frame? %s; --align moves the map', args.map, args.truth, reason)
-    result = {
+    return {
         **evaluate(surfels, truth, max_distance_m=max_distance_m, radius_m=args.radius or size_m),
         **digests,
         **({} if motion is None else {'aligned': motion.summary()}),
     }
-    return result, map_lines(result)
 
 
 def compared_digests(surfels: Discs, other: Discs) -> dict[str, Any]:
@@ -165,23 +164,25 @@ def map_lines(result: dict[str, Any]) -> list[str]:
     return lines
 
 
+def decimals(value: float | None, unit: str, factor: float = 1.0) -> str:
+    """Return a number with its unit, or a dash for None."""
+    return '-' if value is None else f'{value * factor:.3f} {unit}'
+
+
 def in_words(errors: dict[str, float | None], unit: str, factor: float = 1.0) -> str:
     """Return errors as one line of text."""
-    return '   '.join(
-        f'{name} {"-" if value is None else f"{value * factor:.3f} {unit}"}'
-        for name, value in errors.items()
-    )
+    return '   '.join(f'{name} {decimals(value, unit, factor)}' for name, value in errors.items())
 
 
-def trajectories(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
-    """Return the errors of a trajectory, and lines that state them."""
+def trajectories(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the errors of a trajectory."""
     from surfel_mapper.evaluation.trajectory_errors import compare
     from surfel_mapper.evaluation.truth import read_poses, true_poses
 
     estimated_ns, estimated = read_poses(args.map)
     true_ns, true = true_poses(args.truth, estimated_ns)
     try:
-        result = compare(
+        return compare(
             estimated_ns,
             estimated,
             true_ns,
@@ -190,11 +191,15 @@ def trajectories(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
         )
     except ValueError as error:
         raise FileFormatError(f'{args.map}, {args.truth}: {error}') from error
+
+
+def trajectory_lines(result: dict[str, Any]) -> list[str]:
+    """Return the errors of a trajectory as lines of text."""
     lines = [f'poses {result["num_poses"]}']
     for kind in ('absolute', 'relative'):
         moved, turned = result[kind]['translation_m'], result[kind]['rotation_deg']
         lines.append(f'{kind} {in_words(moved, "mm", 1e3)}')
         lines.append(f'{" " * len(kind)} {in_words(turned, "deg")}')
     drift_m, drift_deg = result['drift_m_per_100m'], result['drift_deg_per_100m']
-    lines.append(f'drift {drift_m:.3f} m, {drift_deg:.3f} deg in 100 m')
-    return result, lines
+    lines.append(f'drift {decimals(drift_m, "m")}, {decimals(drift_deg, "deg")} in 100 m')
+    return lines

@@ -35,6 +35,9 @@ EXAMPLE = 'surfel-mapper view street_surfels/ --color height'
 
 COLOURS = ('normal', 'height', 'planarity', 'intensity', 'rgb', 'age', 'label')
 
+LAST_PORT = 65_534
+"""Last port of a page: the one after it is the last of TCP."""
+
 DISPLAYS = ('DISPLAY', 'WAYLAND_DISPLAY')
 """Variables of the environment that name a display."""
 
@@ -81,7 +84,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where.add_argument(
         '--glb', type=Path, metavar='FILE', help='write glTF instead, for Blender and web pages'
     )
-    add('--port', type=positive_int, default=0, metavar='N', help='of the page (a free one)')
+    add(
+        '--port',
+        type=page_port,
+        default=0,
+        metavar='N',
+        help=f'of the page, at most {LAST_PORT}; its data use the next one (free ones)',
+    )
+
+
+def page_port(text: str) -> int:
+    """Return the port of a page; the next one, of its data, is a port too."""
+    port = positive_int(text)
+    if port > LAST_PORT:
+        raise argparse.ArgumentTypeError(f'{text!r}, expected a port up to {LAST_PORT}')
+    return port
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 import json
+import math
 import os
 from pathlib import Path
 import re
@@ -114,9 +115,18 @@ def check_names(path: str | Path, names: Iterable[str]) -> None:
 
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
-    """Write values as indented JSON, atomically; see replace_file."""
+    """Write finite values as indented JSON, atomically; see replace_file and finite_or_none."""
     with replace_file(path) as file:
-        file.write((json.dumps(content, indent=2) + '\n').encode())
+        file.write((json.dumps(content, indent=2, allow_nan=False) + '\n').encode())
+
+
+def finite_or_none(content: Any) -> Any:
+    """Return plain values with None for nan and infinite numbers, which JSON does not have."""
+    if isinstance(content, dict):
+        return {key: finite_or_none(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return type(content)(map(finite_or_none, content))
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def by_number(file: Path) -> list[Any]:

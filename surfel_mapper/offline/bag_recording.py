@@ -33,6 +33,9 @@ if TYPE_CHECKING:  # they load the compiler, which `info` does not need
     from surfel_mapper.offline.image_feeds import Decode, DepthFeed, SceneFeed
     from surfel_mapper.pipeline import Mapper, Update
 
+CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+"""Type of the calibrations that the feeds of images read."""
+
 
 class BagRecording:
     """
@@ -77,6 +80,19 @@ class BagRecording:
             duration_s=request.duration_s,
             every=request.every,
         )
+        if path is not None:
+            self._check_last_scan(path)
+
+    def _check_last_scan(self, path: PosePath) -> None:
+        """
+        Raise if a file has too few poses for the last scan of a part.
+
+        In parts whose last number takes counting, ``PosePath.add_for`` raises at the scan.
+        """
+        start_ns, stop_ns, every = self.span.start_ns, self.span.stop_ns, self.span.every
+        if stop_ns is None and (start_ns is None or every == 1):
+            num_clouds = self.reader.topics.num_messages(self.topics)
+            path.check_scan((num_clouds - 1) // every * every)
 
     def _poses(self, request: Request, config: Config, path: PosePath | None) -> PoseTopics:
         """Return the source of the poses."""
@@ -259,11 +275,25 @@ def scene_feed(mapper: Mapper) -> SceneFeed | None:
 def messages(
     reader: BagReader, clouds: Collection[str], poses: PoseTopics, span: Span
 ) -> Iterator[BagMessage]:
-    """Yield the messages for a part: earlier static transforms, then its clouds and poses."""
-    if poses.static and span.poses_start_ns is not None:
-        yield from reader.messages(poses.static, None, span.poses_start_ns)
+    """Yield the messages for a part: those that hold from before it, then its clouds and poses."""
     names = {*clouds, *poses.kinds, *poses.static}
+    if span.start_ns is not None:
+        lasting = {*poses.static, *early_calibrations(reader, names, span)}
+        if lasting:
+            yield from reader.messages(lasting, None, span.poses_start_ns)
     yield from reader.messages(names, span.poses_start_ns, span.poses_stop_ns)
+
+
+def early_calibrations(reader: BagReader, names: Collection[str], span: Span) -> list[str]:
+    """
+    Return the topics of calibrations that were recorded only well before a part.
+
+    A camera whose calibration is recorded with every image has a later one in the margin of the
+    poses; to read all earlier ones is to read the bag from its start.
+    """
+    margin = span.poses_start_ns, span.start_ns
+    infos = [name for name in reader.topics.of_type(CAMERA_INFO) if name in names]
+    return [name for name in infos if next(reader.messages([name], *margin), None) is None]
 
 
 def numbers_before(

@@ -78,12 +78,13 @@ def choose_for_bag(
 
     """
     wanted = wanted_source(request, config)
-    if wanted == 'registration' and request.poses_from is not None:
+    is_depth = config.input.kind == 'depth'  # all pixels have one time: nothing to deskew
+    if wanted == 'registration' and request.poses_from is not None and not is_depth:
         return PoseChoice(with_registration(config, first_scans(reader, topics)))
     if wanted in ('file', 'identity', 'registration'):
         return PoseChoice(config.replace({'pose.source': SETTING.get(wanted, wanted)}))
     asked = config if wanted is None else config.replace({'pose.source': wanted})
-    if config.input.kind == 'depth':
+    if is_depth:
         return PoseChoice(asked)
     has_poses = any(reader.topics.of_type(type_) for type_ in TYPES.values())
     is_framed = config.frames != DEFAULT.frames or request.mounts or request.pose_topic

@@ -90,13 +90,9 @@ class PosePath:
             If the poses have no stamps, and there are fewer of them than scans.
 
         """
+        self.check_scan(number)
         stamps = self.trajectory.stamp_ns
         if stamps is None:
-            if number >= len(self.trajectory):
-                raise BagError(
-                    f'{self.path}: {len(self.trajectory)} poses, none for scan {number + 1}; '
-                    'expected one for every scan, or a times.txt beside it'
-                )
             self._add(mapper, number, stamp_ns)
             return
         if self._next is None:
@@ -107,6 +103,14 @@ class PosePath:
             self._next += 1
             if stamps[self._next - 1] >= stamp_ns + MARGIN_NS:
                 return
+
+    def check_scan(self, number: int) -> None:
+        """Raise BagError if the poses have no stamps, and there is none for a scan's number."""
+        if not self.has_stamps and number >= len(self.trajectory):
+            raise BagError(
+                f'{self.path}: {len(self.trajectory)} poses, none for scan {number + 1}; '
+                'expected one for every scan, or a times.txt beside it'
+            )
 
     def _add(self, mapper: Mapper, row: int, stamp_ns: int) -> None:
         frames, poses = mapper.config.frames, self.trajectory

@@ -23,13 +23,8 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.arguments import as_path, check_kind
-from surfel_mapper.errors import (
-    BagError,
-    ConfigError,
-    MapError,
-    SurfelMapperError,
-)
-from surfel_mapper.files.atomic import make_directory
+from surfel_mapper.errors import BagError, ConfigError, MapError
+from surfel_mapper.files.atomic import finite_or_none, make_directory
 from surfel_mapper.offline.summary import causes_text
 
 if TYPE_CHECKING:
@@ -198,7 +193,7 @@ def replay(
             trajectory.follow_alignment(mapper)
             write_maps(directory, options.formats, mapper, trajectory, window=options.window)
             mapper.finish_layers()
-        summary = {
+        found = {
             **recording.describe(),
             'recorded_s': recording.recorded_s,
             'replay_s': replay_s,
@@ -210,6 +205,7 @@ def replay(
             **mapper.summary(),
             'settings': mapper.config.to_mapping(),
         }
+        summary = finite_or_none(found)
     if options.poses_out is not None:
         trajectory.write(options.poses_out)
     written = write_files(directory, options.formats, mapper, trajectory, summary, history)
@@ -307,7 +303,7 @@ def write_first(write: Callable[[], None]) -> Iterator[None]:
     """Write the map if a block fails, and then raise its error."""
     try:
         yield
-    except SurfelMapperError:
+    except Exception:  # MemoryError too
         write()
         raise
 

@@ -117,15 +117,21 @@ def apart_text(summary: Mapping[str, Any]) -> str:
 def errors_text(errors: Mapping[str, Any]) -> str:
     """Return the errors of poses against the truth in one line."""
     absolute, relative = (
-        f'{1e3 * errors[kind]["translation_m"]["rmse"]:.3f} mm, '
-        f'{errors[kind]["rotation_deg"]["rmse"]:.3f} deg'
+        f'{decimals(errors[kind]["translation_m"]["rmse"], 1e3)} mm, '
+        f'{decimals(errors[kind]["rotation_deg"]["rmse"])} deg'
         for kind in ('absolute', 'relative')
     )
-    drift = f'{errors["drift_m_per_100m"]:.3f} m, {errors["drift_deg_per_100m"]:.3f} deg'
+    drift_m, drift_deg = errors['drift_m_per_100m'], errors['drift_deg_per_100m']
     return (
         f'errors of {errors["num_poses"]} poses   absolute {absolute} (rmse)   '
-        f'from scan to scan {relative}   drift {drift} in 100 m'
+        f'from scan to scan {relative}   '
+        f'drift {decimals(drift_m)} m, {decimals(drift_deg)} deg in 100 m'
     )
+
+
+def decimals(value: float | None, factor: float = 1.0) -> str:
+    """Return a number with three decimals, or a dash for None."""
+    return '-' if value is None else f'{value * factor:.3f}'
 
 
 def causes_text(counts: Mapping[str, int]) -> str:

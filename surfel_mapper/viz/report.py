@@ -244,19 +244,25 @@ def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
         for name, unit, factor in (('translation_m', 'mm', 1e3), ('rotation_deg', 'deg', 1.0)):
             found = errors[kind][name]
             cells = ''.join(
-                f'<td class="number">{found[figure] * factor:.3f}</td>'
+                f'<td class="number">{decimals(found[figure], factor)}</td>'
                 for figure in ('rmse', 'mean', 'median', 'max')
             )
             rows += f'<tr><td>{kind}, {unit}</td>{cells}</tr>'
     head = ''.join(f'<th class="number">{name}</th>' for name in ('rmse', 'mean', 'median', 'max'))
+    drift_m, drift_deg = errors['drift_m_per_100m'], errors['drift_deg_per_100m']
     drift = (
-        f'{errors["num_poses"]} poses compared; drift {errors["drift_m_per_100m"]:.3f} m and '
-        f'{errors["drift_deg_per_100m"]:.3f} deg in 100 m.'
+        f'{errors["num_poses"]} poses compared; drift {decimals(drift_m)} m and '
+        f'{decimals(drift_deg)} deg in 100 m.'
     )
     return (
         f'<h2>Errors of the poses</h2><table><tr><th></th>{head}</tr>{rows}</table>'
         f'<p>{as_html(drift)}</p>'
     )
+
+
+def decimals(value: float | None, factor: float = 1.0) -> str:
+    """Return a number with three decimals, or a dash for None."""
+    return '-' if value is None else f'{value * factor:.3f}'
 
 
 def times_table(summary: Mapping[str, Any]) -> str:

@@ -10,6 +10,7 @@ import pytest
 from surfel_mapper.cli.main import main
 from surfel_mapper.files.ply import write_points
 from surfel_mapper.simulation import load_simulation
+from test.cli.test_replay import strict_json
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 
@@ -32,7 +33,7 @@ def street(tmp_path_factory):
 def evaluated(capsys, *arguments):
     capsys.readouterr()
     assert main(['evaluate', *map(str, arguments), '--json']) == 0
-    return json.loads(capsys.readouterr().out)
+    return strict_json(capsys.readouterr().out)
 
 
 def test_a_map_of_a_simulated_street_is_near_its_truth(street, capsys):
@@ -136,6 +137,19 @@ def test_the_report_says_it_in_a_few_lines(street, capsys):
         capsys.readouterr()
         assert main(['evaluate', *map(str, arguments), '--truth', str(bag)]) == 0
         assert 2 < len(capsys.readouterr().out.splitlines()) < 9
+
+
+def test_drift_along_a_path_without_length_is_null(tmp_path, capsys):
+    path = tmp_path / 'still.tum'
+    path.write_text(''.join(f'{stamp}.0 1 2 3 0 0 0 1\n' for stamp in range(5)))
+
+    assert main(['evaluate', str(path), '--truth', str(path), '--json']) == 0
+    result = strict_json(capsys.readouterr().out)
+    assert result['drift_m_per_100m'] is result['drift_deg_per_100m'] is None
+    assert result['absolute']['translation_m']['max'] == 0.0
+
+    assert main(['evaluate', str(path), '--truth', str(path)]) == 0
+    assert capsys.readouterr().out.endswith('drift -, - in 100 m\n')
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,9 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
         (('info', 'a', 'b'), 'too many arguments: b'),
         (('merge', 'a', '--output', 'b', '--workers', '0'), 'a whole number of 1 or more'),
         (('view', 'a', '--at', '1', '2', 'nan'), "--at: 'nan', expected a finite number"),
+        (('view', 'a', '--port', '0'), "--port: '0', expected a whole number of 1 or more"),
+        (('view', 'a', '--port', '65535'), "--port: '65535', expected a port up to 65534"),
+        (('view', 'a', '--port', '70000'), "--port: '70000', expected a port up to 65534"),
     ],
 )
 def test_a_mistyped_word_is_answered_with_the_nearest(arguments, says, capsys):

@@ -12,7 +12,7 @@ from plyfile import PlyData
 import pytest
 
 from surfel_mapper.cli.main import main
-from test.bags.recorded import cut, drive, NUM_SCANS, write_rosbag2
+from test.bags.recorded import cut, drive, Entries, NUM_SCANS, PERIOD_NS, START_NS, write_rosbag2
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 
@@ -31,8 +31,13 @@ def settings_file(tmp_path, text):
     return str(path)
 
 
+def strict_json(text):
+    """Return the content of JSON; KeyError for NaN and Infinity, which Python reads too."""
+    return json.loads(text, parse_constant={}.__getitem__)
+
+
 def summary_of(output):
-    return json.loads((output / 'summary.json').read_text())
+    return strict_json((output / 'summary.json').read_text())
 
 
 @pytest.mark.drawn
@@ -182,6 +187,37 @@ def test_poses_are_held_against_the_truth_in_summary_and_report(bag, tmp_path, c
     assert steps['max'] == pytest.approx(0.1, abs=1e-6)
     assert 'Errors of the poses' in (second / 'report.html').read_text()
     assert 'Errors of the poses' not in (first / 'report.html').read_text()
+
+
+@pytest.mark.drawn
+def test_figures_that_do_not_exist_are_null(tmp_path, capsys):
+    rng = np.random.default_rng(4)
+    entries = Entries()
+    for number in range(3):
+        entries.cloud('/points', START_NS + number * PERIOD_NS, rng.uniform(-3, 3, (900, 3)))
+    bag, truth, output = tmp_path / 'still', tmp_path / 'still.tum', tmp_path / 'out'
+    write_rosbag2(bag, entries)
+    stamps_s = [START_NS // 10**9 + 0.1 * number for number in range(3)]
+    truth.write_text(''.join(f'{stamp_s:.1f} 0 0 0 0 0 0 1\n' for stamp_s in stamps_s))
+    arguments = ['replay', str(bag), '--output', str(output), '--truth', str(truth)]
+
+    assert main([*arguments, '--poses-from', 'identity']) == 0
+    assert 'drift - m, - deg in 100 m' in capsys.readouterr().out
+    assert 'drift - m and - deg in 100 m' in (output / 'report.html').read_text()
+    errors = summary_of(output)['pose_errors']
+    assert errors['drift_m_per_100m'] is errors['drift_deg_per_100m'] is None
+    assert main([*arguments, '--poses-from', 'identity', '--json']) == 0
+    assert strict_json(capsys.readouterr().out)['pose_errors'] == errors
+
+
+def test_the_fit_of_a_single_registered_scan_is_null(tmp_path):
+    entries = Entries()
+    entries.cloud('/points', START_NS, np.random.default_rng(4).uniform(-3, 3, (900, 3)))
+    bag, output = write_rosbag2(tmp_path / 'one', entries), tmp_path / 'out'
+
+    assert main(['replay', str(bag), '--output', str(output)]) == 0
+
+    assert summary_of(output)['registration']['fit'] == {'median': None, 'min': None}
 
 
 def test_an_invalid_truth_is_refused_before_the_work(bag, tmp_path, capsys):

@@ -3,6 +3,7 @@
 """A file is replaced completely or not at all, also after errors while it is written."""
 
 from contextlib import contextmanager
+import math
 import os
 import shutil
 import stat
@@ -12,7 +13,7 @@ import sys
 import pytest
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.atomic import make_directory, replace_file
+from surfel_mapper.files.atomic import finite_or_none, make_directory, replace_file, write_json
 
 
 def write(path, *chunks, then=None):
@@ -152,3 +153,17 @@ def test_a_directory_is_made_with_its_parents_or_the_file_in_its_place_is_named(
         said = f'{path}: {tmp_path / name} is a file, expected a directory'
         with pytest.raises(FileFormatError, match=f'^{said}$'):
             make_directory(path)
+
+
+def test_numbers_that_json_lacks_become_none_at_any_depth():
+    content = {'a': math.nan, 'b': [1.5, -math.inf, ('x', math.inf, 2, True, None)]}
+    found = finite_or_none({'c': content})
+    assert found == {'c': {'a': None, 'b': [1.5, None, ('x', None, 2, True, None)]}}
+
+
+def test_json_with_nan_is_refused_and_leaves_the_old_file(tmp_path):
+    path = tmp_path / 'summary.json'
+    path.write_text('old')
+    with pytest.raises(ValueError, match='not JSON compliant'):
+        write_json(path, {'drift': math.nan})
+    assert path.read_text() == 'old'

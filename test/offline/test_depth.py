@@ -4,14 +4,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from surfel_mapper import Config, Mapper
+from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.errors import BagError
 from surfel_mapper.messages.images import CameraImage, depth_scan
+from surfel_mapper.offline.bag_recording import early_calibrations
 from surfel_mapper.offline.recording import open_recording
-from surfel_mapper.offline.request import Request
+from surfel_mapper.offline.request import Request, Span
 from surfel_mapper.sensors.depth import PinholeCamera
 from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
 
@@ -21,7 +25,7 @@ CAMERA = PinholeCamera(width=40, height=30, fx=35.0, fy=35.0, cx=19.5, cy=14.5)
 SETTINGS = {'input.kind': 'depth', 'pose.source': 'identity', 'map.min_points': 1}
 
 
-def camera_info(entries, record_ns, focal=35.0):
+def camera_info(entries, record_ns, focal=35.0, topic=INFO_TOPIC):
     K = np.array([focal, 0.0, 19.5, 0.0, focal, 14.5, 0.0, 0.0, 1.0])
     roi = entries.make(
         'sensor_msgs/msg/RegionOfInterest',
@@ -45,7 +49,7 @@ def camera_info(entries, record_ns, focal=35.0):
         binning_y=0,
         roi=roi,
     )
-    entries.append((INFO_TOPIC, INFO, record_ns, message))
+    entries.append((topic, INFO, record_ns, message))
 
 
 def image(entries, number):
@@ -65,10 +69,10 @@ def image(entries, number):
     return message
 
 
-def replayed(bag, settings=SETTINGS):
+def replayed(bag, settings=SETTINGS, **request):
     config = Config.from_mapping(settings)
-    mapper = Mapper(config)
-    with open_recording(Request(path=bag), config) as recording:
+    with open_recording(Request(path=bag, **request), config) as recording:
+        mapper = Mapper(recording.config)
         list(recording.replay(mapper))
         return mapper, recording
 
@@ -87,6 +91,58 @@ def test_images_wait_for_the_first_calibration_and_are_mapped_with_it(tmp_path):
     assert mapper.counters.mapped == 4
     assert recording.topics == [TOPIC]
     assert mapper.map.digest() == expected.map.digest()
+
+
+@pytest.mark.parametrize(
+    ('infos', 'focal'),
+    [
+        ({-1: 35.0}, 35.0),
+        ({-1: 70.0, 10: 35.0}, 35.0),
+        ({-1: 70.0, 65: 35.0}, 35.0),  # in the margin before the part
+        ({-1: 35.0, 75: 70.0}, 35.0),  # in the part, after its images
+    ],
+)
+def test_a_part_has_the_last_calibration_before_it(tmp_path, infos, focal):
+    entries = Entries()
+    for at, recorded_focal in infos.items():
+        camera_info(entries, START_NS + at * PERIOD_NS + 10, focal=recorded_focal)
+    images = [image(entries, number) for number in range(73)]
+    entries.sort(key=lambda entry: entry[2])
+    bag = write_rosbag2(tmp_path / 'bag', entries)
+    mapper, _ = replayed(bag, start_s=7.05, duration_s=0.35)  # from image 70 on
+
+    expected = Mapper(Config.from_mapping(SETTINGS))
+    for message in images[70:]:
+        camera = replace(CAMERA, fx=focal, fy=focal)
+        expected.add_scan(depth_scan(CameraImage(message, camera)))
+        list(expected.insert_ready())
+    assert mapper.counters.mapped == 3
+    assert mapper.map.digest() == expected.map.digest()
+
+
+def test_calibrations_repeated_up_to_a_part_are_not_read_from_the_start(tmp_path):
+    entries = Entries()
+    for at in range(80):
+        camera_info(entries, START_NS + at * PERIOD_NS)
+        if at % 60 == 0:
+            camera_info(entries, START_NS + at * PERIOD_NS, topic='/rare/camera_info')
+    span = Span(start_ns=START_NS + 119 * PERIOD_NS)  # its margin begins at number 69
+    with BagReader(write_rosbag2(tmp_path / 'bag', entries)) as reader:
+        found = early_calibrations(reader, {INFO_TOPIC, '/rare/camera_info'}, span)
+    assert found == ['/rare/camera_info']
+
+
+def test_registration_can_be_asked_for(tmp_path):
+    entries = Entries()
+    camera_info(entries, START_NS - 10)
+    image(entries, 0)
+    bag = write_rosbag2(tmp_path / 'bag', entries)
+
+    mapper, recording = replayed(bag, {'input.kind': 'depth'}, poses_from='registration')
+
+    assert recording.config.pose.source == 'registration'
+    assert not recording.config.deskew.enabled
+    assert mapper.counters.mapped == 1
 
 
 def test_an_invalid_camera_is_counted_and_the_next_one_taken(tmp_path):

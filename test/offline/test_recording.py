@@ -250,6 +250,39 @@ def test_fewer_poses_without_times_than_clouds_are_refused(tmp_path, bag):
         mapped(bag, poses=pose_file(tmp_path, 'kitti', range(5)))
 
 
+@pytest.mark.parametrize(
+    ('span', 'number', 'missing'),
+    [
+        ({}, 5, 6),
+        ({'every': 2}, 4, 5),
+        ({'every': 5}, 5, 6),
+        ({'start_s': 0.15}, 5, 6),
+    ],
+)
+def test_a_pose_that_the_last_scan_lacks_is_reported_before_the_first(
+    tmp_path, bag, span, number, missing
+):
+    request = Request(path=bag, poses=pose_file(tmp_path, 'kitti', range(number)), **span)
+    says = f'kitti: {number} poses, none for scan {missing}; expected one for every scan'
+    with pytest.raises(BagError, match=says), open_recording(request, Config()):
+        pass
+
+
+@pytest.mark.parametrize(
+    ('span', 'number', 'numbers'),
+    [
+        ({'every': 2}, 5, [0, 2, 4]),
+        ({'duration_s': 0.25}, 3, [0, 1, 2]),
+        ({'start_s': 0.15, 'every': 3}, 6, [2, 5]),
+        ({'start_s': 0.05, 'every': 3}, 5, [1, 4]),
+    ],
+)
+def test_poses_that_no_scan_of_the_part_needs_may_be_missing(tmp_path, bag, span, number, numbers):
+    mapper = mapped(bag, poses=pose_file(tmp_path, 'kitti', range(number)), **span)
+
+    assert mapper.map.digest() == digest_of(numbers)
+
+
 def test_two_sources_of_poses_are_refused(tmp_path, bag):
     with pytest.raises(BagError, match='poses of /odom or of'):
         mapped(bag, poses=pose_file(tmp_path, 'tum'), pose_topic='/odom')

@@ -180,6 +180,22 @@ def test_the_map_is_written_before_an_alignment_that_fails(bag, tmp_path):
     assert load_map(tmp_path / 'out')[0].num_points > 0
 
 
+def test_the_map_is_written_before_an_alignment_that_runs_out_of_memory(
+    bag, tmp_path, monkeypatch
+):
+    def fail(*args):
+        raise MemoryError('a large matrix')
+
+    monkeypatch.setattr('surfel_mapper.pipeline.window_aligner.align_scans', fail)
+    options = ReplayOptions(window=True, align=True)
+    with pytest.raises(MemoryError, match='a large matrix'):
+        replay(bag, output=tmp_path / 'out', options=options)
+
+    assert contents(tmp_path / 'out') == {'map.ply', 'map.npz', 'trajectory.tum'}
+    expected = replay(bag, output=tmp_path / 'whole').summary['digest']
+    assert load_map(tmp_path / 'out')[0].digest() == expected
+
+
 def test_the_map_is_written_before_a_picture_that_fails(bag, tmp_path, monkeypatch):
     def fail(*args, **options):
         raise MemoryError('a large picture')
