@@ -125,7 +125,11 @@ class ScanSpool:
             buffer = array.data.cast('B')
             done = 0
             while done < len(buffer):
-                found = os.preadv(self._file.fileno(), [buffer[done:]], offset + done)
+                try:
+                    found = os.preadv(self._file.fileno(), [buffer[done:]], offset + done)
+                except OSError as error:
+                    reason = f'{self._directory}: points of scans cannot be read: {error.strerror}'
+                    raise FileFormatError(reason) from error
                 if not found:
                     raise FileFormatError(
                         f'{self._directory}: the points of a scan end {len(buffer) - done} bytes '

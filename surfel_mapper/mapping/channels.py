@@ -47,6 +47,13 @@ def missing_columns(columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, .
     return [n for n in names if n not in columns and not (n == 'rgb' and 'rgba' in columns)]
 
 
+def summed_columns(
+    columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, ...]
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the named columns, none of them missing; ``rgba`` takes the name ``rgb``."""
+    return {n: columns['rgba' if n == 'rgb' and n not in columns else n] for n in names}
+
+
 def quantised(
     columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, ...], num_points: int
 ) -> npt.NDArray[np.int32]:
@@ -57,7 +64,7 @@ def quantised(
     ----------
     columns : mapping of str to (N,) array
         ``intensity``: numbers. ``rgb``: three bytes packed into float32 or uint32, as in PCL and
-        RViz, or an (N, 3) array of 0 to 255; ``rgba`` can replace it.
+        RViz, or an (N, 3) array of 0 to 255 with any further columns; ``rgba`` can replace it.
     names : tuple of str
         Columns to quantise.
     num_points : int
@@ -66,7 +73,7 @@ def quantised(
     Raises
     ------
     ValueError
-        If a column is missing or of another length.
+        If a column is missing, of another length or of another shape.
 
     """
     if not isinstance(columns, Mapping):
@@ -82,7 +89,11 @@ def quantised(
             raise ValueError(
                 f'column {name}: of length {len(column)}, expected one row for {num_points} points'
             )
-        parts.append(_unpacked(column) if name == 'rgb' else _fixed(column))
+        is_rgb = name == 'rgb'
+        if column.ndim != 1 and not (is_rgb and column.ndim == 2 and column.shape[1] >= 3):
+            expected = f'({num_points},) packed, or ({num_points}, 3)' if is_rgb else (num_points,)
+            raise ValueError(f'column {name}: shape {column.shape}, expected {expected}')
+        parts.append(_unpacked(column) if is_rgb else _fixed(column))
     return np.ascontiguousarray(np.concatenate(parts, axis=1))
 
 

@@ -11,6 +11,7 @@ beside this one or a part below. The module is long because every stage and ever
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 import logging
@@ -20,7 +21,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Laps
-from surfel_mapper.errors import AlignmentError, FileFormatError, MapError
+from surfel_mapper.errors import AlignmentError, MapError, PoseError
 from surfel_mapper.geometry import Transform
 from surfel_mapper.layers import InsertedScan, Surroundings
 from surfel_mapper.layers.sensor_models import SensorModels
@@ -46,7 +47,7 @@ from surfel_mapper.scan import Scan
 
 _log = logging.getLogger(__name__)
 
-NO_ROWS = np.empty(0, np.int32)
+NO_ROWS, NO_VOXELS = np.empty(0, np.int32), np.empty((0, 3), np.int32)
 
 
 class Inserter:
@@ -92,8 +93,8 @@ class Inserter:
         around = Surroundings(surfel_map=self.map, window=self.window, sensors=sensors)
         self.aligner = WindowAligner(lambda scan, pose: moments_at(scan, pose, self.map, config))
         self.loops = LoopCloser(config, self.map, self.window) if config.loops.enabled else None
-        has_local_map = config.loops.enabled and not config.map.load
-        self._local_map = LocalMap(config) if has_local_map and poses.registered else None
+        has_local_map = config.loops.enabled and poses.registered is not None
+        self._local_map = LocalMap(config) if has_local_map else None
         self.layers = LayerStack(config, around, drops)
         wanted = self.layers.images
         self.images = ScanImages(wanted) if wanted.topics else None
@@ -132,6 +133,19 @@ class Inserter:
         for kept in (self.loops, self._local_map):
             if kept is not None:
                 kept.clear()
+        self.preparation.local_map = self._local_map
+
+    def restore(self, surfel_map: SurfelMap, scans: list[WindowedScan]) -> None:
+        """Replace map and window by saved ones, which scans are registered to until cleared."""
+        self.clear()
+        self.map.insert(surfel_map.moments())
+        self.window.restore(scans)
+        self.preparation.local_map = None
+        if self.loops is not None:
+            self._drops.warn(
+                'loops',
+                'a map was loaded: loops are closed only among the scans that come after it',
+            )
 
     def drop_voxels(
         self, voxel_index: npt.NDArray[np.int32], min_points: int
@@ -176,9 +190,14 @@ class Inserter:
         return self._reduction.scans_ahead if runs_ahead else 0
 
     def begin(self, scan: Scan, pose: Transform, config: Config) -> None:
-        """Begin to prepare and reduce a scan that is inserted soon, in another thread."""
+        """
+        Begin to prepare and reduce a scan that is inserted soon, in another thread.
+
+        Without the poses of its sweep nothing is begun; ``insert`` counts the scan then.
+        """
         place = self.aligner.to_map(pose)
-        self._reduction.begin(scan, place, config, self.preparation.ahead)
+        with suppress(PoseError):
+            self._reduction.begin(scan, place, config, self.preparation.ahead)
 
     def insert(
         self,
@@ -209,10 +228,20 @@ class Inserter:
         if not found and len(laps.milliseconds) > 1:
             self._drops.counters.add_times(laps.milliseconds)
         for prepared in found:
-            update = self._insert(prepared, config, following, laps)
+            num_used = self._num_used
+            try:
+                update = self._insert(prepared, config, following, laps)
+            except Exception as error:  # MemoryError too: the next scan may fit
+                self._drops.failure(prepared.scan, error, is_used=self._num_used > num_used)
+                update = None
             if update is not None:
                 yield update
             laps = Laps()
+
+    @property
+    def _num_used(self) -> int:
+        """Number of scans so far that were mapped, or aligned to a frozen map."""
+        return self._drops.counters.mapped + self._drops.counters.localised
 
     def _insert(
         self,
@@ -225,21 +254,25 @@ class Inserter:
         if config.map.mode == 'frozen':
             return self._localised(prepared, config, laps)
         version = self.map.version
-        inserted = self._add_to_map(prepared, following, config, laps)
-        if inserted is None:
+        added = self._add_to_map(prepared, following, config, laps)
+        if added is None:
             return None
+        inserted, windowed = added
+        self._count(inserted)
+        version, removed = self._to_report(version, inserted)
+        self._keep(prepared.filtered, windowed, config)
+        laps.end('insert')
         cleared = self.layers.voxels_to_clear(inserted, laps)
         if len(cleared):
             inserted = replace(inserted, cleared=cleared)
-            cleared = self.drop_voxels(cleared, config.map.min_points)
+            removed.append(self.drop_voxels(cleared, config.map.min_points))
         alignment = self._align_when_due(config)
         if alignment is not None:
             inserted = inserted.at(alignment.T_map_sensor[-1])
             laps.end('align')
         results = self.layers.follow(inserted, laps)
-        removed = [cleared, *(eviction.fallen for eviction in inserted.evictions)]
-        self._count(inserted)
-        changed = self._changed_since(version, removed, config)
+        changed = self._changed_since(version, config)
+        self._unreported = None
         laps.end('normals')
         milliseconds = laps.milliseconds
         self._drops.counters.add_times(milliseconds)
@@ -266,7 +299,7 @@ class Inserter:
         following: tuple[Scan, Transform] | None,
         config: Config,
         laps: Laps,
-    ) -> InsertedScan | None:
+    ) -> tuple[InsertedScan, WindowedScan] | None:
         """Reduce a scan and insert it into the window; None if the map refuses it."""
         scan, pose = prepared.filtered, prepared.T_map_sensor
         try:
@@ -287,29 +320,28 @@ class Inserter:
         except MapError as error:
             self._drops.scan(scan, 'map_limit', str(error))
             return None
-        self._keep(scan, windowed, config)
-        laps.end('insert')
-        return InsertedScan(
+        inserted = InsertedScan(
             scan=scan,
             T_map_sensor=pose,
             keys=windowed.moments.key,
             num_points=windowed.moments.num_points,
             evictions=tuple(evictions),
         )
+        return inserted, windowed
 
     def _keep(self, scan: Scan, windowed: WindowedScan, config: Config) -> None:
-        """Keep a mapped scan for registration and for loops; warn if the disk is full."""
+        """Keep a mapped scan for registration and for loops; without it loops are not closed."""
         pose = windowed.T_map_sensor
-        if self._local_map is not None:
-            self._local_map.add(scan, windowed, self.aligner.to_fixed(pose), config)
-        if self.loops is None:
-            return
-        try:
-            self.loops.add(scan, pose, config)
-        except FileFormatError as error:
-            self._drops.warn('loops', f'{error}; loops are not closed')
-            self.loops.clear()
-            self.loops = None
+        if self.loops is not None:
+            try:
+                self.loops.add(scan, pose, config)
+            except Exception as error:  # the disk is full, or out of memory
+                self._drops.warn('loops', f'{described(error)}; loops are not closed')
+                self.loops.clear()
+                self.loops = None
+        local_map = self.preparation.local_map
+        if local_map is not None:  # last: it may refuse the scan, which loops must have
+            local_map.add(scan, windowed, self.aligner.to_fixed(pose), config)
 
     def _localised(self, prepared: Prepared, config: Config, laps: Laps) -> Update:
         """Return the pose of a scan in a frozen map, which takes no scan."""
@@ -345,26 +377,26 @@ class Inserter:
         _log.debug('aligned: %s', alignment)
         return alignment
 
-    def _changed_since(
-        self, version: int, removed: list[npt.NDArray[np.int32]], config: Config
-    ) -> Surfels:
+    def _to_report(
+        self, version: int, inserted: InsertedScan
+    ) -> tuple[int, list[npt.NDArray[np.int32]]]:
         """
-        Return the surfels of the voxels that changed after a version of the map.
+        Return the version after which changes are to be reported, and the voxels that left.
 
-        After a failure (out of memory) the next scan reports those changes and removals too.
+        With those of scans before it whose updates failed, as of this one if its update fails.
         """
-        if not self.derives:
-            return self.map.surfels_of(NO_ROWS)
+        removed = [NO_VOXELS, *(eviction.fallen for eviction in inserted.evictions)]
         if self._unreported is not None:
             version = self._unreported[0]
             removed += self._unreported[1]
-        try:
-            changed = self.map.surfels_changed(version, config.map.min_points)
-        except Exception:  # MemoryError; the caller counts it
-            self._unreported = version, removed
-            raise
-        self._unreported = None
-        return changed
+        self._unreported = version, removed
+        return self._unreported
+
+    def _changed_since(self, version: int, config: Config) -> Surfels:
+        """Return the surfels of the voxels that changed after a version of the map."""
+        if not self.derives:
+            return self.map.surfels_of(NO_ROWS)
+        return self.map.surfels_changed(version, config.map.min_points)
 
     def _count(self, inserted: InsertedScan) -> None:
         """Count a scan that was mapped, and the scans that left."""

@@ -11,6 +11,7 @@ and some 200 bytes for each scan.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,9 +21,10 @@ import numpy.typing as npt
 from surfel_mapper.alignment.loop_search import LoopClosure, LoopSearch, Refusal
 from surfel_mapper.alignment.window import extent
 from surfel_mapper.config import Config
-from surfel_mapper.errors import AlignmentError, MapError
+from surfel_mapper.errors import AlignmentError
 from surfel_mapper.files.scan_spool import ScanSpool
 from surfel_mapper.geometry import compose, inverse, Transform
+from surfel_mapper.mapping.channels import summed_columns
 from surfel_mapper.mapping.moments import point_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.reducer import within
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -50,7 +52,7 @@ class LoopMove:
     largest_m, largest_deg : float
         The most that a scan was moved and turned by.
     correction : (4, 4) float64
-        Motion of the last scan in the map.
+        Motion of the last scan in the map; exactly the identity if it did not move.
     removed_voxel_index : (K, 3) int32
         Voxels that were surfels and have too few points now.
 
@@ -111,7 +113,8 @@ class LoopCloser:
     surfel_map : SurfelMap
         The map that holds the scans.
     window : SlidingWindow
-        Its window.
+        Its window. Both end with the same scan; the window may begin with scans of a loaded map,
+        and need not keep old scans that no limit can evict.
 
     Raises
     ------
@@ -152,17 +155,16 @@ class LoopCloser:
         """Keep the points of a scan that entered the map."""
         limits = config.input
         entered = scan.select(within(scan.points, limits.min_range_m, limits.max_range_m))
-        columns = {name: entered.columns[name] for name in self._map.columns}
-        self._spool.append(entered.points, columns)
+        self._spool.append(entered.points, summed_columns(entered.columns, self._map.columns))
         self._stamps_ns.append(scan.stamp_ns)
         self._poses.append(T_map_sensor)
 
     def follow_window(self) -> None:
         """Take over the poses of the scans of the window, which were moved in the map."""
-        before, num_settled = list(self._poses), len(self) - len(list(self._window))
-        for place, scan in enumerate(self._window):
-            self._poses[num_settled + place] = scan.T_map_sensor
-        self._begin_emptied(before)
+        self._begin_emptied()
+        newest_first = zip(reversed(range(len(self))), reversed(list(self._window)), strict=False)
+        for number, scan in newest_first:
+            self._poses[number] = scan.T_map_sensor
 
     def drop_voxels(self, keys: npt.NDArray[np.int64]) -> None:
         """Note that voxels were emptied: the points of the scans so far in them stay removed."""
@@ -186,17 +188,21 @@ class LoopCloser:
         ------
         AlignmentError
             If the map does not hold all scans any more, or there are fewer than two.
+        FileFormatError, OSError
+            If points cannot be read. Nothing has changed then.
         MapError
             If the map refuses a scan at its new pose. Nothing has changed then.
 
         """
-        if len(self._window) != len(self):
+        if len(self._window) < len(self):
             raise AlignmentError(
                 f'the map holds {len(self._window)} of {len(self)} scans; loops are closed '
                 'between scans of the map: the window must not evict any'
             )
         if len(self) < 2:
-            raise AlignmentError(f'{len(self)} scans in the map, expected two or more')
+            raise AlignmentError(
+                f'{len(self)} scans since the map was cleared or loaded, expected two or more'
+            )
         before = self.T_map_sensor
         search = LoopSearch(
             self._spool, before, config.loops, config.registration, config.map.voxel_size_m
@@ -204,7 +210,7 @@ class LoopCloser:
         return self.move(search.close(progress), config)
 
     def move(self, closure: LoopClosure, config: Config) -> LoopMove:
-        """Move all scans to the poses of a closure."""
+        """Move all scans to the poses of a closure; after any error they are where they were."""
         before = self.T_map_sensor
         extents = [
             extent(compose(inverse(old), new))
@@ -216,39 +222,38 @@ class LoopCloser:
             if way_m > config.align.move_m or turn_deg > config.align.move_deg
         ]
         full = self._map.keys(config.map.min_points)
-        self._move_settled(moved, closure.T_map_sensor, config)
-        for number in moved:
-            self._poses[number] = closure.T_map_sensor[number]
-        self._begin_emptied(list(before))
+        self._begin_emptied()
+        self._move_all(moved, closure.T_map_sensor, config)
         after = self._map.keys(config.map.min_points)
+        has_moved = not np.array_equal(self._poses[-1], before[-1])
         return LoopMove(
             closure=closure,
             stamps_ns=np.array(self._stamps_ns, np.int64),
             num_moved=len(moved),
             largest_m=max((extents[number][0] for number in moved), default=0.0),
             largest_deg=max((extents[number][1] for number in moved), default=0.0),
-            correction=compose(self._poses[-1], inverse(before[-1])),
+            correction=compose(self._poses[-1], inverse(before[-1])) if has_moved else np.eye(4),
             removed_voxel_index=unpack_keys(np.setdiff1d(full, after)),
         )
 
-    def _begin_emptied(self, poses_before: list[Transform]) -> None:
+    def _begin_emptied(self) -> None:
         """Keep the poses before a move with the voxels that were emptied until then."""
         if len(self._emptied[-1]):
-            self._poses_before.append(poses_before)
+            self._poses_before.append(list(self._poses))
             self._emptied.append(Emptied())
 
-    def _move_settled(
+    def _move_all(
         self, moved: list[int], T_map_sensor: npt.NDArray[np.float64], config: Config
     ) -> None:
         """Move scans in the map; those that the window keeps, last and in the window too."""
         kept = list(self._window)
-        num_settled = len(self) - len(kept)
-        done: list[int] = []
-        try:
+        num_settled = len(self) - len(kept)  # negative with scans of a loaded map
+        with ExitStack() as undo:
             for number in moved:
                 if number < num_settled:
-                    self._move_one(number, self._poses[number], T_map_sensor[number], config)
-                    done.append(number)
+                    T_before = self._poses[number]
+                    self._move_settled(number, T_map_sensor[number], config)
+                    undo.callback(self._move_settled, number, T_before, config)
             self._window.move(
                 {
                     number - num_settled: replace(
@@ -260,17 +265,25 @@ class LoopCloser:
                     if number >= num_settled
                 }
             )
-        except MapError:
-            for number in done:
-                self._move_one(number, T_map_sensor[number], self._poses[number], config)
-            raise
+            undo.pop_all()
+        for number in moved:
+            self._poses[number] = T_map_sensor[number]
 
-    def _move_one(
-        self, number: int, T_before: Transform, T_after: Transform, config: Config
-    ) -> None:
-        """Add a scan to the map at a pose and remove it at another."""
-        self._map.insert(self._moments(number, T_after, config))
-        self._map.remove(self._moments(number, T_before, config))
+    def _move_settled(self, number: int, T_map_sensor: Transform, config: Config) -> None:
+        """
+        Move a scan that the window does not keep, in the map and in the poses.
+
+        The poses follow scan by scan: if the points of a scan stay unreadable, its move cannot be
+        undone, and its pose has to be the one in the map.
+        """
+        after = self._moments(number, T_map_sensor, config)
+        before = self._moments(number, self._poses[number], config)
+        with ExitStack() as undo:
+            self._map.insert(after)
+            undo.callback(self._map.remove, after)
+            self._map.remove(before)
+            undo.pop_all()
+        self._poses[number] = T_map_sensor
 
     def _moments(self, number: int, T_map_sensor: Transform, config: Config) -> ScanMoments:
         """Return the moments of a scan at a pose, without the points of voxels emptied since."""

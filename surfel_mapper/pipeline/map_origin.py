@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import AUTO, Config
+from surfel_mapper.config.stages import MAX_ORIGIN_M
 from surfel_mapper.errors import ConfigError, MapError
 from surfel_mapper.geometry import compose, Transform
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -94,10 +95,10 @@ class MapOrigin:
         _log.info('map.origin auto: %s', self._map.origin_m.tolist())
 
     def find_in(self, points: npt.NDArray[Any]) -> None:
-        """Take the origin from the first finite of points (N, 3) in the fixed frame, if any."""
-        finite = np.isfinite(points).all(axis=1)
-        if finite.any():
-            self.find(points[np.argmax(finite)])
+        """Take the origin from the first of points (N, 3) in the fixed frame that it may be."""
+        possible = (np.abs(points) < MAX_ORIGIN_M).all(axis=1)  # also not nan
+        if possible.any():
+            self.find(points[np.argmax(possible)])
 
     def take_from(self, loaded: SurfelMap) -> None:
         """

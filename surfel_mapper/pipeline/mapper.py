@@ -37,7 +37,7 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import checked_scans, WindowedScan
 from surfel_mapper.pipeline import regions
-from surfel_mapper.pipeline.drops import described, Drops, INTERNAL
+from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.inserter import Inserter, map_frame
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import MapOrigin
@@ -208,7 +208,8 @@ class Mapper:
             reason = f'its points have no {" and no ".join(missing)}'
             self._drops.scan(scan, 'missing_column', reason)
         elif (timed := self._timed(scan)) is not None:
-            own_ns, other_ns = self._queue.newest_ns, self.transforms.newest_ns
+            own_ns = self._queue.newest_of(scan.frame_id)
+            other_ns = self.transforms.newest_ns
             refuse = partial(self._drops.scan, timed, 'odd_stamp')
             self._guard.take(scan.stamp_ns, own_ns, other_ns, partial(self._accept, timed), refuse)
 
@@ -219,7 +220,7 @@ class Mapper:
 
     def _accept(self, scan: Scan) -> None:
         """Queue a scan; if time was set back, clear the map first."""
-        newest_ns = self._queue.newest_ns
+        newest_ns = self._queue.newest_of(scan.frame_id)
         back_s = 0.0 if newest_ns is None else (newest_ns - scan.stamp_ns) / 1e9
         if back_s > self.config.input.reset_after_s:
             self._start_anew(scan, back_s)
@@ -512,6 +513,8 @@ class Mapper:
         """
         Replace map and window by a saved map and the scans of its window.
 
+        Loops are closed only among the scans that come after it.
+
         Raises
         ------
         MapError
@@ -526,9 +529,7 @@ class Mapper:
                 raise MapError(f'map with {name} {found}, expected {expected} as configured')
         self._origin.take_from(surfel_map)
         self.clear()
-        self._inserter.clear()
-        self.map.insert(surfel_map.moments())
-        self.window.restore(scans)
+        self._inserter.restore(surfel_map, scans)
 
     def reconfigure(self, config: Config) -> None:
         """
@@ -615,20 +616,9 @@ class Mapper:
 
     def _insert(self, scan: Scan, pose: Transform) -> Iterator[Update]:
         """Map a scan whose pose is there, and those that waited for it; yield their updates."""
-        num_mapped = self.counters.mapped + self.counters.localised + self.counters.gated
         following = self._queue.posed[0] if self._queue.posed else None
         updates = self._inserter.insert(scan, pose, self.config, following)
-        while True:
-            try:
-                update = next(updates, None)
-            except Exception as error:  # MemoryError too: the next scan may fit
-                _log.debug('scan at %d ns', scan.stamp_ns, exc_info=True)
-                counters = self.counters
-                if counters.mapped + counters.localised + counters.gated == num_mapped:
-                    self._drops.scan(scan, INTERNAL, described(error))
-                else:
-                    self._drops.message(INTERNAL, f'surfels not derived: {described(error)}')
-                return
-            if update is None:
-                return
-            yield update
+        try:
+            yield from updates
+        except Exception as error:  # MemoryError too: the next scan may fit
+            self._drops.failure(scan, error, is_used=False)

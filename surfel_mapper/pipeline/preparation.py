@@ -60,6 +60,13 @@ class Preparation:
     local_map : LocalMap, optional
         Scans are registered to it instead of the whole map.
 
+    Attributes
+    ----------
+    chain : Chain
+        The filters.
+    local_map : LocalMap or None
+        As given; may be replaced at any time.
+
     """
 
     def __init__(
@@ -73,7 +80,7 @@ class Preparation:
         drops: Drops,
         local_map: LocalMap | None = None,
     ) -> None:
-        self._local_map = local_map
+        self.local_map = local_map
         self._filters = config.filters
         self._poses = poses
         self._around = around
@@ -143,8 +150,8 @@ class Preparation:
         """
         Deskew, filter and register a scan; return the scans that can be mapped now.
 
-        None if it is left out, or registration waits for the next scans to confirm its place;
-        with the scan that confirms it, all that have waited.
+        None of them if it is left out, or registration waits for the next scans to confirm its
+        place; with the scan that confirms it, all that have waited.
 
         Parameters
         ----------
@@ -160,13 +167,16 @@ class Preparation:
             Returns what another thread has done by ``ahead``, and raises its errors.
 
         """
-        if self._poses.registered is None and self._is_gated(pose, config.window):
+        if self._poses.registered is None and self._is_gated(scan, pose, config.window):
             return []
         times = scan.times
         try:
             found = self._filtered(scan, pose, laps) if begun is None else begun()
         except FilterError as error:
             self._drops.scan(scan, 'filter', str(error))
+            return []
+        except PoseError as error:  # poses within its sweep were forgotten since it got its own
+            self._drops.scan(scan, 'no_pose', str(error))
             return []
         if self.chain.filters:
             laps.end('filter')
@@ -181,7 +191,8 @@ class Preparation:
         laps.end('register')
         if len(registered) > 1:  # those that have waited: the gate would compare them with one
             return registered
-        return [p for p in registered if not self._is_gated(p.T_map_sensor, config.window)]
+        gate = config.window
+        return [p for p in registered if not self._is_gated(p.scan, p.T_map_sensor, gate)]
 
     def _filtered(self, scan: Scan, pose: Transform, laps: Laps) -> FilteredScan:
         """Return a scan deskewed, joined with images, and filtered; raise FilterError."""
@@ -221,10 +232,10 @@ class Preparation:
         self, poses: RegisteredPoses, prepared: Prepared, times: PointTimes | None
     ) -> list[Prepared]:
         """Return the scans whose places registration knows now."""
-        if self._local_map is None:
+        if self.local_map is None:
             target, T_target_fixed = self._around.surfel_map, self._aligner.T_map_fixed
         else:
-            target, T_target_fixed = self._local_map.surfel_map, np.eye(4)
+            target, T_target_fixed = self.local_map.surfel_map, np.eye(4)
         try:
             found = poses.place(prepared, times, target, T_target_fixed)
         except (MapError, PoseError) as error:
@@ -257,12 +268,17 @@ class Preparation:
             )
         return scan
 
-    def _is_gated(self, pose: Transform, gate: WindowConfig) -> bool:
-        """Return whether the motion gate leaves out a scan at a pose, and count it."""
+    def _is_gated(self, scan: Scan, pose: Transform, gate: WindowConfig) -> bool:
+        """
+        Return whether the motion gate leaves out a scan at a pose, and count it.
+
+        It is compared with the last scan of its frame: sensors that are mounted apart are not at
+        rest, nor in motion, because of the distance between them.
+        """
         if not (gate.gate_distance_m or gate.gate_angle_deg):
             return False
-        last = self._around.window.newest
-        if last is None or not stands_still(last.T_map_sensor, pose, gate):
+        T_map_last = self._around.window.last_pose(scan.frame_id)
+        if T_map_last is None or not stands_still(T_map_last, pose, gate):
             return False
         self._drops.counters.gated += 1
         return True

@@ -23,8 +23,8 @@ import numpy.typing as npt
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
 from surfel_mapper.kernels.lanes import FULL
-from surfel_mapper.mapping.channels import CHANNELS
-from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.channels import CHANNELS, summed_columns
+from surfel_mapper.mapping.moments import point_keys, ScanMoments
 from surfel_mapper.mapping.reducer import within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
@@ -186,11 +186,19 @@ def reduced(
         max_range_m=limits.max_range_m or np.inf,
         columns=scan.columns,
     )
-    windowed = WindowedScan(moments=moments, stamp_ns=scan.stamp_ns, T_map_sensor=T_map_sensor)
+    windowed = WindowedScan(
+        moments=moments,
+        stamp_ns=scan.stamp_ns,
+        T_map_sensor=T_map_sensor,
+        frame_id=scan.frame_id,
+    )
     if not config.window.keep_points:
         return windowed
-    entered = scan.select(within(scan.points, limits.min_range_m, limits.max_range_m))
-    columns = {name: entered.columns[name] for name in surfel_map.columns}
+    stay = within(scan.points, limits.min_range_m, limits.max_range_m)
+    if 'beyond_map' in moments.left_out:
+        stay &= point_keys(scan.points, T_map_sensor, surfel_map.voxel_size_m) >= 0
+    entered = scan.select(stay)
+    columns = summed_columns(entered.columns, surfel_map.columns)
     return replace(windowed, points=entered.points, columns=columns)
 
 

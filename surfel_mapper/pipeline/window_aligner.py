@@ -222,5 +222,6 @@ class WindowAligner:
 def _samples(scan: WindowedScan, voxel_size_m: float) -> Samples:
     surfel_map = SurfelMap(voxel_size_m)
     assert scan.points is not None, 'checked before'
-    surfel_map.add(scan.points, origin=np.zeros(3))
+    # add refuses points out of reach, and smaller voxels than those of the map reach less far
+    surfel_map.insert(surfel_map.reduce(scan.points, origin=np.zeros(3)))
     return Samples.of_surfels(surfel_map.surfels(MIN_POINTS))

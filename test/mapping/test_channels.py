@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+import re
 
 import numpy as np
 import pytest
@@ -115,6 +116,32 @@ def test_a_missing_or_short_column_is_refused_and_changes_nothing():
     with pytest.raises(ValueError, match='of length 2, expected one row for 3 points'):
         surfel_map.add(np.zeros((3, 3)), columns={'intensity': np.zeros(2)})
     assert surfel_map.num_points == 0
+
+
+@pytest.mark.parametrize(
+    ('name', 'shape', 'expected'),
+    [
+        ('intensity', (3, 1), r'(3,)'),
+        ('intensity', (3, 2), r'(3,)'),
+        ('rgb', (3, 2), r'(3,) packed, or (3, 3)'),
+        ('rgb', (3, 3, 1), r'(3,) packed, or (3, 3)'),
+    ],
+)
+def test_a_column_of_another_shape_is_refused_and_changes_nothing(name, shape, expected):
+    surfel_map = SurfelMap(0.5, columns=(name,))
+    match = re.escape(f'column {name}: shape {shape}, expected {expected}')
+    with pytest.raises(ValueError, match=match):
+        surfel_map.add(np.zeros((3, 3)), columns={name: np.zeros(shape)})
+    assert surfel_map.num_points == 0
+
+
+def test_colours_may_have_an_opacity():
+    points, _, colors = coloured(6)
+    expected, surfel_map = SurfelMap(0.5, columns=('rgb',)), SurfelMap(0.5, columns=('rgb',))
+    expected.add(points, columns={'rgb': colors})
+    opacity = np.full((len(points), 1), 255, np.uint8)
+    surfel_map.add(points, columns={'rgba': np.hstack([colors, opacity])})
+    assert surfel_map == expected
 
 
 def test_maps_with_other_columns_do_not_mix():

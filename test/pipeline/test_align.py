@@ -106,6 +106,45 @@ def test_limits_of_range_and_columns_hold_for_moved_scans(drive):
     assert mapper.map.digest() == rebuilt(mapper, scans).digest()
 
 
+@pytest.mark.parametrize(
+    ('far_m', 'settings'),
+    [
+        (np.finfo(np.float32).max, {}),  # as drivers mark no return
+        (2e5, {'align.voxel_size_m': 0.1}),  # in the map, but beyond the voxels of the alignment
+    ],
+)
+def test_points_out_of_reach_leave_no_scan_unaligned(drive, far_m, settings):
+    far = np.full((50, 3), far_m, np.float32)
+    scans = [
+        replace(scan, points=np.concatenate([far, scan.points]), columns={}) for scan in drive[0]
+    ]
+    mapper, _ = mapped((scans, *drive[1:]), settings)
+
+    assert mapper.align().num_moved > 0
+
+    assert mapper.map.digest() == rebuilt(mapper, scans).digest()
+    assert [len(scan.points) for scan in mapper.window] == [
+        scan.moments.num_points for scan in mapper.window
+    ]
+
+
+def test_colours_named_rgba_stay_with_their_points(drive):
+    rng = np.random.default_rng(1)
+    colours = [rng.integers(0, 2**32, len(scan), np.uint32) for scan in drive[0]]
+    scans = [
+        replace(scan, columns={'rgba': rgba}) for scan, rgba in zip(drive[0], colours, strict=True)
+    ]
+    mapper, _ = mapped((scans, *drive[1:]), {'map.color': True})
+
+    assert mapper.align().num_moved > 0
+
+    opaque = [
+        replace(scan, columns={'rgb': rgba & 0xFFFFFF})
+        for scan, rgba in zip(drive[0], colours, strict=True)
+    ]
+    assert mapper.map.digest() == rebuilt(mapper, opaque).digest()
+
+
 def test_filtered_points_stay_out_after_an_alignment(drive, tmp_path):
     chain = tmp_path / 'chain.yaml'
     chain.write_text('- RandomSamplingDataPointsFilter:\n    prob: 0.5\n')

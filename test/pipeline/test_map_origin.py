@@ -121,6 +121,18 @@ def test_clouds_in_the_fixed_frame_are_moved_exactly(origin):
     assert maps[0].digest() == maps[1].digest()
 
 
+def test_auto_is_found_among_the_points_that_an_origin_can_have():
+    cloud = np.full((100, 3), ECEF, np.float64)
+    cloud[:3] = np.array([np.finfo(np.float32).max, np.nan, -1e9])[:, None]
+    mapper = Mapper(Config.from_mapping({'pose.source': 'identity', 'map.origin': 'auto'}))
+
+    mapper.add_scan(Scan(points=cloud, stamp_ns=1, frame_id='odom'))
+    (update,) = mapper.insert_ready()
+
+    assert update.num_points == 97
+    assert (np.abs(mapper.map.origin_m - ECEF) <= 256.0).all()
+
+
 def test_the_map_has_a_frame_of_its_own():
     mapper = mapped(text_of(UTM), UTM)
     assert mapper.map_frame == 'utm_local'
