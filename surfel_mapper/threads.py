@@ -16,7 +16,7 @@ error in its byte count (Fast DDS 2.14) delays repetitions by up to half a secon
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache
 import itertools
@@ -88,7 +88,8 @@ def share(work: Callable[[slice], object], num_rows: int, threads: int) -> None:
     Do the work on all rows, with the help of idle threads of the pool.
 
     The calling thread takes parts until none is left, so it never waits for a thread that is busy
-    with other work, only for parts that another thread has begun, also if its own part fails.
+    with other work, only for parts that another thread has begun, also if a part fails. Of several
+    errors its own is raised, or that of the first helper.
     """
     helpers = pool(threads)
     if helpers is None:
@@ -104,6 +105,7 @@ def share(work: Callable[[slice], object], num_rows: int, threads: int) -> None:
     try:
         take_parts()
     finally:
-        for helper in helping:
-            if not helper.cancel():
-                helper.result()
+        begun = [helper for helper in helping if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
+        helper.result()

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+import itertools
 import os
 from pathlib import Path
 import subprocess
@@ -17,6 +18,7 @@ import pytest
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.threads import (
     BACKGROUND_NICE,
+    pool,
     real_time_threads,
     share,
     split,
@@ -66,6 +68,42 @@ def test_a_failed_part_ends_the_work_of_all_threads():
     with pytest.raises(KeyboardInterrupt):
         share(work, 100, 2)
     assert ended.is_set()
+
+
+def test_a_failed_helper_ends_the_work_after_the_other_helpers():
+    may_begin, has_begun = ([threading.Event() for _ in range(2)] for _ in range(2))
+    may_end, ended, numbers = threading.Event(), threading.Event(), itertools.count()
+    for event in may_begin:  # the threads of the pool are busy until the caller sets it
+        pool(3).submit(event.wait, 10.0)
+
+    def work(part):
+        if threading.current_thread() is threading.main_thread():
+            for may, has in zip(may_begin, has_begun, strict=True):
+                may.set()
+                has.wait(10.0)
+        elif (number := next(numbers)) < 2:
+            has_begun[number].set()
+            (has_begun[1], may_end)[number].wait(10.0)
+            if number == 0:
+                threading.Timer(0.05, may_end.set).start()
+                raise OSError('the first helper')
+            ended.set()
+
+    with pytest.raises(OSError, match='the first helper'):
+        share(work, 100, 3)
+    assert ended.is_set()
+
+
+def test_an_error_of_the_calling_thread_is_raised_before_those_of_helpers():
+    both_have_begun = threading.Barrier(2)
+
+    def work(part):
+        both_have_begun.wait(10.0)
+        is_main = threading.current_thread() is threading.main_thread()
+        raise KeyboardInterrupt if is_main else OSError
+
+    with pytest.raises(KeyboardInterrupt):
+        share(work, 100, 2)
 
 
 def test_no_thread_at_all_is_refused():

@@ -3,15 +3,17 @@
 """
 Saving and loading a map with its window, exactly: the digests before and after are equal.
 
-The file has the integers of every voxel, and for each scan of the window its moments, stamp, pose
-and, if kept, points; so a loaded map continues as if it had never stopped. Files are not trusted:
-voxels and counts are checked, and the digest is compared.
+The file has the integers of every voxel, and for each scan of the window its moments, stamp, pose,
+frame and, if kept, points; so a loaded map continues as if it had never stopped. Without the
+frames, in files of earlier versions, those of all scans are empty. Files are not trusted: voxels
+and counts are checked, and the digest is compared.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +87,7 @@ def save_map(
         'level': surfel_map.level,
         'columns': surfel_map.columns,
         'origin_m': surfel_map.origin_m.tolist(),
+        'frame_ids': [scan.frame_id for scan in scans],
         'digest': digest,
     }
     save_state(path, arrays, attributes, compress=compress, copies=COPIES)
@@ -137,7 +140,7 @@ def load_map(
             origin_m=attributes.get('origin_m', NO_ORIGIN),
         )
         surfel_map.insert(_moments(arrays, 'map', surfel_map))
-        scans = [_scan(arrays, number, surfel_map) for number in range(_num_scans(arrays))]
+        scans = _scans(arrays, attributes, surfel_map)
         held = SurfelMap(
             found_m,
             columns=surfel_map.columns,
@@ -180,7 +183,7 @@ def load_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap, list[Windowe
         )
         moments = _moments(arrays, 'map', empty)
         check_possible(moments)
-        return moments, empty, [_scan(arrays, n, empty) for n in range(_num_scans(arrays))]
+        return moments, empty, _scans(arrays, attributes, empty)
 
 
 def window_stamps_ns(path: str | Path) -> list[int]:
@@ -228,8 +231,24 @@ def _num_scans(arrays: dict[str, npt.NDArray[Any]]) -> int:
     return len(stamps)
 
 
+def _scans(
+    arrays: dict[str, npt.NDArray[Any]], attributes: dict[str, Any], surfel_map: SurfelMap
+) -> list[WindowedScan]:
+    """Return the scans of the window."""
+    num_scans = _num_scans(arrays)
+    frame_ids = attributes.get('frame_ids', [''] * num_scans)
+    if not (isinstance(frame_ids, list) and all(isinstance(each, str) for each in frame_ids)):
+        raise ValueError(f'frames of scans: {frame_ids!r:.60}, expected a list of names')
+    if len(frame_ids) != num_scans:
+        raise ValueError(f'{len(frame_ids)} frames for {num_scans} scans')
+    return [
+        replace(_scan(arrays, number, surfel_map), frame_id=frame_id)
+        for number, frame_id in enumerate(frame_ids)
+    ]
+
+
 def _scan(arrays: dict[str, npt.NDArray[Any]], number: int, surfel_map: SurfelMap) -> WindowedScan:
-    """Return one scan of the window."""
+    """Return one scan of the window, without its frame."""
     pose = arrays['scans.pose'][number]
     check_rigid(f'pose of scan {number}', pose)
     points = arrays.get(f'scan{number}.points')

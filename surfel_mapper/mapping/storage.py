@@ -177,10 +177,11 @@ class HashTable:
         num_segments = len(self._held)
         if self.state[hashing.SEGMENTS] == num_segments:
             self._buckets.grow(2 * num_segments)
-            self._held = np.append(self._held, np.zeros_like(self._held))
-            self._local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
-        elif self.state[hashing.DEPTH] < self._max_depth:
-            self._directory = np.repeat(self._directory, 2)
-            self.state[hashing.DEPTH] += 1
+            held = np.append(self._held, np.zeros_like(self._held))
+            local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
+            self._held, self._local_depth = held, local_depth  # both or none: of one length
+        elif (depth := int(self.state[hashing.DEPTH])) < self._max_depth:
+            directory = np.repeat(self._directory, 2)
+            self.state[hashing.DEPTH], self._directory = depth + 1, directory
         else:
             raise MapLimitError(f'{self.num_keys} keys: the hash table is full')

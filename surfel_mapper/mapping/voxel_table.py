@@ -10,13 +10,14 @@ no scan waits while the whole map is rehashed.
 ChangeLog: the rows that the latest versions changed. Without it, asking for changes would look at
 the stamp of every row. It holds at most a quarter of the rows: beyond that, reading all stamps in
 order is as fast.
+
+(One module because the log is read by means of the stamps of the table.)
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from dataclasses import replace
 from itertools import takewhile
 from typing import Any
 
@@ -104,34 +105,16 @@ class VoxelTable:
         if there is no memory at all from then on.
 
         """
-        arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)
-        self._version = version
-        found = np.empty(num, np.int32)
+        found = np.empty(len(moments), np.int32)
         found.fill(-1)  # np.full takes 10 us more in a cold cache
-        reserve = np.empty(num * UNDO_BYTES, np.uint8)
-        done = 0
+        reserve = np.empty(len(moments) * UNDO_BYTES, np.uint8)
         try:
-            while done < num:
-                done = add_moments(
-                    arrays,
-                    view_is_sum,
-                    self.rows.array,
-                    self._stamps.array.reshape(-1),
-                    self._hash.arrays,
-                    self._state,
-                    stamp_of(version),
-                    done,
-                    found,
-                )
-                if done < num:
-                    self._make_room()
+            self._add(moments, version, found)
             if self._channels:
-                if len(self._channels.array) < len(self.rows.array):
-                    self._channels.grow(len(self.rows.array))
                 self._channels.array[found.astype(np.intp)] += moments.channels
         except BaseException:
             del reserve
-            self._undo(moments, found, version)
+            self._undo_add(moments, version, found)
             raise
         return found
 
@@ -147,6 +130,8 @@ class VoxelTable:
         """
         Subtract moments from their voxels, or nothing if one does not hold them.
 
+        The table is unchanged after any exception, as after one of ``add``.
+
         Returns
         -------
         missing : int
@@ -157,28 +142,25 @@ class VoxelTable:
             The indices of the voxels that fell below min_points.
 
         """
-        arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)
-        if moments.rows is None or len(moments.rows) != num:
+        if moments.rows is None or len(moments.rows) != len(moments):
             rows = self.find(moments.key)
         else:
             rows = np.array(moments.rows, np.int32)  # hints, confirmed by the kernel
-        fallen = np.empty((num, 3), np.int32)
-        self._version = version
-        missing, num_fallen = remove_moments(
-            arrays,
-            view_is_sum,
-            self.rows.array,
-            self._stamps.array.reshape(-1),
-            self._hash.arrays,
-            self._state,
-            stamp_of(version),
-            rows,
-            max(min_points, 1),
-            fallen,
-        )
-        if self._channels and missing < 0:
-            self._channels.array[rows.astype(np.intp)] -= moments.channels
-        return int(missing), rows, fallen[:num_fallen]
+        fallen: npt.NDArray[np.int32] = np.empty((len(moments), 3), np.int32)
+        undo_bytes = moments.nbytes + len(moments) * UNDO_BYTES if self._channels else 0
+        reserve = np.empty(undo_bytes, np.uint8)
+        num_points = self.num_points
+        try:
+            missing, num_fallen = self._subtract(moments, version, rows, min_points, fallen)
+            fallen = fallen[:num_fallen]
+            if self._channels and missing < 0:
+                self._channels.array[rows.astype(np.intp)] -= moments.channels
+        except BaseException:
+            del reserve
+            if self.num_points < num_points:
+                self._undo_subtract(moments, version)
+            raise
+        return int(missing), rows, fallen
 
     def checked(self, rows: npt.ArrayLike) -> npt.NDArray[np.int32]:
         """Return rows (K,) as the kernels take them; IndexError if the table does not have one."""
@@ -251,21 +233,75 @@ class VoxelTable:
         num = rows_held(self.rows.array, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
-    def _undo(self, moments: ScanMoments, found: npt.NDArray[np.int32], version: int) -> None:
+    def _add(self, moments: ScanMoments, version: int, found: npt.NDArray[np.int32]) -> None:
+        """Add moments without channels; write the row of each voxel to found once it is added."""
+        arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)
+        self._version = version
+        done = 0
+        while done < num:
+            done = add_moments(
+                arrays,
+                view_is_sum,
+                self.rows.array,
+                self._stamps.array.reshape(-1),
+                self._hash.arrays,
+                self._state,
+                stamp_of(version),
+                done,
+                found,
+            )
+            if done < num:
+                self._make_room()
+
+    def _undo_add(self, moments: ScanMoments, version: int, found: npt.NDArray[np.int32]) -> None:
         """Subtract the moments that an incomplete ``add`` added; channels are added last."""
         num = bisect_left(found, True, key=lambda row: row < 0)
         if num:
-            added = moments.select(slice(num))
-            added = replace(added, channels=np.zeros_like(added.channels))
-            object.__setattr__(added, 'rows', found[:num])
-            self.remove(added, version)
+            fallen = np.empty((num, 3), np.int32)
+            self._subtract(moments.select(slice(num)), version, found[:num], 1, fallen)
+
+    def _subtract(
+        self,
+        moments: ScanMoments,
+        version: int,
+        rows: npt.NDArray[np.int32],
+        min_points: int,
+        fallen: npt.NDArray[np.int32],
+    ) -> tuple[int, int]:
+        """Subtract moments without channels; see remove_moments."""
+        self._version = version
+        missing, num_fallen = remove_moments(
+            moments.arrays,
+            moments.view_is_sum,
+            self.rows.array,
+            self._stamps.array.reshape(-1),
+            self._hash.arrays,
+            self._state,
+            stamp_of(version),
+            rows,
+            max(min_points, 1),
+            fallen,
+        )
+        return missing, num_fallen
+
+    def _undo_subtract(self, moments: ScanMoments, version: int) -> None:
+        """
+        Add the moments that an incomplete ``remove`` subtracted; channels are subtracted last.
+
+        The row that was emptied last is taken first: in reverse order each voxel gets its own row,
+        which has its channels.
+        """
+        reverse = moments.select(np.arange(len(moments))[::-1])
+        self._add(reverse, version, np.empty(len(moments), np.int32))
 
     def _make_room(self) -> None:
         """Enlarge the array that had no room for a new voxel."""
         num_rows = len(self.rows.array)
         if self._hash.lacks_row(num_rows):
-            self._stamps.grow(2 * num_rows)  # first: the rows tell how many there are
-            self.rows.grow(2 * num_rows)
+            self._stamps.grow(2 * num_rows)
+            if self._channels:
+                self._channels.grow(2 * num_rows)
+            self.rows.grow(2 * num_rows)  # last: the rows tell how many there are
         else:
             self._hash.grow()
 

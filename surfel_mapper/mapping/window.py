@@ -6,6 +6,11 @@ SlidingWindow: the scans that a map holds, and the limits that evict the oldest.
 The window keeps the moments of every scan; an evicted scan is subtracted from the map, so the map
 equals the sum of the scans in the window at any time, to the bit. A new scan is added before old
 ones are evicted, so that a voxel observed by both is not removed and created again.
+
+Distances are measured between scans of one frame: sensors that are mounted apart do not travel
+from one to the other. The window has travelled as far as the sensor that travelled farthest.
+
+(One module because it is one class and its scans; the rest is the description of its methods.)
 """
 
 from __future__ import annotations
@@ -42,6 +47,8 @@ class WindowedScan:
         Its points in the sensor frame, if kept: the points of the moments, no others.
     columns : mapping of str to (N,) array
         Columns of these points that the map sums.
+    frame_id : str
+        The frame of its sensor; distances travelled are those of scans of one frame.
 
     """
 
@@ -50,6 +57,7 @@ class WindowedScan:
     T_map_sensor: npt.NDArray[np.float64]
     points: npt.NDArray[Any] | None = None
     columns: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    frame_id: str = ''
 
     @property
     def nbytes(self) -> int:
@@ -122,10 +130,12 @@ class SlidingWindow:
         self.keeps_scans = False
         self._map = surfel_map
         self._scans: deque[tuple[WindowedScan, float]] = deque()
+        self._last: dict[str, tuple[npt.NDArray[np.float64], float]] = {}
         self._reset()
 
     def _reset(self) -> None:
         self._scans.clear()
+        self._last.clear()
         self._num_settled = 0
         self._travelled_m = 0.0
         self._nbytes = 0
@@ -147,6 +157,16 @@ class SlidingWindow:
     def newest(self) -> WindowedScan | None:
         """The scan added last, None if empty."""
         return self._scans[-1][0] if self._scans else None
+
+    def last_pose(self, frame_id: str) -> npt.NDArray[np.float64] | None:
+        """
+        Return the pose (4, 4) of the scan of a frame added last, whether it was evicted or not.
+
+        None if no scan of the frame was added since the window was cleared or restored; after
+        ``move`` the kept scans alone count, as evicted ones have no pose that fits the others.
+        """
+        last = self._last.get(frame_id)
+        return None if last is None else last[0]
 
     def insert(self, scan: WindowedScan, min_points: int = 1) -> list[Eviction]:
         """
@@ -185,6 +205,9 @@ class SlidingWindow:
         """
         Restore the scans of a saved window, oldest first, which the map already holds.
 
+        Distances are measured from these scans on. Scans without a frame, of files that do not
+        have it, count as those of one sensor.
+
         Raises
         ------
         ValueError
@@ -221,9 +244,10 @@ class SlidingWindow:
         held = self._map.moments(voxel_index)
         if not len(held):
             return np.empty((0, 3), np.int32)
-        fallen = self._map.remove(held, min_points)
-        self._scans = deque((without(scan, held.key), m) for scan, m in self._scans)
-        self._nbytes = sum(scan.nbytes for scan in self)
+        rest = deque((without(scan, held.key), m) for scan, m in self._scans)
+        nbytes = sum(scan.nbytes for scan, _ in rest)
+        fallen = self._map.remove(held, min_points)  # last: copies of scans can lack memory
+        self._scans, self._nbytes = rest, nbytes
         return fallen
 
     def move(
@@ -266,6 +290,7 @@ class SlidingWindow:
             undo.pop_all()
         travelled_m = self._scans[0][1] if self._scans else 0.0
         self._scans.clear()
+        self._last.clear()
         self._nbytes, self._travelled_m = 0, travelled_m
         for place, scan in enumerate(old):
             self._append(scans.get(place, scan))
@@ -282,9 +307,13 @@ class SlidingWindow:
         self._map.clear()
 
     def _append(self, scan: WindowedScan) -> None:
-        if self._scans:
-            step = scan.T_map_sensor[:3, 3] - self._scans[-1][0].T_map_sensor[:3, 3]
-            self._travelled_m += float(np.sqrt((step * step).sum()))
+        travelled_m = self._travelled_m
+        if scan.frame_id in self._last:
+            T_map_last, travelled_m = self._last[scan.frame_id]
+            step = scan.T_map_sensor[:3, 3] - T_map_last[:3, 3]
+            travelled_m += float(np.sqrt((step * step).sum()))
+        self._last[scan.frame_id] = scan.T_map_sensor, travelled_m
+        self._travelled_m = max(self._travelled_m, travelled_m)
         self._scans.append((scan, self._travelled_m))
         self._nbytes += scan.nbytes
 

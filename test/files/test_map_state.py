@@ -30,6 +30,7 @@ def driven(num_scans=6, *, keep_points=False):
                 stamp_ns=number * 10**8,
                 T_map_sensor=pose,
                 points=points if keep_points else None,
+                frame_id=('front', 'rear')[number % 2],
             )
         )
     return surfel_map, window
@@ -44,6 +45,7 @@ def test_a_map_comes_back_with_its_digest_and_its_window(tmp_path, keep_points):
 
     assert digest == surfel_map.digest() == loaded.digest()
     assert [scan.stamp_ns for scan in scans] == [scan.stamp_ns for scan in window]
+    assert [scan.frame_id for scan in scans] == ['rear', 'front', 'rear']
     for scan, kept in zip(scans, window, strict=True):
         np.testing.assert_array_equal(scan.T_map_sensor, kept.T_map_sensor)
         assert (scan.points is None) == (kept.points is None)
@@ -66,6 +68,30 @@ def test_a_loaded_map_continues_like_the_saved_one(tmp_path):
 
     assert len(resumed) == len(window) == 3
     assert loaded == surfel_map
+
+
+def test_a_window_of_an_earlier_version_comes_back_without_frames(tmp_path):
+    surfel_map, window = driven()
+    save_map(tmp_path / 'map.npz', surfel_map, window)
+    arrays, attributes = load_state(tmp_path / 'map.npz')
+    del attributes['frame_ids']
+    save_state(tmp_path / 'map.npz', arrays, attributes)
+
+    loaded, scans = load_map(tmp_path / 'map.npz')
+
+    assert loaded == surfel_map
+    assert [scan.frame_id for scan in scans] == ['', '', '']
+    assert [scan.stamp_ns for scan in scans] == [scan.stamp_ns for scan in window]
+
+
+@pytest.mark.parametrize('frame_ids', [5, 'abc', ['front', 'rear'], ['front', 'rear', 5], None])
+def test_frames_that_are_not_those_of_the_scans_are_refused(tmp_path, frame_ids):
+    save_map(tmp_path / 'map.npz', *driven())
+    arrays, attributes = load_state(tmp_path / 'map.npz')
+    save_state(tmp_path / 'map.npz', arrays, {**attributes, 'frame_ids': frame_ids})
+    for load in (load_map, load_moments):
+        with pytest.raises(FileFormatError, match=r'damaged: .*frames'):
+            load(tmp_path / 'map.npz')
 
 
 def test_moments_are_read_without_their_map(tmp_path):

@@ -29,12 +29,14 @@ import traceback
 import numpy as np
 import pytest
 
-from surfel_mapper.errors import FileFormatError, SurfelMapperError
+from surfel_mapper.errors import FileFormatError, MapLimitError, SurfelMapperError
 from surfel_mapper.files import atomic
 from surfel_mapper.files.map_state import load_map, save_map
+from surfel_mapper.kernels import hashing
+from surfel_mapper.mapping.storage import HashTable
 from surfel_mapper.offline.replay import replay
 from test.bags import recorded
-from test.fuzz.writers import map_of, Steps, WRITERS, Written
+from test.fuzz.writers import made_columns, map_of, Steps, WRITERS, Written
 
 pytestmark = pytest.mark.skipif(not hasattr(os, 'fork'), reason='needs fork')
 
@@ -131,15 +133,21 @@ def read(surfel_map, moments, path):
 
 
 def reduce(surfel_map, moments, path):
-    surfel_map.reduce(np.zeros((10, 3)), np.eye(4))
+    points = np.zeros((10, 3))
+    surfel_map.reduce(points, np.eye(4), columns=made_columns(points))
 
 
+@pytest.mark.parametrize('columns', [(), ('intensity', 'rgb')], ids=['plain', 'columns'])
 @pytest.mark.parametrize('operation', [insert, remove, load, read, reduce])
-def test_an_allocation_that_fails_leaves_the_map_before_or_after(testcapi, tmp_path, operation):
-    surfel_map, path = map_of(1), tmp_path / 'a.npz'
+def test_an_allocation_that_fails_leaves_the_map_before_or_after(
+    testcapi, tmp_path, operation, columns
+):
+    surfel_map, other, path = map_of(1, columns), map_of(4, columns), tmp_path / 'a.npz'
+    surfel_map.merge(other)
     save_map(path, surfel_map)
-    moments = surfel_map.reduce(np.random.default_rng(3).uniform(-9.0, 9.0, (500, 3)))
-    KEPT[surfel_map.num_voxels] = surfel_map.moments()
+    points = np.random.default_rng(3).uniform(-9.0, 9.0, (500, 3))
+    moments = surfel_map.reduce(points, columns=made_columns(points))
+    KEPT[surfel_map.num_voxels] = other.moments()
     after = surfel_map.copy()
     operation(after, moments, path)
     allowed = {surfel_map.digest(), after.digest()}
@@ -149,7 +157,7 @@ def test_an_allocation_that_fails_leaves_the_map_before_or_after(testcapi, tmp_p
         operation(changed, moments, path)
 
     successes = crashes = 0
-    sampled = (*range(30), *(30 + 15 * step for step in range(30)))
+    sampled = (*range(90), *(90 + 15 * step for step in range(30)))
     first, stride = first_and_stride(FEWER)
     numbers = count(first, stride) if EVERY else sampled
     for number, code in results(testcapi, surfel_map, operate, numbers, allowed):
@@ -170,8 +178,9 @@ def results(testcapi, surfel_map, operate, numbers, allowed):
     """
     Let allocations of an operation fail in turn; yield the number of each with the result.
 
-    0: done all the same, 1: raised, 2: the map is neither that of before nor that of after; a
-    negative number: the signal by which a process died. Each process tries a batch, or a part.
+    0: done all the same, 1: raised, 2: the map is neither that of before, with each voxel in its
+    row, nor that of after; a negative number: the signal by which a process died. Each process
+    tries a batch, or a part.
     """
     numbers, batch = iter(numbers), []
     while batch := batch + list(islice(numbers, BATCH - len(batch))):
@@ -203,6 +212,8 @@ def in_child(testcapi, surfel_map, operate, batch, allowed):
 def result(testcapi, surfel_map, operate, number, allowed):
     """Let an allocation of an operation on a copy of a map fail; see results."""
     changed, failed = surfel_map.copy(), 0
+    digest, key = changed.digest(), changed.keys()
+    rows = changed.find(key)
     testcapi.set_nomemory(number, number + 1)
     try:
         operate(changed)
@@ -210,7 +221,32 @@ def result(testcapi, surfel_map, operate, number, allowed):
         failed = 1
     finally:
         testcapi.remove_mem_hooks()
-    return failed if changed.digest() in allowed else 2
+    if changed.digest() not in allowed:
+        return 2
+    is_moved = changed.digest() == digest and not np.array_equal(changed.find(key), rows)
+    return 2 if is_moved else failed
+
+
+def test_a_hash_table_that_cannot_grow_keeps_arrays_that_fit_together(testcapi):
+    def let_each_fail():
+        failures = 0
+        for number in range(200):
+            table = HashTable(max_depth=24)
+            for _ in range(2):  # the first time the segments grow, then the directory
+                testcapi.set_nomemory(number, number + 1)
+                try:
+                    table.grow()
+                except (MapLimitError, MemoryError):
+                    failures += 1
+                finally:
+                    testcapi.remove_mem_hooks()
+                directory, buckets, held, local_depth = table.arrays
+                assert len(held) == len(local_depth), number
+                assert len(buckets) >= len(held) * hashing.SEGMENT, number
+                assert len(directory) == 2 ** table.state[hashing.DEPTH], number
+        assert failures > 5
+
+    assert exit_code(let_each_fail) == 0
 
 
 def test_an_allocation_that_fails_leaves_no_file_beside_the_one_to_be_written(testcapi, tmp_path):

@@ -84,10 +84,16 @@ class StepFile:
         return getattr(self._file, name)
 
 
-def map_of(seed):
-    surfel_map = SurfelMap(0.5)
-    surfel_map.add(np.random.default_rng(seed).uniform(-2.0, 2.0, (50, 3)))
+def map_of(seed, columns=()):
+    surfel_map = SurfelMap(0.5, columns=columns)
+    points = np.random.default_rng(seed).uniform(-2.0, 2.0, (50, 3))
+    surfel_map.add(points, columns=made_columns(points))
     return surfel_map
+
+
+def made_columns(points):
+    """Return intensity and colours of points, all different from 0."""
+    return {'intensity': 1.0 + np.arange(len(points)), 'rgb': np.full((len(points), 3), 7)}
 
 
 def write_parquet(path, surfel_map):

@@ -8,6 +8,10 @@ limits.
 """
 
 from dataclasses import replace
+import os
+from pathlib import Path
+import subprocess
+import sys
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -125,6 +129,39 @@ def test_distance_is_measured_along_the_way():
     for number in range(10):  # to and fro: never more than 1 m away
         window.insert(scan_at(surfel_map, number, number, [number % 2, 0, 0]))
     assert len(window) == 3
+
+
+def test_sensors_apart_travel_as_far_as_each_alone():
+    window, surfel_map = window_with({'max_distance_m': 2.5})
+    for number in range(10):  # 1 m a turn, the rear sensor 2.1 m behind
+        for place, frame_id in ((number, 'front'), (number - 2.1, 'rear')):
+            scan = scan_at(surfel_map, number, number, [place, 0, 0])
+            window.insert(replace(scan, frame_id=frame_id))
+    assert [scan.stamp_ns // S for scan in window] == [7, 7, 8, 8, 9, 9]
+
+
+def test_sensors_apart_at_a_standstill_travel_nothing():
+    window, surfel_map = window_with({'max_distance_m': 0.001})
+    for number in range(30):
+        place, frame_id = ((0, 'front'), (-2.1, 'rear'))[number % 2]
+        scan = scan_at(surfel_map, number, number, [place, 0, 0])
+        window.insert(replace(scan, frame_id=frame_id))
+    assert len(window) == 30
+
+
+def test_the_last_pose_of_a_frame_outlives_its_scan():
+    window, surfel_map = window_with({'max_scans': 1})
+    rear = replace(scan_at(surfel_map, 0, 0, [-2.1, 0, 0]), frame_id='rear')
+    front = replace(scan_at(surfel_map, 1, 1, [0, 0, 0]), frame_id='front')
+    window.insert(rear)
+    window.insert(front)
+
+    assert list(window) == [front]
+    assert window.last_pose('rear') is rear.T_map_sensor
+    assert window.last_pose('front') is front.T_map_sensor
+    assert window.last_pose('roof') is None
+    window.clear()
+    assert window.last_pose('front') is None
 
 
 def test_at_a_standstill_no_scan_leaves_by_distance():
@@ -256,6 +293,56 @@ def test_voxels_that_are_dropped_leave_the_map_and_the_scans(seed, keep_points):
         window.insert(scan_at(surfel_map, number, number, (50.0, 0.0, 0.0), keep_points))
     assert len(surfel_map.moments(chosen)) == 0
     assert surfel_map.moments().voxel_index[:, 0].min() > 80
+
+
+NO_MEMORY = """
+import resource
+import numpy as np
+from surfel_mapper.config import WindowConfig
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
+
+rng = np.random.default_rng(1)
+surfel_map = SurfelMap(0.5)
+window = SlidingWindow(surfel_map, WindowConfig(max_scans=4, keep_points=True))
+for number in range(4):
+    points = rng.uniform(-60.0, 60.0, (100_000, 3))
+    window.insert(WindowedScan(
+        moments=surfel_map.reduce(points),
+        stamp_ns=number,
+        T_map_sensor=np.eye(4),
+        points=points,
+    ))
+window.drop_voxels(surfel_map.moments().voxel_index[:9])  # compiles
+index = surfel_map.moments().voxel_index[::100]
+before = surfel_map.digest()
+for left in (1_000_000, 10_000_000, 30_000_000):
+    used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + left, resource.RLIM_INFINITY))
+    try:
+        window.drop_voxels(index)
+    except MemoryError:
+        print('MemoryError')
+    else:
+        print('not refused')
+    resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    print(surfel_map.digest() == before)
+    print(sum(scan.moments.num_points for scan in window) == surfel_map.num_points)
+"""
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='reads /proc')
+def test_voxels_that_cannot_be_dropped_for_lack_of_memory_stay_in_map_and_scans():
+    done = subprocess.run(
+        [sys.executable, '-c', NO_MEMORY],
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, 'MALLOC_MMAP_THRESHOLD_': '65536'},  # freed memory is given back
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == 3 * ['MemoryError', 'True', 'True']
 
 
 def test_voxels_of_settled_scans_are_dropped_too():
