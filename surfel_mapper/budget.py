@@ -20,9 +20,12 @@ import errno
 from functools import cache
 import os
 from pathlib import Path
+import re
 import stat
 import time
 from typing import BinaryIO
+
+from surfel_mapper.errors import ConfigError
 
 FLOOR_BYTES = 64 << 20
 """Memory that reading any input may take: one unpacked chunk, one image of 16 Mpixel."""
@@ -157,13 +160,16 @@ def stated_limit() -> int:
 
     Raises
     ------
-    ValueError
-        If it is not a positive integer.
+    ConfigError
+        If it is not a positive integer, of at most 18 digits. Readers let it pass: their input is
+        not damaged.
 
     """
     text = os.environ.get(VARIABLE, '')
-    if text and (not text.isdecimal() or int(text) == 0):
-        raise ValueError(f'{VARIABLE}={text!r}, expected a positive number of bytes')
+    if text and not re.fullmatch('0*[1-9][0-9]{0,17}', text):
+        raise ConfigError(
+            f'{VARIABLE}: {text!r}, expected a positive number of bytes, such as 4294967296'
+        )
     return int(text or 0)
 
 

@@ -16,7 +16,7 @@ from surfel_mapper.budget import (
     upper_bound,
     VARIABLE,
 )
-from surfel_mapper.errors import BagError, FileFormatError, LineFormatter, one_line
+from surfel_mapper.errors import BagError, ConfigError, FileFormatError, LineFormatter, one_line
 
 
 def test_small_inputs_may_use_the_floor_and_large_ones_a_multiple_of_their_size():
@@ -39,10 +39,13 @@ def test_a_variable_sets_the_upper_bound(monkeypatch):
     assert Budget('a', 10**18, BagError).max_bytes == upper_bound() > FLOOR_BYTES
     monkeypatch.setenv(VARIABLE, '5000')
     assert Budget('a', 10, BagError).max_bytes == 5000
-    for text in ('0', '-1', '1e9', 'all'):
+    for text in ('0', '00', '-1', '1e9', 'all', '4G', '9' * 19, '9' * 5000):
         monkeypatch.setenv(VARIABLE, text)
-        with pytest.raises(ValueError, match='expected a positive number'):
+        says = f'{VARIABLE}: {text!r}, expected a positive number of bytes, such as 4294967296'
+        with pytest.raises(ConfigError) as raised:
             Budget('a', 10, BagError)
+        assert str(raised.value) == one_line(says)
+    assert issubclass(ConfigError, ValueError)
 
 
 def test_processor_time_is_limited(monkeypatch):

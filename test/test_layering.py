@@ -23,8 +23,8 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'surfel_mapper'
 
 LEVELS = (
-    {'budget', 'errors'},
-    {'arguments'},
+    {'errors'},
+    {'arguments', 'budget'},
     {'config', 'counters', 'geometry', 'kernels', 'memory', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},

@@ -155,24 +155,27 @@ class ChunkedFile(BagFile):
         pending = deque(self._numbers(wanted, *span))
         indexes: dict[int, Index] = {}
         heads: list[tuple[int, int, int]] = []  # record time, number of the chunk, row
-        while pending or heads:
-            while pending and (not heads or pending[0][0] <= heads[0][0]):
-                number = pending.popleft()[1]
-                indexes[number] = index = self._index_of(number, wanted, *span)
-                if len(index):
-                    heapq.heappush(heads, (int(index[0, 0]), number, 0))
-            if not heads:
-                continue
-            record_ns, number, row = heads[0]
-            _, connection, _, at, size, _ = indexes[number][row].tolist()
-            raw = self._message(number, at, size)
-            if row + 1 < len(indexes[number]):
-                next_ns = int(indexes[number][row + 1, 0])
-                heapq.heapreplace(heads, (next_ns, number, row + 1))
-            else:
-                heapq.heappop(heads)
-                self._budget.give_back(MESSAGE_BYTES * len(indexes.pop(number)))
-            yield wanted[connection], record_ns, raw
+        try:
+            while pending or heads:
+                while pending and (not heads or pending[0][0] <= heads[0][0]):
+                    number = pending.popleft()[1]
+                    indexes[number] = index = self._index_of(number, wanted, *span)
+                    if len(index):
+                        heapq.heappush(heads, (int(index[0, 0]), number, 0))
+                if not heads:
+                    continue
+                record_ns, number, row = heads[0]
+                _, connection, _, at, size, _ = indexes[number][row].tolist()
+                raw = self._message(number, at, size)
+                if row + 1 < len(indexes[number]):
+                    next_ns = int(indexes[number][row + 1, 0])
+                    heapq.heapreplace(heads, (next_ns, number, row + 1))
+                else:
+                    heapq.heappop(heads)
+                    self._budget.give_back(MESSAGE_BYTES * len(indexes.pop(number)))
+                yield wanted[connection], record_ns, raw
+        finally:  # of the chunks that are open if the caller leaves early
+            self._budget.give_back(MESSAGE_BYTES * sum(map(len, indexes.values())))
 
     @abstractmethod
     def _head(self, chunk: Chunk) -> Packed:

@@ -258,9 +258,16 @@ class McapFile(ChunkedFile):
         topic, at = text(content, 4)
         encoding, at = text(content, at)
         name, kind, definition = self._schemas.get(schema, ('', '', ''))
-        qos = content[at:].decode(errors='replace')
+        metadata = content[at:].decode(errors='replace')
         connection = ros2_connection(
-            key, topic, name, None, encoding=encoding, qos=qos, definition=(kind, definition)
+            key,
+            topic,
+            name,
+            None,
+            encoding=encoding,
+            qos=metadata,
+            definition=(kind, definition),
+            digest=metadata,
         )
         self._describe(key, connection, len(content))
         return schema in self._schemas

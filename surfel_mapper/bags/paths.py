@@ -140,8 +140,15 @@ def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
 
 
 def loose_files(directory: Path) -> list[Path]:
-    """Return the storage files in a directory without metadata.yaml, bag_2 before bag_10."""
+    """
+    Return the storage files in a directory without metadata.yaml, bag_2 before bag_10.
+
+    Of a file that is there packed and unpacked, the unpacked one: a recorder removes it once the
+    packed one is complete.
+    """
     files = [file for file in directory.iterdir() if is_storage(file) and file.is_file()]
+    names = {file.name for file in files}
+    files = [file for file in files if not is_packed(file) or unpacked_name(file) not in names]
     if not files:
         raise BagError(
             f'{directory}: not a bag: neither {METADATA} nor an .mcap or .db3 file in it'

@@ -34,7 +34,7 @@ from surfel_mapper.bags.decoders import Decoders
 from surfel_mapper.bags.paths import files_of, is_packed, is_ros1, stated_counts, unpacked_name
 from surfel_mapper.bags.storage import damaged, described, open_storage
 from surfel_mapper.bags.topics import CLOUD, SAME_AS, Topic, Topics
-from surfel_mapper.errors import BagError, DependencyError
+from surfel_mapper.errors import BagError, SurfelMapperError
 from surfel_mapper.messages.pointcloud2 import parse_cloud
 
 if TYPE_CHECKING:
@@ -179,11 +179,29 @@ class BagReader:
                 f'{message.type}: {described(error)}'
             ) from error
 
+    def definition(self, type_: str) -> tuple[str, str] | None:
+        """
+        Return text and hash of the definition of a message type in a ROS 2 bag.
+
+        None for types of ROS 2 Jazzy, which the bag need not define.
+
+        Raises
+        ------
+        BagError
+            If the messages are not CDR, or the bag has no definition that can be copied.
+
+        """
+        try:
+            return self._decoders.definition(type_)
+        except Exception as error:  # of a text from the bag
+            reason = f'no definition of {error}' if isinstance(error, KeyError) else error
+            raise BagError(f'{self.path}: {type_} cannot be copied: {reason}') from error
+
     def _open(self, paths: list[Path], files: ExitStack) -> None:
         """Open the files of the bag; the last of several may be unreadable, as after a crash."""
         for number, path in enumerate(paths, 1):
-            file = self._unpacked(path, files) if is_packed(path) else path
             try:
+                file = self._unpacked(path, files) if is_packed(path) else path
                 storage = open_storage(file, path)
             except BagError as error:
                 if number == 1 or number < len(paths):
@@ -258,7 +276,7 @@ class BagReader:
             except StopIteration:
                 self._note_skipped(path, storage)
                 return
-            except (BagError, DependencyError):
+            except SurfelMapperError:
                 raise
             except Exception as error:
                 raise damaged(path, f'damaged after {done} messages', error) from error
@@ -301,8 +319,13 @@ class BagReader:
                 log.warning(self.cuts[-1])
 
     def _check_complete(self, read: Counter[str], names: Collection[str] | None) -> None:
-        """Compare the number of messages read of each topic with the index."""
-        asked = [topic for topic in self.topics if names is None or topic.name in names]
+        """Compare the number of messages read of each topic, if all are CDR, with the index."""
+        unread = {c.topic for c in self._connections() if not is_cdr(c)}
+        asked = [
+            topic
+            for topic in self.topics
+            if topic.name not in unread and (names is None or topic.name in names)
+        ]
         short = [topic for topic in asked if read[topic.name] < topic.count]
         text = ', '.join(f'{topic.name} {read[topic.name]} of {topic.count}' for topic in short)
         message = f'{self.path}: fewer messages than its index states: {text}'

@@ -40,6 +40,9 @@ LEAST_ROW_BYTES = 9
 READ_BYTES, ROW_BYTES = 1 << 16, 1 << 9
 """Size of messages read together, and of one beside its bytes; asking for the time takes 3 us."""
 
+DEFINITION = 'topic_type', 'encoding', 'encoded_message_definition', 'type_description_hash'
+"""Columns of the definition of a type."""
+
 PLAIN = re.compile(r'\s*CREATE\s+(TABLE|(UNIQUE\s+)?INDEX)\b', re.IGNORECASE)
 """Beginning of the definition of a table or an index, not of a view, trigger or virtual table."""
 
@@ -148,12 +151,36 @@ class SqliteFile(BagFile):
         columns = {name for _, name, *_ in self._rows('PRAGMA table_info(topics)')}
         qos = 'offered_qos_profiles' if 'offered_qos_profiles' in columns else "''"
         query = f'SELECT id, name, type, serialization_format, {qos} FROM topics'
+        definitions = self._definitions()
         for key, *texts in self._rows(query):
             if not isinstance(key, int) or not all(isinstance(text, str) for text in texts):
                 raise ValueError(f'topic {key!r} is not described by texts')
             topic, type_, encoding, profiles = texts
-            connection = ros2_connection(key, topic, type_, None, encoding=encoding, qos=profiles)
+            kind, definition, digest = definitions.get(type_, ('', '', ''))
+            connection = ros2_connection(
+                key,
+                topic,
+                type_,
+                None,
+                encoding=encoding,
+                qos=profiles,
+                definition=(kind, definition),
+                digest=digest,
+            )
             self._keep_connection(key, connection, 4 * sum(map(len, texts)))
+
+    def _definitions(self) -> dict[str, tuple[str, str, str]]:
+        """Return format, text and hash of the definition of each type; none before ROS 2 Iron."""
+        found: dict[str, tuple[str, str, str]] = {}
+        known = {name for _, name, *_ in self._rows('PRAGMA table_info(message_definitions)')}
+        if not known.issuperset(DEFINITION):
+            return found
+        for row in self._rows(f'SELECT {", ".join(DEFINITION)} FROM message_definitions'):
+            if all(isinstance(text, str) for text in row):
+                self._budget.take(ROW_BYTES + 4 * sum(map(len, row)), 'definitions of types')
+                type_, kind, text, digest = row
+                found[type_] = kind, text, digest
+        return found
 
     def _count_messages(self) -> None:
         """Count the messages of each topic; raise ValueError if one has no topic or time."""

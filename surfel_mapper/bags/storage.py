@@ -21,7 +21,7 @@ from surfel_mapper.bags.ros1 import Ros1File
 from surfel_mapper.bags.sqlite import SqliteFile
 from surfel_mapper.bags.sqlite_pages import is_short, SalvagedSqlite
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import BagError, DependencyError
+from surfel_mapper.errors import BagError, SurfelMapperError
 
 OURS: dict[str, type[BagFile]] = {'.mcap': McapFile, '.db3': SalvagedSqlite, '.bag': Ros1File}
 """The reader for each kind of file, if it may be damaged."""
@@ -53,7 +53,7 @@ def open_storage(path: Path, named: Path | None = None) -> BagFile:
         if suffix(path) == '.db3' and not is_short(path):
             return SqliteFile(path)
         return open_ours(path, named)
-    except (DependencyError, BagError):
+    except SurfelMapperError:
         raise
     except Exception as error:
         if suffix(path) != '.db3':

@@ -119,6 +119,7 @@ class BagWriter:
         raw: bytes | memoryview,
         *,
         latched: bool = False,
+        definition: tuple[str, str] | None = None,
     ) -> None:
         """
         Append a message; the first message of a topic adds the topic.
@@ -126,20 +127,35 @@ class BagWriter:
         Parameters
         ----------
         topic, type_ : str
-            A type of ROS 2 Jazzy, such as sensor_msgs/msg/PointCloud2.
+            A type of ROS 2 Jazzy, such as sensor_msgs/msg/PointCloud2, or one with a definition.
         record_ns : int
             Record time; messages are expected in this order.
         raw : bytes
             The message as CDR.
         latched : bool
             Whether late subscribers get the last message: durability transient local.
+        definition : (str, str), optional
+            Text and hash of another type, see BagReader.definition.
+
+        Raises
+        ------
+        BagError
+            If the type is another one and has no definition, or the bag cannot be written.
 
         """
+        if definition is None and type_ not in self._store.fielddefs:
+            raise BagError(f'{self.path}: {topic}: {type_} without a definition, expected one')
+        text, digest = definition or (None, None)
         with self._refusing():
             if topic not in self._connections:
                 profiles = [latched_profile()] if latched else []
                 self._connections[topic] = self._writer.add_connection(
-                    topic, type_, typestore=self._store, offered_qos_profiles=profiles
+                    topic,
+                    type_,
+                    typestore=self._store,
+                    msgdef=text,
+                    rihs01=digest,
+                    offered_qos_profiles=profiles,
                 )
             self._writer.write(self._connections[topic], record_ns, raw)
 
@@ -209,17 +225,17 @@ class BagWriter:
 
     def _take_name(self) -> None:
         """Rename the hidden directory to the path; restore the former content if that fails."""
-        replaced = self._hidden / 'replaced'
-        if self.path.exists():
-            self.path.rename(replaced)
         for file in self.directory.iterdir():
             with open(file, 'rb') as written:
                 os.fsync(written.fileno())
         sync_directory(self.directory)
+        replaced = self._hidden / 'replaced'
         try:
+            if self.path.exists():
+                self.path.rename(replaced)
             self.directory.rename(self.path)
-        except OSError:
-            if replaced.exists():
+        except BaseException:  # an interrupt too: the hidden directory is removed in any case
+            if replaced.exists() and not self.path.exists():
                 replaced.rename(self.path)
             raise
         sync_directory(self.path.parent)

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import Budget, BYTES_PER_BYTE, open_regular
-from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.errors import ConfigError, DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
     try:
         check_header(path)
         las = laspy.read(str(path), laz_backend=laspy.LazBackend.Lazrs)
-    except (FileFormatError, KeyboardInterrupt, SystemExit):
+    except (FileFormatError, ConfigError, KeyboardInterrupt, SystemExit):
         raise
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, open_regular
+from surfel_mapper.budget import Budget, open_regular, stated_limit
 from surfel_mapper.errors import DependencyError, FileFormatError, MapError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.map_state import checked_moments, NO_ORIGIN
@@ -161,6 +161,7 @@ def read_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap]:
 def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, SurfelMap, Any]:
     """Return the moments in a file, an empty map of its kind, and the digest that it states."""
     arrow, parquet = import_pyarrow()
+    stated_limit()  # a wrong one is no damage of the file
     try:
         with open_regular(path) as opened:
             file = arrow.OSFile(f'/dev/fd/{opened.fileno()}')  # the file that was checked

@@ -27,7 +27,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import open_regular
+from surfel_mapper.budget import open_regular, stated_limit
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files.atomic import make_directory, replace_file
 from surfel_mapper.files.parquet import (
@@ -342,6 +342,7 @@ def _opened(path: str | Path, footer: Any = None) -> Iterator[tuple[Any, dict[st
     Passing the footer, if known, takes a quarter of the time.
     """
     _, parquet = import_pyarrow()
+    stated_limit()  # a wrong one is no damage of the file
     try:
         with (
             open_regular(path) as file,

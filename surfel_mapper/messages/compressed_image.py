@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import Budget, FLOOR_BYTES
-from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.errors import CloudFormatError, ConfigError
 
 TRANSPORTS = ('compressed', 'compressedDepth')
 """Last part of the name of a topic of compressed images."""
@@ -158,7 +158,7 @@ def pixels_of(
             check_size(width, height, len(data), topic, size, pixel_bytes)
             shown = image if image.mode in ENCODINGS else image.convert('RGB')
             pixels = np.asarray(shown)
-    except CloudFormatError:
+    except (CloudFormatError, ConfigError):
         raise
     except (*DAMAGED, Image.DecompressionBombError) as error:
         expected = ' or '.join(formats)

@@ -425,10 +425,9 @@ def parse_cloud(raw: bytes | memoryview, *, ros1: bool = False, topic: str = 'po
         If the bytes are truncated, or are not such a message.
 
     """
+    budget = Budget(topic, len(raw), CloudFormatError)
     try:
-        return _read_cloud(
-            MessageReader(raw, ros1=ros1), Budget(topic, len(raw), CloudFormatError)
-        )
+        return _read_cloud(MessageReader(raw, ros1=ros1), budget)
     except (struct.error, UnicodeDecodeError, ValueError) as error:
         raise CloudFormatError(
             f'{topic}: {len(raw)} bytes that are not a whole PointCloud2: {error}'

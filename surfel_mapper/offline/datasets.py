@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import Budget, open_regular
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import ConfigError, FileFormatError
 from surfel_mapper.files.atomic import by_number
 from surfel_mapper.files.pose_rows import (
     matrix_rows,
@@ -210,7 +210,7 @@ def nuscenes_poses(tables: Path, files: Sequence[Path]) -> list[Floats]:
                 raise FileFormatError(f'{tables}: no entry for {file.name}')
             T_map_ego = wxyz_pose(ego[row['ego_pose_token']])
             poses.append(T_map_ego @ wxyz_pose(mounts[row['calibrated_sensor_token']]))
-    except FileFormatError:
+    except (FileFormatError, ConfigError):
         raise
     except Exception as error:  # of rows of any shape, with numbers of any size
         raise FileFormatError(

@@ -4,8 +4,9 @@
 A chain of filters applied to files of clouds, folders of scans and bags, without mapping them.
 
 All columns are written, those added by filters too. A bag keeps all its other messages, so that
-it can be replayed with the filtered clouds. A scan of a bag that a filter refuses is left out and
-counted; a file that is refused is an error.
+it can be replayed with the filtered clouds; those that are not CDR, or of a type that neither
+Jazzy nor the bag defines, are left out with a warning. A scan of a bag that a filter refuses is
+left out and counted; a file that is refused is an error.
 """
 
 from __future__ import annotations
@@ -100,14 +101,21 @@ def filter_clouds(
     Raises
     ------
     FileFormatError, BagError
-        If an input cannot be read or an output cannot be written.
+        If an input cannot be read, an output cannot be written, or two inputs have the same one.
     FilterError
         If a filter refuses a file.
 
     """
     work = _Work(chain, topics, T_base_sensor, show)
     pairs = list(outputs_of([Path(each) for each in inputs], Path(output)))
-    for _, target in pairs:
+    sources: dict[Path, Path] = {}
+    for source, target in pairs:
+        if target in sources:
+            raise FileFormatError(
+                f'{sources[target]}, {source}: expected an output for each, both would be '
+                f'{target}; filter them one after the other, into several directories'
+            )
+        sources[target] = source
         if target.exists() and not overwrite:
             raise FileFormatError(f'{target}: exists; choose another output, or overwrite it')
     chain.warm_up()
@@ -141,7 +149,7 @@ def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
         return
     for each in inputs:
         if is_bag(each):
-            yield each, output / each.stem
+            yield each, output / (each.name if each.is_dir() else each.stem)
             continue
         files = scan_files(each) if each.is_dir() else [each]
         if not files:
@@ -151,6 +159,25 @@ def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
         for file in files:
             suffix = file.suffix if file.suffix in WRITTEN else '.ply'
             yield file, output / f'{file.stem}{suffix}'
+
+
+def definitions_of(reader: BagReader) -> dict[str, tuple[str, str] | None]:
+    """
+    Return the definition of the type of each topic of a ROS 2 bag, None for types of Jazzy.
+
+    Topics that cannot be copied are left out, with a warning for each type.
+    """
+    topics: dict[str, list[str]] = {}
+    for topic in reader.topics:
+        if topic.count:
+            topics.setdefault(topic.type, []).append(topic.name)
+    found: dict[str, tuple[str, str] | None] = {}
+    for type_, names in topics.items():
+        try:
+            found |= dict.fromkeys(names, reader.definition(type_))
+        except BagError as error:
+            log.warning('%s; topics left out: %s', error, ', '.join(names))
+    return found
 
 
 class _Work:
@@ -188,10 +215,10 @@ class _Work:
             topics = self._cloud_topics(reader)
             if reader.is_ros1:
                 log.warning('%s: a ROS 1 bag; only its clouds are written', source)
-            names = topics if reader.is_ros1 else None
+            copied = dict.fromkeys(topics) if reader.is_ros1 else definitions_of(reader)
             count = sum(topic.count for topic in reader.topics if topic.name in topics)
             latched = {topic.name for topic in reader.topics if reader.is_latched(topic.name)}
-            for message in reader.messages(names):
+            for message in reader.messages(copied):
                 if message.topic in topics:
                     self._filter_message(reader, writer, message)
                     self.show(self.done.scans + self.done.refused, count)
@@ -202,6 +229,7 @@ class _Work:
                         message.record_ns,
                         message.raw,
                         latched=message.topic in latched,
+                        definition=copied[message.topic],
                     )
 
     def _filter_message(self, reader: BagReader, writer: BagWriter, message: BagMessage) -> None:

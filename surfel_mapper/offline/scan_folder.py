@@ -19,7 +19,7 @@ from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.bags.paths import is_storage, METADATA
 from surfel_mapper.config import Config
-from surfel_mapper.errors import BagError, FileFormatError
+from surfel_mapper.errors import BagError, ConfigError, FileFormatError
 from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
 from surfel_mapper.files.stamps import nanoseconds
 from surfel_mapper.offline import ouster_pcap
@@ -125,6 +125,8 @@ class ScanFolder:
         for number, stamp_ns in enumerate(self.stamps):
             try:
                 return self._read(number, stamp_ns, '')
+            except ConfigError:  # a wrong limit concerns all scans
+                raise
             except (FileFormatError, ValueError):
                 continue
         return None
@@ -151,6 +153,8 @@ class ScanFolder:
         try:
             with mapper.counters.timed('decode'):
                 scan = self._read(number, stamp_ns, frame)
+        except ConfigError:  # a wrong limit concerns all scans
+            raise
         except (FileFormatError, ValueError) as error:
             mapper.refuse_clouds('bad_cloud', str(self.path), str(error))
             return

@@ -244,3 +244,15 @@ def test_places_that_are_kept_leave_room_for_chunks(tmp_path, made, monkeypatch)
     found, _ = read(path)
     assert len(found) == 90_001
     assert found[-1][0] == '/b'
+
+
+@pytest.mark.parametrize('made', FORMATS, ids=NAMES)
+def test_iterations_left_early_give_their_memory_back(tmp_path, made):
+    """The index of the chunk has 5 MB, of 64 MiB for the file."""
+    messages = (made.message(0, number, b'') for number in range(50_000))
+    path = tmp_path / made.name
+    path.write_bytes(made.file([made.described(0) + b''.join(messages)]))
+    with BagReader(path) as reader:
+        for _ in range(30):
+            assert next(reader.messages()).record_ns == 0
+        assert sum(1 for _ in reader.messages()) == 50_000

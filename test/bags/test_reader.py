@@ -9,6 +9,7 @@ from pathlib import Path
 import shutil
 import sqlite3
 
+from mcap.writer import Writer
 import numpy as np
 import pytest
 
@@ -237,6 +238,29 @@ def test_a_topic_without_any_message_read_is_an_error(tmp_path):
 
     with pytest.raises(BagError, match=NOTHING_READ):
         read(path)
+
+
+def test_messages_that_are_not_cdr_are_passed_over(tmp_path, caplog):
+    path = tmp_path / 'drive.mcap'
+    with open(path, 'wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2')
+        schema = writer.register_schema('foxglove.Log', 'jsonschema', b'{}')
+        log = writer.register_channel('/log', 'json', schema)
+        channels = {}
+        for topic, type_, record_ns, message in drive():
+            if topic not in channels:
+                schema = writer.register_schema(type_, 'ros2msg', b'')
+                channels[topic] = writer.register_channel(topic, 'cdr', schema)
+            raw = recorded.ROS2.serialize_cdr(message, type_)
+            writer.add_message(channels[topic], record_ns, raw, record_ns)
+            writer.add_message(log, record_ns, b'{"message": "a scan"}', record_ns)
+        writer.finish()
+
+    assert_is_the_drive(read(path))
+    assert caplog.records == []
+    with BagReader(path) as reader:
+        assert reader.topics.num_messages(['/log']) == len(drive())
 
 
 def raw_of(path, topic):

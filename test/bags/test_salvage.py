@@ -15,6 +15,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 import pytest
 
+from surfel_mapper.bags.compression import import_zstd
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.errors import BagError
@@ -305,6 +306,37 @@ def test_the_last_of_several_files_may_be_unreadable(tmp_path, caplog):
 
     assert_is_the_drive(read(path))
     assert 'drive_2.mcap: cannot be read' in caplog.text
+
+
+def loose_files(directory, *parts):
+    """Write messages into drive_1.mcap, drive_2.mcap and so on, without metadata.yaml."""
+    directory.mkdir()
+    for number, part in enumerate(parts, 1):
+        write_mcap(directory / f'drive_{number}.mcap', part)
+    return directory
+
+
+@pytest.mark.parametrize('keep', [1.0, 0.5, 0.0])
+@pytest.mark.parametrize('damage', [b'', b'damaged'])
+def test_a_file_is_read_once_if_the_recorder_was_killed_while_it_packed_it(
+    tmp_path, caplog, keep, damage
+):
+    path = loose_files(tmp_path / 'drive', drive()[:9], drive()[9:])
+    packed = import_zstd().compress((path / 'drive_2.mcap').read_bytes())
+    packed = damage + packed[: int(keep * len(packed))]
+    (path / 'drive_2.mcap.zstd').write_bytes(packed)
+
+    assert_is_the_drive(read(path))
+    assert caplog.records == []
+
+
+def test_the_last_of_several_files_may_be_packed_and_damaged(tmp_path, caplog):
+    path = loose_files(tmp_path / 'drive', drive())
+    (path / 'drive_2.mcap.zstd').write_bytes(b'damaged')
+
+    assert_is_the_drive(read(path))
+    assert 'file skipped, it cannot be read: ' in caplog.text
+    assert 'drive_2.mcap.zstd: cannot be unpacked' in caplog.text
 
 
 def test_the_first_of_several_files_must_be_readable(tmp_path):

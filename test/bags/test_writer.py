@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags are written atomically, replace only bags, and read back the same."""
 
+import errno
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -57,6 +59,13 @@ def test_raw_messages_are_written_unchanged(tmp_path):
         assert reader.decode(message).data == 'hi'
 
 
+def test_a_type_outside_of_jazzy_needs_its_definition(tmp_path):
+    says = r'bag: /a: my_msgs/msg/A without a definition'
+    with pytest.raises(BagError, match=says), BagWriter(tmp_path / 'bag') as bag:
+        bag.write('/a', 'my_msgs/msg/A', 1, b'\x00\x01\x00\x00\x05')
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_files_carry_the_name_of_the_bag_and_others_may_join_them(tmp_path):
     with BagWriter(tmp_path / 'deep' / 'street') as bag:
         (bag.directory / 'note.txt').write_text('here')
@@ -92,6 +101,45 @@ def test_a_bag_is_replaced_only_on_request_and_only_at_the_end(tmp_path):
     with BagReader(path) as new:
         assert [topic.name for topic in new.topics] == ['/text']
     assert [entry.name for entry in tmp_path.iterdir()] == ['bag']
+
+
+def text_over(path):
+    """Replace a bag by one with a text."""
+    with BagWriter(path, overwrite=True) as bag:
+        bag.write('/text', 'std_msgs/msg/String', 1, b'\x00\x01\x00\x00\x01\x00\x00\x00\x00')
+
+
+def assert_is_the_old_bag(path):
+    with BagReader(path) as old:
+        assert [message.topic for message in old.messages()] == ['/tf_static', '/odom', '/points']
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize('error', [OSError(errno.EIO, 'Input/output error'), KeyboardInterrupt()])
+def test_the_old_bag_stays_if_the_new_one_does_not_reach_the_disk(tmp_path, monkeypatch, error):
+    def fail(descriptor):
+        raise error
+
+    write_some(tmp_path / 'bag')
+    monkeypatch.setattr(os, 'fsync', fail)
+    with pytest.raises((BagError, KeyboardInterrupt)):
+        text_over(tmp_path / 'bag')
+    assert_is_the_old_bag(tmp_path / 'bag')
+
+
+def test_the_old_bag_comes_back_if_the_new_one_does_not_get_its_name(tmp_path, monkeypatch):
+    rename = Path.rename
+
+    def interrupted(path, target):
+        if Path(target) == tmp_path / 'bag' and path.name == 'bag':
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    write_some(tmp_path / 'bag')
+    monkeypatch.setattr(Path, 'rename', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        text_over(tmp_path / 'bag')
+    assert_is_the_old_bag(tmp_path / 'bag')
 
 
 def test_an_empty_directory_is_filled_on_request(tmp_path):

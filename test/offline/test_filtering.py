@@ -5,9 +5,15 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+import re
+import shutil
 
+from mcap.writer import Writer
 import numpy as np
 import pytest
+from rosbags import rosbag2
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.bags.writer import BagWriter
@@ -19,7 +25,7 @@ from surfel_mapper.filters import Chain
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.offline.filtering import filter_clouds
-from test.bags.recorded import drive, ROS1, write_ros1
+from test.bags.recorded import CLOUD, drive, NUM_SCANS, ROS1, ROS2, write_ros1
 
 CHAIN = '- range_limit: {min_m: 1}\n- surface_normal: {num_neighbours: 5}\n'
 
@@ -75,6 +81,41 @@ def test_a_folder_gives_a_folder(tmp_path):
     assert [path.name for path in done.outputs] == [f'scan{i}.ply' for i in range(4)]
     assert counts == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert 'intensity' in read_scan(tmp_path / 'out/scan3.ply')[1]
+
+
+@pytest.mark.parametrize(
+    ('files', 'inputs', 'target'),
+    [
+        (('one/000000.pcd', 'two/000000.pcd'), ('one', 'two'), '000000.pcd'),
+        (('in/a.bin', 'in/a.ply'), ('in',), 'a.ply'),
+        (('in/a.ply', 'b.ply'), ('in', 'b.ply', 'in/a.ply'), 'a.ply'),
+    ],
+)
+def test_inputs_with_the_same_output_are_refused_before_any_is_written(
+    tmp_path, monkeypatch, files, inputs, target
+):
+    monkeypatch.chdir(tmp_path)
+    for name in files:
+        Path(name).parent.mkdir(exist_ok=True)
+        if name.endswith('.bin'):
+            np.ones((5, 4), '<f4').tofile(name)
+        else:
+            (ply if name.endswith('ply') else pcd).write_points(name, columns_of())
+    first, second = files if len(inputs) < 3 else ('in/a.ply', 'in/a.ply')
+    says = f'{first}, {second}: expected an output for each, both would be out/{target}; '
+    with pytest.raises(FileFormatError, match=re.escape(says)):
+        filter_clouds(Chain.from_yaml(CHAIN), inputs, 'out', overwrite=True)
+    assert not Path('out').exists()
+
+
+def test_directories_of_bags_keep_their_whole_names(tmp_path, bag):
+    chain = Chain.from_yaml('- range_limit: {min_m: 1}')
+    for name in ('run.1', 'run.2'):
+        shutil.copytree(bag, tmp_path / name)
+    filter_clouds(chain, [tmp_path / 'run.1', tmp_path / 'run.2'], tmp_path / 'out')
+    for name in ('run.1', 'run.2'):
+        with BagReader(tmp_path / 'out' / name) as found:
+            assert found.topics.num_messages(['/points']) == 3
 
 
 @pytest.fixture
@@ -133,6 +174,135 @@ def test_a_ros_1_bag_becomes_a_bag_of_its_filtered_clouds(tmp_path, caplog, comp
         stamp = cloud.header.stamp
         assert scan.stamp_ns == stamp.sec * 10**9 + stamp.nanosec
         assert scan.frame_id == cloud.header.frame_id
+
+
+LIVOX = 'livox_ros_driver2/msg/CustomMsg'
+
+POINT = """uint32 offset_time  # ns
+float32 x
+uint8 line
+"""
+
+AS_MSG = f"""std_msgs/Header header
+CustomPoint[] points
+{'=' * 80}
+MSG: livox_ros_driver2/CustomPoint
+{POINT}"""
+
+AS_IDL = f"""{'=' * 80}
+IDL: {LIVOX}
+module livox_ros_driver2 {{ module msg {{ struct CustomMsg {{ unsigned long line; }}; }}; }};
+"""
+
+LIVOX_RAWS = [b'\x00\x01\x00\x00' + bytes([number]) * 40 for number in range(5)]
+
+
+RECORDED = 'RIHS01_' + '0123456789abcdef' * 4
+"""A hash other than that of the definition: it is copied, or else computed."""
+
+
+def write_livox(path, storage):
+    """Write the clouds of the drive and messages of Livox, as rosbags does."""
+    plugin = rosbag2.StoragePlugin[storage.upper()]
+    with rosbag2.Writer(path, version=9, storage_plugin=plugin) as writer:
+        points = writer.add_connection('/points', CLOUD, typestore=ROS2)
+        livox = writer.add_connection('/livox', LIVOX, msgdef=AS_MSG, rihs01=RECORDED)
+        for _, type_, record_ns, message in clouds_of_the_drive():
+            writer.write(points, record_ns, ROS2.serialize_cdr(message, type_))
+        for number, raw in enumerate(LIVOX_RAWS):
+            writer.write(livox, drive()[0][2] + number, raw)
+    return path
+
+
+def write_mcap(path, encoding='ros2msg', definition='', metadata=None):
+    """Write the clouds of the drive, messages of Livox and a log in JSON, as recorders do."""
+    with open(path, 'wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2')
+        points = writer.register_channel(
+            '/points', 'cdr', writer.register_schema(CLOUD, 'ros2msg', b'')
+        )
+        livox = writer.register_channel(
+            '/livox',
+            'cdr',
+            writer.register_schema(LIVOX, encoding, definition.encode()),
+            metadata or {},
+        )
+        log = writer.register_channel(
+            '/log', 'json', writer.register_schema('foxglove.Log', 'jsonschema', b'{}')
+        )
+        for _, type_, ns, message in clouds_of_the_drive():
+            writer.add_message(points, ns, ROS2.serialize_cdr(message, type_), ns)
+            writer.add_message(log, ns, b'{}', ns)
+        for number, raw in enumerate(LIVOX_RAWS):
+            writer.add_message(livox, drive()[0][2] + number, raw, 0)
+        writer.finish()
+    return path
+
+
+def clouds_of_the_drive():
+    return [entry for entry in drive() if entry[0] == '/points']
+
+
+@pytest.mark.parametrize(
+    ('write', 'definition', 'digest'),
+    [
+        (lambda path: write_livox(path / 'bag', 'sqlite3'), AS_MSG, RECORDED),
+        (lambda path: write_livox(path / 'bag', 'mcap'), AS_MSG, None),
+        (
+            lambda path: write_mcap(
+                path / 'a.mcap', 'ros2idl', AS_IDL, {'topic_type_hash': RECORDED}
+            ),
+            AS_IDL,
+            RECORDED,
+        ),
+    ],
+    ids=['sqlite3', 'mcap of rosbags without the hash', 'mcap of ROS 2'],
+)
+def test_messages_of_other_types_are_copied_with_their_definition(
+    tmp_path, write, definition, digest
+):
+    filter_clouds(Chain.from_yaml(CHAIN), [write(tmp_path)], tmp_path / 'out')
+    if digest is None:
+        store = get_typestore(Stores.ROS2_JAZZY)
+        store.register(get_types_from_msg(definition, LIVOX))
+        digest = store.hash_rihs01(LIVOX)
+    with rosbag2.Reader(tmp_path / 'out') as reader:
+        (livox,) = (each for each in reader.connections if each.topic == '/livox')
+        assert livox.msgtype == LIVOX
+        assert livox.msgdef.data == definition
+        assert livox.digest == digest
+        assert [raw for *_, raw in reader.messages([livox])] == LIVOX_RAWS
+
+
+@pytest.mark.parametrize(
+    ('encoding', 'definition', 'says'),
+    [
+        ('ros2msg', '', 'the bag has no definition of it'),
+        ('ros2idl', AS_IDL, 'a definition as IDL without the hash of the type'),
+        ('ros2msg', 'Other other', "no definition of 'livox_ros_driver2/msg/Other'"),
+        ('ros2msg', 'CustomMsg[] inner', 'maximum recursion depth exceeded'),
+        ('ros2msg', '!', 'Could not parse'),
+        ('ros2msg', POINT * 1000, 'the definitions of the bag are too long together for its size'),
+    ],
+    ids=['none', 'IDL', 'incomplete', 'endless', 'damaged', 'long'],
+)
+def test_messages_that_cannot_be_copied_are_left_out_with_a_warning(
+    tmp_path, caplog, encoding, definition, says
+):
+    path = write_mcap(tmp_path / 'a.mcap', encoding, definition)
+    (tmp_path / 'chain.yaml').write_text(CHAIN)
+    files = [str(tmp_path / name) for name in ('chain.yaml', 'a.mcap')]
+    assert main(['filter', *files, '--output', str(tmp_path / 'out')]) == 0
+    livox, log = sorted((record.getMessage() for record in caplog.records), reverse=True)
+    assert livox.startswith(f'{path}: {LIVOX} cannot be copied: {says}')
+    assert livox.endswith('; topics left out: /livox')
+    assert log == (
+        f'{path}: foxglove.Log as json cannot be copied: its messages are not CDR; '
+        'topics left out: /log'
+    )
+    with BagReader(tmp_path / 'out') as reader:
+        assert [(topic.name, topic.count) for topic in reader.topics] == [('/points', NUM_SCANS)]
 
 
 def test_scans_that_a_filter_refuses_are_left_out_and_counted(tmp_path, bag, caplog):
