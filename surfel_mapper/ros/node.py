@@ -31,6 +31,7 @@ from rclpy.lifecycle import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from surfel_mapper.budget import stated_limit
 from surfel_mapper.errors import ConfigError, SurfelMapperError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.pipeline.reduction import standing_sensor
@@ -155,6 +156,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         return SUCCESS
 
     def _configure(self) -> None:
+        stated_limit()  # else a wrong one would refuse every cloud
         try:
             self._session = Session(self, self._config, self.tasks)
         except BaseException:

@@ -17,6 +17,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
+from surfel_mapper.errors import ConfigError
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.checkpoints import checkpoint_paths
@@ -166,6 +167,21 @@ def test_settings_changed_while_kernels_compile_are_used(prefork, peer, monkeypa
         node.destroy_node()
     assert answers[0].successful
     assert values['window_scans'] == '2'
+
+
+def test_a_wrong_limit_of_inputs_is_refused_before_any_cloud_comes(domain, monkeypatch):
+    monkeypatch.setenv('SURFEL_MAPPER_MAX_BYTES', '4G')
+    with context(WAITING):
+        node = create_node()
+        with executing(node):
+            with pytest.raises(ConfigError, match="SURFEL_MAPPER_MAX_BYTES: '4G'"):
+                node.start()
+            assert node.state == 'unconfigured'
+            monkeypatch.delenv('SURFEL_MAPPER_MAX_BYTES')
+            node.start()
+            assert node.state == 'active'
+            node.end()
+        node.destroy_node()
 
 
 def test_a_destroyed_node_leaves_the_graph(peer):
