@@ -470,6 +470,20 @@ def test_an_invalid_duration_is_refused(name, value):
         TransformBuffer(**{name: value})
 
 
+def test_the_newest_stamp_between_frames_is_that_of_the_edge_that_ends_first():
+    buffer = TransformBuffer()
+    buffer.add('map', 'odom', 3 * S, np.eye(4))  # stamped ahead, as localisation does
+    buffer.add('odom', 'base', 2 * S, np.eye(4))
+    buffer.add('base', 'wheel', 5 * S, np.eye(4))
+    buffer.add_static('base', 'lidar', np.eye(4))
+    assert buffer.newest_between('map', 'lidar') == 2 * S
+    assert buffer.newest_between('lidar', 'map') == 2 * S
+    assert buffer.newest_between('odom', 'map') == 3 * S
+    assert buffer.newest_between('lidar', 'wheel') == 5 * S
+    assert buffer.newest_between('base', 'lidar') is None
+    assert buffer.newest_between('map', 'map') is None
+
+
 # Gaps
 
 

@@ -451,7 +451,7 @@ class Mapper:
 
     def T_map_of(self, frame_id: str, stamp_ns: int) -> Transform:
         """
-        Return the pose of a frame in the map at a time; 0: at the newest stamp.
+        Return the pose of a frame in the map at a time; 0: at the newest at which it is known.
 
         Raises
         ------
@@ -463,9 +463,10 @@ class Mapper:
         stamp_ns = as_whole('stamp_ns', stamp_ns)
         if frame_id == self.map_frame:
             return np.eye(4)
-        fixed, at_ns = self.config.frames.fixed, stamp_ns or self.transforms.newest_ns or 0
+        fixed = self.config.frames.fixed
         if frame_id == fixed:
             return self.T_map_fixed
+        at_ns = stamp_ns or self.transforms.newest_between(fixed, frame_id) or 0
         return self._inserter.aligner.to_map(self.transforms.lookup(fixed, frame_id, at_ns))
 
     @property

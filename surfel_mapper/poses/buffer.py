@@ -113,6 +113,16 @@ class TransformBuffer:
         edge = self._edges.get(child)
         return None if edge is None or edge.is_static else edge.stamps[-1]
 
+    def newest_between(self, target: str, source: str) -> int | None:
+        """
+        Return the newest stamp at which the transform between two frames is known.
+
+        None if they are the same, or static edges alone lie between them. Transforms of other
+        frames, and those that are stamped ahead as of a localisation, do not count.
+        """
+        between = {*self._edges_above(source)} ^ {*self._edges_above(target)}
+        return min((edge.stamps[-1] for edge in between if not edge.is_static), default=None)
+
     def add(
         self,
         parent: str,

@@ -211,6 +211,30 @@ def test_a_scan_in_a_long_gap_of_poses_waits_and_is_dropped(caplog):
     assert 'in a gap of 8.600 s' in caplog.text
 
 
+def test_transforms_that_are_stamped_ahead_do_not_shorten_the_wait():
+    mapper = mapper_with(pose__source='tf', pose__max_gap_s=0.3, frames__fixed='map')
+    add_pose(mapper, 0.0, parent='map', child='odom')
+    add_pose(mapper, 0.2, parent='map', child='odom')
+    for stamp_s in (0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0):  # as of a localisation
+        add_pose(mapper, stamp_s, parent='map', child='odom')
+    add_pose(mapper, 0.9)
+    add_pose(mapper, 1.4, x=5.0)
+    mapper.add_scan(scan_at(1.2))
+    assert list(mapper.insert_ready()) == []
+    add_pose(mapper, 1.15, x=2.5)
+    (update,) = mapper.insert_ready()
+    assert update.T_map_sensor[0, 3] == pytest.approx(3.0)
+    assert dropped(mapper) == {}
+
+
+def test_a_frame_is_found_at_the_newest_time_at_which_its_pose_is_known():
+    mapper = mapper_with(pose__source='tf')
+    add_pose(mapper, 1.0, x=1.0)
+    add_pose(mapper, 2.0, x=2.0)
+    add_pose(mapper, 5.0, x=0.1, parent='base_link', child='wheel')
+    assert mapper.T_map_of('base_link', 0)[0, 3] == 2.0
+
+
 def sweep_at(stamp_s):
     """Return a scan of 40 points that were measured within 0.1 s."""
     scan = scan_at(stamp_s)
