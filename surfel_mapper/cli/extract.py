@@ -131,7 +131,7 @@ def read(
     from surfel_mapper.files.scan_files import read_scan, SUFFIXES
     from surfel_mapper.models.fitting import above, surfel_points
 
-    args.cloud = map_in(args.cloud)
+    args.cloud = exact_map(args.cloud)
     is_tiles = args.cloud.is_dir()
     if not is_tiles and args.cloud.suffix not in (*MAPS, *SUFFIXES):
         raise FileFormatError(
@@ -164,22 +164,17 @@ def read(
     return points, size_m, viewpoint, origin_m
 
 
-def map_in(path: Path) -> Path:
+def exact_map(path: Path) -> Path:
     """Return the exact map in an output directory, a file or tiles; another path as it is."""
     from surfel_mapper.errors import FileFormatError
-    from surfel_mapper.files.parquet_tiles import dataset_in
+    from surfel_mapper.files.latest_map import EXACT, map_in
 
-    if not path.is_dir():
-        return path
-    for name in ('map.npz', 'map.parquet'):
-        if (path / name).is_file():
-            return path / name
-    tiles = dataset_in(path)
-    if tiles is None:
+    found = map_in(path, EXACT) if path.is_dir() else path
+    if found is None:
         raise FileFormatError(
             f'{path}: no map.npz, map.parquet or map/tile_i=*/tile_j=*/ in this directory'
         )
-    return tiles
+    return found
 
 
 def figures(model: MultiModel, found: Any, num_points: int) -> dict[str, Any]:

@@ -103,7 +103,7 @@ def map_bags(
 
     """
     with work_directory(directory) as work:
-        run = ShardRun(list(shards), executor, work, on_done)
+        run = ShardRun(dict(enumerate(shards)), executor, work, on_done)
         is_whole = run.all(stopped)
         results = run.ordered()
         mapped_s = time.perf_counter()
@@ -122,7 +122,9 @@ def map_bags(
 class ShardRun:
     """Maps shards, again if one began too late, until each continues the one before it."""
 
-    shards: list[Shard]
+    shards: dict[int, Shard]
+    """By number; a bag that becomes one shard keeps its first number."""
+
     executor: Executor
     work: Path
     on_done: OnDone
@@ -131,26 +133,25 @@ class ShardRun:
 
     def all(self, stopped: Callable[[], bool]) -> bool:
         """Map all shards, after a stop keep the consistent ones; return whether all are done."""
-        wanted = list(range(len(self.shards)))
+        wanted = list(self.shards)
         while wanted:
             paths = [str(self.work / f'shard-{number}.parquet') for number in wanted]
             tasks = [(self.shards[n], path) for n, path in zip(wanted, paths, strict=True)]
             for done, result in self.executor.run(map_task, tasks, stopped):
-                if wanted[done] not in self.results:
+                if not self.repeated:  # the first round covers the recordings
                     self.on_done('map', result.recorded_s)
                 self.results[wanted[done]] = result
             if stopped():
                 self.keep_consistent()
-                return len(self.results) == len(self.shards)
+                return self.results.keys() == self.shards.keys()
             wanted = self.set_back() or self.begun_too_late()
             self.repeated += len(wanted)
         return True
 
     def keep_consistent(self) -> None:
         """Keep the leading shards of every recording that continue each other, without a gap."""
-        for number in self.set_back():
-            self.results.pop(number, None)
-        for number, shard in enumerate(self.shards):
+        self.set_back()
+        for number, shard in self.shards.items():
             if shard.start_ns is not None and not self.continues(number):
                 self.results.pop(number, None)
 
@@ -161,7 +162,7 @@ class ShardRun:
     def begun_too_late(self) -> list[int]:
         """Return the shards that do not continue the one before; they begin earlier next time."""
         late = []
-        for number, shard in enumerate(self.shards):
+        for number, shard in self.shards.items():
             if shard.start_ns is None or number not in self.results:
                 continue
             if not self.continues(number):
@@ -175,20 +176,24 @@ class ShardRun:
         return before is not None and after is not None and after.before == before.after
 
     def set_back(self) -> list[int]:
-        """Return the first shards of bags in which time was set back: each becomes its bag."""
+        """
+        Return the first shards of bags in which time was set back: each becomes its bag.
+
+        The other shards of such a bag, and the results of all of them, are dropped.
+        """
         again = []
-        for number, shard in enumerate(self.shards):
-            parts = [n for n, other in enumerate(self.shards) if other.request is shard.request]
+        for number, shard in list(self.shards.items()):
+            parts = [n for n, other in self.shards.items() if other.request is shard.request]
             if shard.start_ns is not None or shard.stop_ns is None:
                 continue
             if any(self.results[n].resets for n in parts if n in self.results):
                 path = shard.request.path
                 log.warning('%s: time is set back in it; it cannot be mapped in parts', path)
+                for part in parts:
+                    del self.shards[part]
+                    self.results.pop(part, None)
                 self.shards[number] = replace(shard, stop_ns=None)
                 again.append(number)
-                for other in parts:
-                    if self.shards[other].start_ns is not None:
-                        self.results.pop(other, None)
         return again
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 import resource
+import sys
 import time
 from typing import Any
 
@@ -308,4 +309,5 @@ def peak_bytes() -> int:
         if line.startswith('VmHWM:'):
             return int(line.split()[1]) * 1024
     # without /proc; on Linux this would include the memory of the parent
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    unit = 1 if sys.platform == 'darwin' else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

@@ -14,7 +14,7 @@ directories.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 import logging
@@ -30,7 +30,8 @@ from surfel_mapper.cluster.executors import Executor
 from surfel_mapper.cluster.shards import peak_bytes
 from surfel_mapper.errors import FileFormatError, MapError, MapLimitError
 from surfel_mapper.files.atomic import sync_directory
-from surfel_mapper.files.map_state import FILE, load_map, window_stamps_ns
+from surfel_mapper.files.latest_map import EXACT, map_in, TILES
+from surfel_mapper.files.map_state import load_map, window_stamps_ns
 from surfel_mapper.files.parquet_tiles import (
     dataset_digest,
     kind_of,
@@ -49,11 +50,8 @@ from surfel_mapper.files.trajectory import read_trajectory, trajectory_beside
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import concatenated, Surfels
 
-DATASET = 'map'
+DATASET = TILES
 """Directory of the tiles inside the output directory of a replay."""
-
-FILES = ('map.parquet', 'map.npz')
-"""Files of an exact map inside the output directory of a replay by one process."""
 
 DRAWN = 75_000
 """Limit of the surfels returned for pictures; the view of a report takes 80,000."""
@@ -335,16 +333,14 @@ def parts_of_map(source: str | Path, work: Path) -> list[dict[Tile, Part]]:
         If there is no map, or it cannot be read.
 
     """
-    path = Path(source)
-    for directory in (path / DATASET, path):
-        tiles = tiles_in(directory) if directory.is_dir() else {}
-        if tiles:
-            return [{tile: tile_part(file) for tile, file in tiles.items()}]
-    file = next((path / name for name in FILES if (path / name).is_file()), path)
+    file = map_in(source, EXACT) or Path(source)
+    tiles = tiles_in(file)
+    if tiles:
+        return [{tile: tile_part(path) for tile, path in tiles.items()}]
     if not file.is_file():
         raise FileFormatError(
-            f'{source}: no map; expected {DATASET}/tile_i=*/tile_j=*/, or {" or ".join(FILES)} of '
-            'surfel-mapper replay'
+            f'{source}: no map; expected {DATASET}/tile_i=*/tile_j=*/, or map.parquet or map.npz '
+            'of surfel-mapper replay'
         )
     if file.suffix == '.npz':
         return [write_shard(work / 'piece.parquet', load_map(file)[0])]
@@ -393,7 +389,7 @@ def stamps_of_map(source: Path) -> set[int]:
     if path is not None:
         stamps_ns = read_trajectory(path).stamp_ns
         return set() if stamps_ns is None else set(stamps_ns.tolist())
-    file = source / FILE if source.is_dir() else source
+    file = map_in(source, EXACT) or source
     return set(window_stamps_ns(file)) if file.suffix == '.npz' and file.is_file() else set()
 
 
@@ -401,23 +397,24 @@ def take_name(fresh: Path, wanted: Path) -> None:
     """
     Rename a finished dataset to the name wanted; an earlier dataset of this name is removed.
 
-    If that fails the earlier one has its name again.
+    If that fails, or is interrupted before the name is taken, the earlier one has it again.
     """
     old = wanted.with_name(f'.{wanted.name}-{secrets.token_hex(8)}.old')
     try:
         for directory in (*fresh.iterdir(), fresh):  # those of the files are synced with them
             sync_directory(directory)
-        if wanted.exists():
-            wanted.rename(old)
         try:
+            if wanted.exists():
+                wanted.rename(old)
             fresh.rename(wanted)
         except BaseException:
-            if old.exists():
+            if old.exists() and not wanted.exists():
                 old.rename(wanted)
             raise
-        sync_directory(wanted.parent)
     except OSError as error:
         raise FileFormatError(f'{wanted}: cannot be written: {error.strerror}') from error
+    with suppress(OSError):  # the new dataset has its name
+        sync_directory(wanted.parent)
     shutil.rmtree(old, ignore_errors=True)
 
 

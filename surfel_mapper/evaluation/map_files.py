@@ -19,13 +19,11 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import map_state, parquet, pcd, ply
-from surfel_mapper.files.parquet_tiles import dataset_digest, dataset_in, tiles_in
+from surfel_mapper.files.latest_map import DRAWABLE, map_in, TILES
+from surfel_mapper.files.parquet_tiles import dataset_digest, tiles_in
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 Floats = npt.NDArray[np.float64]
-
-IN_DIRECTORY = ('map.parquet', 'map.npz', 'map.ply', 'map.pcd')
-"""Files of a replay that hold its map, the exact ones first."""
 
 NORMALS = (('nx', 'ny', 'nz'), ('normal_x', 'normal_y', 'normal_z'))
 """Names of the components of normals."""
@@ -60,7 +58,7 @@ class Discs:
 
 def load_discs(path: str | Path, min_points: int) -> Discs:
     """
-    Return the surfels of a map in a file or directory.
+    Return the surfels of a map in a file, or of the map written last in a directory.
 
     Parameters
     ----------
@@ -76,19 +74,13 @@ def load_discs(path: str | Path, min_points: int) -> Discs:
         If there is no map, or it cannot be read.
 
     """
-    found = Path(path)
-    if not found.is_dir():
-        return load_file(found, min_points)
-    tiles = dataset_in(found)
-    if tiles is not None:
-        return load_tiles(tiles, min_points)
-    for name in IN_DIRECTORY:
-        if (found / name).is_file():
-            return load_file(found / name, min_points)
-    raise FileFormatError(
-        f'{path}: no map in this directory; expected map/tile_i=*/tile_j=*/ or one of '
-        f'{", ".join(IN_DIRECTORY)}'
-    )
+    found = map_in(path, DRAWABLE) if Path(path).is_dir() else Path(path)
+    if found is None:
+        raise FileFormatError(
+            f'{path}: no map in this directory; expected map/tile_i=*/tile_j=*/ or one of '
+            f'{", ".join(form for form in DRAWABLE if form != TILES)}'
+        )
+    return load_tiles(found, min_points) if found.is_dir() else load_file(found, min_points)
 
 
 def load_file(path: Path, min_points: int) -> Discs:
@@ -128,7 +120,7 @@ def of_map(surfel_map: SurfelMap, min_points: int) -> Discs:
 
 
 def of_columns(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Discs:
-    """Return the points of a cloud, with normals scaled to unit length."""
+    """Return the points of a cloud, with normals scaled to unit length; none if all are zero."""
     if not {'x', 'y', 'z'} <= set(columns):
         raise FileFormatError(f'{path}: no x, y, z among {", ".join(columns)}')
     names = next((names for names in NORMALS if set(names) <= set(columns)), None)
@@ -137,6 +129,8 @@ def of_columns(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Discs:
         normal = np.stack([columns[name].astype(np.float64) for name in names], axis=1)
         with np.errstate(invalid='ignore'):
             normal /= np.sqrt((normal * normal).sum(axis=1, keepdims=True))
+        if not np.isfinite(normal).all(axis=1).any():  # PCL's PointNormal, never filled
+            normal = None
     position = np.stack([columns[name].astype(np.float64) for name in 'xyz'], axis=1)
     finite = np.isfinite(position).all(axis=1)
     return Discs(position[finite], None if normal is None else normal[finite])

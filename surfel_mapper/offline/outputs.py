@@ -37,7 +37,9 @@ MAP_FORMATS = {
     'npz': 'map.npz',
     BAG: 'normals',
 }
-"""File of each format of the map; npz and parquet are exact, to be loaded again."""
+"""File of each format of the map; npz and parquet are exact, to be loaded again.
+
+In the order of writing: of several maps in a directory the one written last is read."""
 
 
 def known_formats() -> dict[str, str]:
@@ -224,9 +226,9 @@ def write_maps(
     from surfel_mapper.files.trajectory import TRAJECTORY
 
     make_directory(output)
-    for name in formats:
-        if name in MAP_FORMATS:
-            write_map(output / MAP_FORMATS[name], name, mapper, window=window)
+    for name, file in MAP_FORMATS.items():
+        if name in formats:
+            write_map(output / file, name, mapper, window=window)
     trajectory.write(output / TRAJECTORY)
     for old in (*output.glob('apart_*.npz'), *output.glob('apart_*.tum')):
         old.unlink()

@@ -14,9 +14,11 @@ from collections.abc import Iterator
 import logging
 from pathlib import Path
 
+from surfel_mapper.files.latest_map import map_in, RESTORABLE
 from surfel_mapper.files.map_state import FILE, load_map, save_map
-from surfel_mapper.files.parquet_tiles import dataset_in, read_tiles
+from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.layers import Layer
+from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.mapper import Mapper
 
 _log = logging.getLogger(__name__)
@@ -65,7 +67,7 @@ def load_mapper(
     Parameters
     ----------
     path : str or Path
-        As of load_map, or a dataset of tiles, which has no window.
+        As of load_map, or a dataset of tiles, which has no window and no layers.
     mapper : Mapper
         Takes them.
     with_window : bool
@@ -82,14 +84,17 @@ def load_mapper(
 
     """
     size_m = None if any_voxel_size else mapper.config.map.voxel_size_m
-    tiles = dataset_in(path)
-    path = Path(path) / FILE if Path(path).is_dir() else Path(path)
-    if tiles is None or path.is_file():
-        surfel_map, scans = load_map(path, voxel_size_m=size_m)
+    path = Path(path)
+    if path.is_dir():
+        path = map_in(path, RESTORABLE) or path / FILE
+    scans: list[WindowedScan] = []
+    restores = []
+    if path.is_dir():  # tiles: layers beside them are of the file of an earlier run
+        surfel_map = read_tiles(path, voxel_size_m=size_m)
     else:
-        surfel_map, scans = read_tiles(tiles, voxel_size_m=size_m), []
+        surfel_map, scans = load_map(path, voxel_size_m=size_m)
+        restores = [layer.load(file) for file, layer in layer_files(path, mapper) if file.exists()]
     scans = scans if with_window else []
-    restores = [layer.load(file) for file, layer in layer_files(path, mapper) if file.exists()]
     mapper.restore(surfel_map, scans)
     for restore in restores:
         restore()

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files import map_state, parquet, ply
+from surfel_mapper.files.latest_map import DRAWABLE, map_in
 from surfel_mapper.files.obj import read_obj
 from surfel_mapper.files.parquet_tiles import tiles_in
 from surfel_mapper.files.scan_files import read_scan
@@ -40,9 +41,6 @@ ASSETS = ('.glb', '.gltf', '.stl')
 """Files of triangles that rerun reads itself."""
 
 TRAJECTORIES = ('.tum', '.csv', '.txt', '.kitti')
-
-IN_DIRECTORY = ('map.parquet', 'map.npz', 'map.ply', 'map.pcd')
-"""Files of a replay that hold its map, the exact ones first; one of them is shown."""
 
 BESIDE = ('mesh.ply', 'models.obj', 'trajectory.tum')
 """Further files of a replay that are shown."""
@@ -122,8 +120,8 @@ Content = ExactMap | Cloud | ShownMesh | Asset | Way
 def is_shown(path: Path) -> bool:
     """Return whether ``contents`` reads a path; others are bags or folders of scans."""
     if path.is_dir():
-        named = any((path / name).is_file() for name in (*IN_DIRECTORY, *BESIDE))
-        return named or any(tiles_in(place) for place in (path / 'map', path))
+        named = any((path / name).is_file() for name in BESIDE)
+        return named or map_in(path, DRAWABLE) is not None
     return path.suffix in (*EXACT, *ASSETS, *TRAJECTORIES, *CLOUDS, '.obj')
 
 
@@ -187,15 +185,13 @@ def check_asset(path: Path) -> None:
 
 
 def in_directory(path: Path, name: str) -> Iterator[Content]:
-    """Yield the map in a directory and the meshes, models and trajectories beside it."""
+    """Yield the latest map in a directory and the meshes, models and trajectories beside it."""
     prefix = f'{name}/' if name else ''
-    places = [path / each for each in IN_DIRECTORY if (path / each).is_file()][:1]
-    tiled = next((place for place in (path / 'map', path) if tiles_in(place)), None)
-    if tiled is not None:
-        yield tiles(tiled, f'{prefix}surfels')
-    else:
-        for place in places:
-            yield from contents(place, f'{prefix}surfels')
+    found = map_in(path, DRAWABLE)
+    if found is not None and found.is_dir():
+        yield tiles(found, f'{prefix}surfels')
+    elif found is not None:
+        yield from contents(found, f'{prefix}surfels')
     for each in BESIDE:
         if (path / each).is_file():
             yield from contents(path / each, f'{prefix}{Path(each).stem}')

@@ -7,6 +7,8 @@ import errno
 from itertools import pairwise
 import math
 from pathlib import Path
+import resource
+import sys
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from surfel_mapper.cluster.shards import (
     difference,
     LONGEST_S,
     map_shard,
+    peak_bytes,
     shard_length_s,
     SHORTEST_S,
 )
@@ -191,11 +194,33 @@ def test_shards_that_do_not_fit_are_left_out_when_it_is_stopped(tmp_path):
     assert mapped.map.digest == expected.map.digest
 
 
-def test_a_bag_in_which_time_is_set_back_is_left_out_when_it_is_stopped(tmp_path):
+@pytest.mark.parametrize('shards_asked', [6, 7])
+def test_a_bag_in_which_time_is_set_back_is_left_out_when_it_is_stopped(tmp_path, shards_asked):
+    """Its first shard was kept if the stop came before it was mapped again."""
     bag, config = written(tmp_path, 'time set back')
     shards = shards_of(bag, config, 1.0)
+    assert len(shards) == 6
     with pytest.raises(MapError, match='no scan was mapped'):
-        map_bags(shards, SerialExecutor(), tmp_path / 'out', stopped=after(6))
+        map_bags(shards, SerialExecutor(), tmp_path / 'out', stopped=after(shards_asked))
+
+
+def test_a_stop_while_a_whole_bag_is_mapped_again_leaves_nothing_missing(tmp_path):
+    bag, config = written(tmp_path, 'time set back')
+    expected = in_one_go(bag, config)
+    told = []
+
+    mapped = map_bags(
+        shards_of(bag, config, 1.0),
+        SerialExecutor(),
+        tmp_path / 'out',
+        lambda *done: told.append(done),
+        stopped=after(8),  # 6 shards, the end of their round, the whole bag
+    )
+
+    assert not mapped.interrupted
+    assert mapped.map.digest == expected.map.digest()
+    assert counted(mapped.counts()) == counted(expected.summary())
+    assert sum(s for kind, s in told if kind == 'map') == pytest.approx(RECORDED_S, abs=0.01)
 
 
 def test_when_it_is_stopped_at_the_end_nothing_is_missing(tmp_path):
@@ -293,12 +318,19 @@ def test_counts_are_taken_from_each_other_at_every_depth():
     }
 
 
-def test_a_dataset_that_cannot_take_its_name_leaves_the_earlier_one(tmp_path, monkeypatch):
-    """It kept a hidden name."""
+@pytest.fixture
+def datasets(tmp_path):
+    """Return a fresh dataset and an earlier one of the name wanted."""
     fresh, wanted = tmp_path / 'fresh', tmp_path / 'map'
     for directory, content in ((fresh, 'new'), (wanted, 'old')):
         (directory / 'tile_i=0').mkdir(parents=True)
         (directory / 'tile_i=0' / 'a').write_text(content)
+    return fresh, wanted
+
+
+def test_a_dataset_that_cannot_take_its_name_leaves_the_earlier_one(datasets, monkeypatch):
+    """It kept a hidden name."""
+    fresh, wanted = datasets
     rename = Path.rename
 
     def failing(path, target):
@@ -313,4 +345,51 @@ def test_a_dataset_that_cannot_take_its_name_leaves_the_earlier_one(tmp_path, mo
     monkeypatch.undo()
     tiles.take_name(fresh, wanted)
     assert (wanted / 'tile_i=0' / 'a').read_text() == 'new'
-    assert [*tmp_path.iterdir()] == [wanted]
+    assert [*wanted.parent.iterdir()] == [wanted]
+
+
+@pytest.mark.parametrize('renamed', ['map', 'fresh'])
+def test_an_interrupt_after_a_rename_leaves_one_whole_dataset(datasets, monkeypatch, renamed):
+    """After the first rename there was none of that name."""
+    fresh, wanted = datasets
+    rename, sources = Path.rename, []
+
+    def interrupted(path, target):
+        found = rename(path, target)
+        sources.append(path.name)
+        if path.name == renamed and sources.count(renamed) == 1:
+            raise KeyboardInterrupt
+        return found
+
+    monkeypatch.setattr(Path, 'rename', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        tiles.take_name(fresh, wanted)
+    expected = {'map': 'old', 'fresh': 'new'}[renamed]
+    assert (wanted / 'tile_i=0' / 'a').read_text() == expected
+
+
+def test_a_dataset_that_has_its_name_is_no_failure(datasets, monkeypatch):
+    """An error of the last sync was reported, and the earlier dataset kept a hidden name."""
+    fresh, wanted = datasets
+    sync = tiles.sync_directory
+
+    def failing(directory):
+        if directory == wanted.parent:
+            raise OSError(errno.EMFILE, 'too many open files')
+        sync(directory)
+
+    monkeypatch.setattr(tiles, 'sync_directory', failing)
+    tiles.take_name(fresh, wanted)
+    assert (wanted / 'tile_i=0' / 'a').read_text() == 'new'
+    assert [*wanted.parent.iterdir()] == [wanted]
+
+
+@pytest.mark.parametrize(('platform', 'unit'), [('darwin', 1), ('freebsd14', 1024)])
+def test_the_peak_memory_without_proc_is_in_bytes(monkeypatch, platform, unit):
+    """Darwin reports bytes, others KiB; the figure was 1024 times too large there."""
+    monkeypatch.setattr(sys, 'platform', platform)
+    monkeypatch.setattr(Path, 'exists', lambda path: False)
+    monkeypatch.setattr(
+        resource, 'getrusage', lambda who: resource.struct_rusage((0.0, 0.0, 7_000_000, *[0] * 13))
+    )
+    assert peak_bytes() == 7_000_000 * unit
