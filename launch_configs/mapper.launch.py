@@ -149,6 +149,11 @@ def view(values: dict[str, str]) -> str:
     return file.name
 
 
+def logger(values: dict[str, str]) -> str:
+    """Return the name of the node's logger, which has its namespace: robot1.surfel_mapper."""
+    return f'{values["namespace"].strip("/")}/surfel_mapper'.lstrip('/').replace('/', '.')
+
+
 def nodes(context: LaunchContext) -> list[Node]:
     """Return the nodes, once the values of the arguments are known."""
     values = {
@@ -164,7 +169,7 @@ def nodes(context: LaunchContext) -> list[Node]:
             output='screen',
             parameters=[settings_file(values), overrides(values)],
             remappings=[(topic, values[argument]) for argument, topic in TOPICS.items()],
-            ros_arguments=['--log-level', f'surfel_mapper:={values["log_level"]}'],
+            ros_arguments=['--log-level', f'{logger(values)}:={values["log_level"]}'],
             respawn=values['respawn'] == 'true',
             respawn_delay=2.0,
             respawn_max_retries=5,  # a setting that is refused ends the node each time

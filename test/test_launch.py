@@ -19,6 +19,7 @@ import yaml
 
 from surfel_mapper.config import declarations
 from test import settings
+from test.ros.domain import domain_of_our_own
 
 FOLDER = settings.DEFAULT_YAML.parent
 
@@ -84,6 +85,17 @@ def test_the_node_is_started_again_a_few_times_unless_refused(launch):
     )
     assert (node.respawn, node.respawn_delay, node.respawn_max_retries) == (True, 2.0, 5)
     assert not once.respawn
+
+
+@pytest.mark.parametrize('namespace', ['', 'robot1', '/fleet/robot1'])
+def test_the_log_level_is_given_to_the_logger_of_the_node(launch, namespace):
+    rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+    (node,) = launch.nodes(values(launch, namespace=namespace, log_level='debug'))
+    with domain_of_our_own(), rclpy.Context() as context:
+        made = rclpy.create_node(node.name, namespace=namespace, context=context)
+        name = made.get_logger().name
+        made.destroy_node()
+    assert node.ros_arguments == ['--log-level', f'{name}:=debug']
 
 
 def test_a_settings_file_that_does_not_exist_ends_the_launch(launch, tmp_path):

@@ -131,7 +131,8 @@ class Publication:
     is_eager : bool
         Published without subscribers too, so that later ones find a latched message.
     version : callable, optional
-        Returns a value; a topic with a rate is published only if the value has changed.
+        Takes a Moment; returns a value. A topic with a rate is published only if the value has
+        changed.
     prepare : callable, optional
         Does one step of the work for a new subscriber, or for the next messages of a topic with a
         rate; returns True once ``messages`` is fast. Scans are mapped between two steps.
@@ -151,7 +152,7 @@ class Publication:
     is_latched: bool = True
     rate_hz: Callable[[Config], float] | None = None
     is_eager: bool = False
-    version: Callable[[], object] | None = None
+    version: Callable[[Moment], object] | None = None
     prepare: Callable[[], bool] | None = None
     all_messages: Callable[[Moment], Iterable[bytes]] | None = None
     in_background: bool = False

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config, TsdfConfig
 from surfel_mapper.errors import CloudFormatError, PoseError
+from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.channels import quantised
 from surfel_mapper.poses.buffer import TransformBuffer
 from surfel_mapper.scan import Scan
@@ -100,6 +101,7 @@ class SensorModels:
         self.num_refits = 0
         self._cameras: dict[tuple[float, ...], CameraModel] = {}
         self._checked: tuple[Scan | None, LidarModel | None] = (None, None)
+        self._centered: tuple[Scan, Scan, Transform | None] | None = None
 
     @classmethod
     def configured(
@@ -115,9 +117,38 @@ class SensorModels:
             mount(config.tsdf.sensor_frame)
         return cls(config.tsdf, transforms)
 
+    def centered(self, scan: Scan, T_map_scan: Transform) -> tuple[Scan, Transform]:
+        """
+        Return a scan in the frame of its sensor, and the pose of the sensor in the map.
+
+        Parameters
+        ----------
+        scan : Scan
+            In its own frame.
+        T_map_scan : (4, 4) float64
+            The pose of that frame in the map.
+
+        Raises
+        ------
+        PoseError
+            See pose_in.
+
+        """
+        if self._centered is None or self._centered[0] is not scan:
+            T_scan_sensor = self.pose_in(scan)
+            found = scan if T_scan_sensor is None else seen_from(T_scan_sensor, scan)
+            self._centered = scan, found, T_scan_sensor  # all layers get one, checked once
+        _, found, T_scan_sensor = self._centered
+        return found, T_map_scan if T_scan_sensor is None else T_map_scan @ T_scan_sensor
+
     def of(self, scan: Scan) -> CameraModel | LidarModel | None:
         """
         Return the sensor of a scan: its camera, else the lidar of its frame; None if none fits.
+
+        Parameters
+        ----------
+        scan : Scan
+            In the frame of its sensor, see centered.
 
         Raises
         ------
@@ -139,7 +170,7 @@ class SensorModels:
             self._checked = scan, frame.model
         return self._checked[1]
 
-    def pose_in(self, scan: Scan) -> npt.NDArray[np.float64] | None:
+    def pose_in(self, scan: Scan) -> Transform | None:
         """
         Return the pose of the sensor in the frame of a scan, T_scan_sensor; None: its origin.
 
@@ -278,6 +309,27 @@ class SensorModels:
 
     def _share(self, model: LidarModel, scan: Scan) -> float:
         return fit_share(model, scan.points, self._config.voxel_size_m, num_checked=NUM_CHECKED)
+
+
+def seen_from(T_scan_sensor: Transform, scan: Scan) -> Scan:
+    """Return a scan with points and free rays in the frame of its sensor."""
+    R, center = T_scan_sensor[:3, :3], T_scan_sensor[:3, 3]
+    points = ((scan.points - center) @ R).astype(scan.points.dtype)
+    return replace(scan, points=points, free=None if scan.free is None else scan.free @ R)
+
+
+def without_sensor(config: TsdfConfig) -> TsdfConfig:
+    """Return settings that say nothing about the sensor: any is fitted, about its origin."""
+    return replace(
+        config,
+        sensor_rows=0,
+        sensor_columns=0,
+        sensor_fov_deg=(),
+        sensor_beams_deg=(),
+        sensor_azimuth_deg=(),
+        sensor_frame='',
+        sensor_center_m=(),
+    )
 
 
 def range_image(

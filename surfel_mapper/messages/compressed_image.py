@@ -126,10 +126,10 @@ def depth_of(
     data: bytes, encoding: str, packing: str, topic: str, size: tuple[int, int] | None
 ) -> tuple[str, npt.NDArray[Any]]:
     """Return encoding and pixels of a compressedDepth image."""
-    if packing.endswith('rvl') or encoding not in ('16UC1', '32FC1'):
+    if packing.endswith('rvl') or encoding not in ('16UC1', 'mono16', '32FC1'):
         raise CloudFormatError(
-            f'{topic}: format {encoding}; {packing}, expected a png of 16UC1 or 32FC1; set '
-            '.compressedDepth.format of the publisher to png'
+            f'{topic}: format {encoding}; {packing}, expected a png of 16UC1, mono16 or 32FC1; '
+            'set .compressedDepth.format of the publisher to png'
         )
     if len(data) < DEPTH_HEADER.itemsize:
         raise CloudFormatError(f'{topic}: {len(data)} bytes, expected a header and a PNG')
@@ -137,8 +137,8 @@ def depth_of(
     found, steps = pixels_of(data[DEPTH_HEADER.itemsize :], topic, ('PNG',), size)
     if found != '16UC1':
         raise CloudFormatError(f'{topic}: a PNG of {found}, expected one of 16 bits')
-    if encoding == '16UC1':
-        return encoding, steps
+    if encoding != '32FC1':
+        return found, steps
     scale, offset = header['quantum']
     with np.errstate(all='ignore'):
         depth = scale / (steps.astype(np.float32) - offset)

@@ -196,17 +196,21 @@ class Preparation:
 
     def _filtered(self, scan: Scan, pose: Transform, laps: Laps) -> FilteredScan:
         """Return a scan deskewed, joined with images, and filtered; raise FilterError."""
+        if self._needs_free_rays and scan.free is None:  # first: deskewing makes nan of inf
+            scan = replace(scan, free=free_directions(scan, self._deskewed))
         if scan.times is not None:
-            scan = self._poses.deskewing(scan, scan.times)()
+            scan = self._deskewed(scan)
             laps.end('deskew')
-        if self._needs_free_rays and scan.free is None:
-            scan = replace(scan, free=free_directions(scan))
         if self._images is not None:
             scan = self._with_images(scan, self._images)
         if self._needs_free_rays or self._images is not None:
             laps.end('images')
         T_base_sensor = self._poses.of_base(scan) if self.chain.filters else None
         return filtered_scan(scan, pose, self.chain, T_base_sensor)
+
+    def _deskewed(self, scan: Scan) -> Scan:
+        """Return a scan with all points in the sensor frame at its stamp."""
+        return scan if scan.times is None else self._poses.deskewing(scan, scan.times)()
 
     def _count_filtered(self, found: FilteredScan) -> bool:
         """Count what the filters did; return whether points are left."""

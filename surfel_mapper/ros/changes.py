@@ -62,6 +62,7 @@ class ChangeTracker:
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
         self._published: PublishedKeys | None = None
+        self._content = self._present_content
         self._version = mapper.map.version
         self._num_resets = mapper.counters.resets
         self._num_mapped = mapper.counters.mapped
@@ -72,9 +73,15 @@ class ChangeTracker:
         config = self._mapper.config
         return 1 if config.publish.moments else config.map.min_points
 
+    @property
+    def _present_content(self) -> tuple[int, bool]:
+        """Points that a published voxel needs, and whether it comes with its moments."""
+        return self.min_points, self._mapper.config.publish.moments
+
     def reset(self) -> None:
         """Start from the present map; called while there are no subscribers."""
         self._published = None
+        self._content = self._present_content
         self._version = self._mapper.map.version
         self._num_resets = self._mapper.counters.resets
         self._num_mapped = self._mapper.counters.mapped
@@ -82,13 +89,13 @@ class ChangeTracker:
     @contextmanager
     def undone_on_error(self) -> Iterator[None]:
         """In a with-block, take a change back that cannot be published; it comes with the next."""
-        version, published = self._version, self._published
+        version, published, content = self._version, self._published, self._content
         num_changes = 0 if published is None else len(published)
         try:
             yield
         except Exception:  # MemoryError too
             self._num_mapped = BEHIND
-            self._version = version
+            self._version, self._content = version, content
             if published is not None:
                 self._published = published
                 published.cut(num_changes)
@@ -116,9 +123,13 @@ class ChangeTracker:
         return change
 
     def collect(self) -> MapChange:
-        """Return all changes since the last call."""
+        """Return all changes since the last call; all voxels if new settings publish more."""
         surfel_map = self._mapper.map
-        surfels = surfel_map.surfels_changed(self._version, self.min_points)
+        (least, had_moments), self._content = self._content, self._present_content
+        min_points, has_moments = self._content
+        publishes_more = min_points < least or has_moments > had_moments
+        since = 0 if publishes_more else self._version
+        surfels = surfel_map.surfels_changed(since, min_points)
         keys = self._keys()
         before = np.empty(0, np.int64) if self._published is None else self._published.keys()
         self._published = PublishedKeys(keys)

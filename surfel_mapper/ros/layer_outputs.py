@@ -183,7 +183,7 @@ class LayerTopic:
     def post_if_due(self) -> None:
         """Post publishing to the mapping thread if the content changed and is subscribed to."""
         version = self._publication.version
-        newest = version() if version is not None else None
+        newest = version(self._now()) if version is not None else None
         is_new = version is None or self._published != newest
         is_busy = self._pending is not None and not self._pending.done()
         if is_new and not is_busy and (self._publication.is_eager or self._is_read()):

@@ -30,6 +30,7 @@ from rclpy.lifecycle import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 
 from surfel_mapper.budget import stated_limit
 from surfel_mapper.errors import ConfigError, SurfelMapperError
@@ -212,10 +213,17 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
                     destroy(entity)
 
     def _entities(self) -> Iterator[tuple[Any, Callable[[Any], Any]]]:
-        """Yield all timers and endpoints of the node, each with the method that destroys it."""
+        """
+        Yield all timers and endpoints of the node, each with the method that destroys it.
+
+        Without the subscription to /clock: rclpy makes it when use_sim_time is set, never again.
+        """
         for entities, destroy in (
             (self.timers, self.destroy_timer),
-            (self.subscriptions, self.destroy_subscription),
+            (
+                (each for each in self.subscriptions if each.msg_type is not Clock),
+                self.destroy_subscription,
+            ),
             (self.publishers, self.destroy_publisher),
             (self.services, self.destroy_service),
         ):

@@ -12,7 +12,8 @@ With ``map.origin`` the map has a frame whose origin is somewhere else in the fi
 transform states it, and ``~/origin`` too, which needs no tf2_msgs.
 
 With ``pose.source: registration`` the node finds the poses itself. Odometry and its transform go
-out with every scan, ``~/track`` once a second. They are in the fixed frame, which never jumps.
+out with every scan, ``~/track`` once a second. They are in the fixed frame, which never jumps. The
+track begins anew if time is set back, or if the map is cleared or replaced.
 """
 
 from __future__ import annotations
@@ -209,6 +210,7 @@ class RegistrationOutputs:
         self._track = node.create_publisher(Path, '~/track', LATCHED)
         self._poses: deque[PoseStamped] = deque(maxlen=MAX_TRACK)
         self._track_ns = 0
+        self._beginning = self._present_beginning
         self._transform: TransformPublisher | None = None
         node.create_subscription(
             PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, 1
@@ -226,10 +228,19 @@ class RegistrationOutputs:
             self._odometry.publish(self._odometry_message(header, update, T_fixed_body))
         if self._transform is not None:
             self._transform.publish(update.stamp_ns, self._registered.body, T_fixed_body)
+        if self._beginning != self._present_beginning:
+            self._beginning = self._present_beginning
+            self._poses.clear()
+            self._track_ns = 0  # the latched track is replaced at once
         self._poses.append(PoseStamped(header=header, pose=pose_message(T_fixed_body)))
         if abs(update.stamp_ns - self._track_ns) >= TRACK_PERIOD_NS:
             self._track_ns = update.stamp_ns
             self._track.publish(Path(header=header, poses=list(self._poses)))
+
+    @property
+    def _present_beginning(self) -> tuple[int, int]:
+        """Return a value that changes if time is set back or the map is cleared."""
+        return self._mapper.counters.resets, self._mapper.map.cleared_at
 
     def _odometry_message(
         self, header: Header, update: Update, T_fixed_body: Transform

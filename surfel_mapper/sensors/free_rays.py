@@ -6,10 +6,15 @@ Directions of the rays of a lidar that met nothing.
 REP 117 writes inf for a return beyond the range, and such a point has no direction of its own. In
 an organised cloud its neighbours give it: points of a row have one elevation, those of a column
 one azimuth but for an offset of the row. Points that are nan or 0 are unknown.
+
+In a sweep of a moving lidar each direction is turned from the time of its ray to the stamp, as the
+points are. The time is that of a return in the same column: drivers leave out others.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,8 +28,13 @@ MOST_OFF = 0.6
 ROUNDS = 4
 """Rounds of fitting columns to rows and rows to columns; four leave less than 0.1 deg."""
 
+FAR_M = 1e9
+"""Distance of points that are deskewed in place of directions, m: a sweep only turns these."""
 
-def free_directions(scan: Scan) -> npt.NDArray[np.float32] | None:
+
+def free_directions(
+    scan: Scan, deskewed: Callable[[Scan], Scan] | None = None
+) -> npt.NDArray[np.float32] | None:
     """
     Return unit vectors of the points at infinity, (K, 3); None without any.
 
@@ -32,7 +42,10 @@ def free_directions(scan: Scan) -> npt.NDArray[np.float32] | None:
     ----------
     scan : Scan
         With the cloud that it was read from, whose rows or columns are the beams of a lidar;
-        None is returned for other clouds.
+        None is returned for other clouds. Its points are not deskewed yet: that makes nan of inf.
+    deskewed : callable, optional
+        Deskews a scan with times. With it the directions are in the sensor frame at the stamp,
+        without it each is in that at its own time.
 
     """
     rows, columns = int(getattr(scan.msg, 'height', 0)), int(getattr(scan.msg, 'width', 0))
@@ -41,16 +54,31 @@ def free_directions(scan: Scan) -> npt.NDArray[np.float32] | None:
     infinite = np.isinf(scan.points).any(axis=1).reshape(rows, columns)
     if not infinite.any():
         return None
-    points = np.where(np.isfinite(scan.points), scan.points, 0.0).reshape(rows, columns, 3)
+    points: npt.NDArray[Any] = np.where(np.isfinite(scan.points), scan.points, 0.0)
+    points = points.reshape(rows, columns, 3)
+    pixels = np.arange(len(scan)).reshape(rows, columns)
     if rows > columns:  # some drivers have a row for each azimuth
-        return rays_of_beams(points.swapaxes(0, 1), infinite.T)
-    return rays_of_beams(points, infinite)
+        points, infinite, pixels = points.swapaxes(0, 1), infinite.T, pixels.T
+    rays, row, column = rays_of_beams(points, infinite)
+    if not len(rays):
+        return None
+    if deskewed is None or scan.times is None:
+        return rays
+    times = replace(scan.times, offsets=scan.times.offsets[pixels[row, column]])
+    far = replace(scan, points=FAR_M * rays, columns={}, times=times, msg=None)
+    turned = deskewed(far).points
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    return turned.astype(np.float32)
 
 
 def rays_of_beams(
     points: npt.NDArray[Any], infinite: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.float32] | None:
-    """Return the directions of the infinite pixels of (beams, columns, 3)."""
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """
+    Return the directions of the infinite pixels of (beams, columns, 3), (K, 3).
+
+    And for each the row (K,) and column (K,) of a pixel in its column that has a point.
+    """
     level = points[..., 0] + 1j * points[..., 1].astype(np.float64)
     reach = np.abs(level)
     known = reach > 0.0
@@ -63,14 +91,13 @@ def rays_of_beams(
     predicted = offset[:, None] * across
     step = 2.0 * np.pi / points.shape[1]
     off = np.abs(np.angle(heading[known] * predicted[known].conj()))
-    if not len(off) or np.median(off) > MOST_OFF * step:
-        return None
+    are_beams = len(off) > 0 and np.median(off) <= MOST_OFF * step
     beam = slope.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    row, column = np.nonzero(infinite & (predicted != 0.0))
+    row, column = np.nonzero(infinite & (predicted != 0.0) & are_beams)
     found = predicted[row, column]
     rays = np.stack([found.real, found.imag, beam[row]], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return rays.astype(np.float32) if len(rays) else None
+    return rays.astype(np.float32), known.argmax(axis=0)[column], column
 
 
 def unit(numbers: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:

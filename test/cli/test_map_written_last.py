@@ -74,7 +74,7 @@ def test_mapping_continues_from_the_map_written_last(tmp_path, newest):
     assert mapper.map.digest() == expected.digest()
 
 
-def test_of_the_maps_of_one_run_an_exact_one_is_written_last(tmp_path):
+def test_an_exact_map_is_the_last_that_a_run_writes(tmp_path):
     mapper = mapper_with(pose__source='identity')
     (_,) = insert(mapper, scan_at(1.0))
     write_maps(tmp_path, ('npz', 'pcd', 'ply', 'parquet'), mapper, ScanTrajectory(mapper))

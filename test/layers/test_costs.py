@@ -7,9 +7,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.config import GridConfig
+from surfel_mapper.config import Config, GridConfig
 from surfel_mapper.layers.costs.traversability import OBSTACLE, traversability, UNKNOWN
+from surfel_mapper.layers.layer import Moment
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.pipeline import Mapper
 
 H = 0.5
 LIMITS = GridConfig(size_m=8.0, max_slope_deg=30.0, max_step_m=0.25, clearance_m=2.0)
@@ -92,6 +94,22 @@ def test_the_grid_is_about_the_place_asked_for_and_on_the_voxels():
     assert (grid.cost[3:, :11] == 0).all()
     assert (grid.cost[:3] == UNKNOWN).all()
     assert (grid.cost[:, 11:] == UNKNOWN).all()
+
+
+def test_a_grid_is_due_when_the_map_or_the_cell_of_the_sensor_has_changed():
+    mapper = Mapper(Config.from_mapping({'pose.source': 'identity', 'grid.rate_hz': 1.0}))
+    (topic,) = mapper.layers['grid'].publications()
+
+    def version(x, y, z=0.0):
+        pose = np.eye(4)
+        pose[:3, 3] = x, y, z
+        return topic.version(Moment(T_map_sensor=pose))
+
+    first = version(0.01, -0.01)
+    assert version(0.49, -0.49, 9.0) == first
+    assert len({first, version(0.51, -0.01), version(-0.01, -0.01), version(0.01, 0.01)}) == 4
+    mapper.map.add(np.zeros((1, 3)))
+    assert version(0.01, -0.01) != first
 
 
 def test_an_empty_map_is_unknown():

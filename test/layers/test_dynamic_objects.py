@@ -72,8 +72,8 @@ def scan_of(number, has_box=True, missing_wall=None):
     return scan, origin, box
 
 
-def driven(missing_wall=None, **settings):
-    """Return a mapper that has seen the box pass."""
+def driven(missing_wall=None, center_m=(0.0, 0.0, 0.0), **settings):
+    """Return a mapper that has seen the box pass, in clouds with the lidar at a place."""
     mapper = Mapper(
         Config.from_mapping(
             {
@@ -86,11 +86,12 @@ def driven(missing_wall=None, **settings):
             }
         )
     )
+    mapper.add_pose('lidar', 'top', 0, center_m, (0.0, 0.0, 0.0, 1.0), static=True)
     updates = []
     for number in range(SCANS):
         scan, origin, _ = scan_of(number, missing_wall=missing_wall)
-        mapper.add_pose('odom', 'lidar', scan.stamp_ns, origin, (0.0, 0.0, 0.0, 1.0))
-        mapper.add_scan(scan)
+        mapper.add_pose('odom', 'lidar', scan.stamp_ns, origin - center_m, (0.0, 0.0, 0.0, 1.0))
+        mapper.add_scan(replace(scan, points=scan.points + np.float32(center_m)))
         updates += mapper.insert_ready()
     assert len(updates) == SCANS
     return mapper, updates
@@ -126,6 +127,28 @@ def test_voxels_of_a_box_that_moved_are_cleared_and_the_room_stays(with_clearing
     assert mapper.summary()['voxels_cleared']['dynamic'] > 200
     assert not without.counters.voxels_cleared
     assert updates[-1].milliseconds['dynamic'] > 0.0
+
+
+CENTER_M = (1.0, 0.5, 1.5)
+
+
+@pytest.mark.parametrize(
+    'settings',
+    [
+        {'sensor_frame': 'top', 'enabled': True, 'carve': False},
+        {'sensor_center_m': CENTER_M, 'sensor_rows': 64, 'sensor_fov_deg': (-30.0, 30.0)},
+    ],
+    ids=['its frame', 'its place and beams'],
+)
+def test_voxels_are_seen_from_the_place_of_the_sensor_in_the_cloud(
+    settings, with_clearing, caplog
+):
+    settings = {f'layers.tsdf.{name}': value for name, value in settings.items()}
+    mapper, _ = driven(center_m=CENTER_M, **settings, **{'dynamic.clear': True})
+    central, _ = with_clearing
+    assert len(ghosts(mapper)) <= len(ghosts(central)) + 2
+    assert len(walls(mapper)) >= 0.995 * len(walls(central))
+    assert 'fit' not in caplog.text
 
 
 TSDF = {'enabled': True, 'carve': False, 'voxel_size_m': 0.1}

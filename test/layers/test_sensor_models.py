@@ -63,6 +63,19 @@ def test_layers_that_share_a_scan_share_its_check():
     assert sensors.frames['lidar'].due == due
 
 
+def test_layers_that_share_a_scan_about_another_origin_share_its_check():
+    center_m = (1.0, 0.4, 1.8)
+    sensors = SensorModels(config(sensor_center_m=center_m))
+    scan = scan_of(wall_around(FIRST) + np.array(center_m))
+    poses = np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])
+    (first, T_first), (second, T_second) = (sensors.centered(scan, T) for T in poses)
+    assert first is second
+    assert sensors.of(first).rows == 64
+    np.testing.assert_allclose(first.points, wall_around(FIRST), atol=1e-5)
+    assert T_first[:3, 3].tolist() == [1.0, 0.4, 1.8]
+    assert T_second[:3, 3].tolist() == [-1.0, -0.4, 1.8]
+
+
 def test_configured_angles_are_used_and_checked(caplog):
     fov = SensorModels(config(sensor_rows=64, sensor_fov_deg=(-20.0, 20.0)))
     model = fov.of(scan_of(wall_around(FIRST)))

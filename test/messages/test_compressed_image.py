@@ -76,7 +76,10 @@ def test_labels_of_a_jpeg_are_refused():
         scene('label', packed(SMOOTH[..., 0].copy(), 'mono8; jpeg compressed', 'JPEG'))
 
 
-@pytest.mark.parametrize('format_', ['16UC1; compressedDepth png', '16UC1; compressedDepth'])
+@pytest.mark.parametrize(
+    'format_',
+    ['16UC1; compressedDepth png', '16UC1; compressedDepth', 'mono16; compressedDepth png'],
+)
 def test_depth_in_millimetres_is_the_same_packed(format_):
     scan = depth_scan(CameraImage(packed_depth(DEPTH_MM, format_), CAMERA))
     np.testing.assert_array_equal(scan.points, depth_points(DEPTH_MM, CAMERA))

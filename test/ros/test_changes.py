@@ -8,6 +8,7 @@ Imports no ROS: messages are built from the bytes that the node publishes.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from types import SimpleNamespace
 
 import numpy as np
@@ -225,6 +226,49 @@ def test_stamps_of_several_sensors_may_be_out_of_order():
             full = node.full()
     mirror.replace(full)
     assert_equal(mirror, node)
+
+
+@pytest.mark.parametrize('fails_first', [False, True])
+@pytest.mark.parametrize(
+    ('before', 'after'),
+    [
+        ({'publish.moments': False, 'map.min_points': 8}, {'map.min_points': 3}),
+        ({'publish.moments': False, 'map.min_points': 8}, {'publish.moments': True}),
+        ({'publish.moments': False, 'map.min_points': 1}, {'publish.moments': True}),
+    ],
+)
+def test_all_voxels_are_collected_once_settings_publish_more(before, after, fails_first):
+    node = Node(**before)
+    for number in range(3):
+        node.map_scan(number * SECOND)
+    node.mapper.reconfigure(node.mapper.config.replace(after))
+    if fails_first:
+        with suppress(MemoryError), node.changes.undone_on_error():
+            node.changes.collect()
+            raise MemoryError
+
+    change, message = node.collect()
+
+    expected = node.mapper.map.keys(node.changes.min_points)
+    assert set(pack_keys(change.surfels.voxel_index).tolist()) == set(expected.tolist())
+    assert not len(change.removed)
+    assert not len(node.collect()[0].surfels)
+    if node.mapper.config.publish.moments:
+        mirror = MapMirror(0.5)
+        mirror.change(message)
+        assert_equal(mirror, node)
+
+
+def test_voxels_that_no_longer_qualify_are_removed_and_others_not_sent_again():
+    node = Node(**{'publish.moments': False, 'map.min_points': 3})
+    node.map_scan(0)
+    least_3, least_8 = (set(node.mapper.map.keys(number).tolist()) for number in (3, 8))
+    node.mapper.reconfigure(node.mapper.config.replace({'map.min_points': 8}))
+
+    change, _ = node.collect()
+
+    assert not len(change.surfels)
+    assert set(pack_keys(change.removed).tolist()) == least_3 - least_8
 
 
 def test_without_moments_only_surfels_are_published():

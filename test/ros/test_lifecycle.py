@@ -12,9 +12,11 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
+from builtin_interfaces.msg import Time
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from surfel_mapper.errors import ConfigError
@@ -180,6 +182,29 @@ def test_a_wrong_limit_of_inputs_is_refused_before_any_cloud_comes(domain, monke
             monkeypatch.delenv('SURFEL_MAPPER_MAX_BYTES')
             node.start()
             assert node.state == 'active'
+            node.end()
+        node.destroy_node()
+
+
+def test_simulated_time_set_at_runtime_outlasts_a_cleanup(prefork, peer):
+    with context(WAITING):
+        node = create_node()
+
+        def follows_clock(seconds):
+            peer.publish('/clock', Clock(clock=Time(sec=seconds)))
+            now = node.get_clock().now
+            peer.spin_until(lambda: now().nanoseconds == seconds * 10**9, timeout_s=20.0)
+
+        with executing(node):
+            node.trigger_configure()
+            simulated = [Parameter('use_sim_time', value=True)]
+            assert peer.result(peer.parameters().set_parameters(simulated)).results[0].successful
+            peer.advertise('/clock', kinds={'/clock': Clock})
+            follows_clock(1)
+            node.trigger_cleanup()
+            node.trigger_configure()
+            assert node.state == 'inactive'
+            follows_clock(2)
             node.end()
         node.destroy_node()
 

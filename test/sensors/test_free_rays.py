@@ -6,10 +6,12 @@ Rays that met nothing: found by rows and columns, and free up to the range of th
 Points that are nan are unknown: space without rays stays unknown.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from surfel_mapper.config import Config
 from surfel_mapper.pipeline import Mapper
@@ -106,6 +108,48 @@ def test_infinite_points_free_the_space_before_them_and_missing_ones_do_not(noth
     middle = rays.mean(axis=0)
     points = np.outer([4.0, 8.0, 12.0, 16.0], middle / np.linalg.norm(middle))
     assert set(states(mapper.tsdf.blocks, points)) == {state}
+
+
+@pytest.mark.parametrize(
+    ('threads', 'transpose'),
+    [(1, False), (2, False), (1, True)],
+    ids=['one thread', 'two threads', 'a row for each azimuth'],
+)
+def test_rays_without_a_return_are_deskewed_by_the_time_of_their_column(threads, transpose):
+    turning = np.array([0.3, -0.4, 1.5])  # rad/s
+    settings = {
+        'pose.source': 'odometry',
+        'frames.base': 'lidar',
+        'deskew.enabled': True,
+        'map.threads': threads,
+        'map.min_points': 1,
+        'layers.tsdf.enabled': True,
+        'layers.tsdf.voxel_size_m': 0.2,
+        'layers.tsdf.truncation_m': 0.6,
+        'layers.tsdf.max_range_m': 20.0,
+        'layers.tsdf.sensor_rows': 32,
+        'layers.tsdf.sensor_columns': 360,
+    }
+    mapper = Mapper(Config.from_mapping(settings))
+    scan, rays = organised(np.inf, PATCH, transpose=transpose)
+    seconds = np.tile(np.float32(0.1 / 360) * np.arange(360, dtype=np.float32), (32, 1))
+    expected = Rotation.from_rotvec(np.outer(seconds[PATCH], turning)).apply(rays)
+    seconds[PATCH] = 0.0  # undefined without a return
+    for hundredths in range(12):
+        xyz, turn = (0.05 * hundredths, 0.0, 0.0), turning * hundredths / 100
+        q_xyzw = Rotation.from_rotvec(turn).as_quat()
+        mapper.add_pose('odom', 'lidar', S + hundredths * S // 100, xyz, q_xyzw)
+    column = (seconds.T if transpose else seconds).reshape(-1)
+    for shift_ns in (0, 1):
+        mapper.add_scan(replace(scan, stamp_ns=S + shift_ns, columns={'t': column}))
+    updates = list(mapper.insert_ready())
+    assert len(updates) == 2
+    for found in (update.filtered.free for update in updates):
+        off = np.degrees(np.linalg.norm(found - expected, axis=1))
+        assert off.max() < 0.1  # of directions fitted to columns; the sweep turns these by 3 deg
+    middle = expected.mean(axis=0)
+    points = np.outer([4.0, 8.0, 12.0, 16.0], middle / np.linalg.norm(middle))
+    assert set(states(mapper.tsdf.blocks, points)) == {FREE}
 
 
 def test_pixels_of_depth_at_infinity_are_free_up_to_the_range():

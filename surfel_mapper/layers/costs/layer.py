@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from surfel_mapper.layers.costs.traversability import traversability
 from surfel_mapper.layers.layer import Layer, Moment, Publication
 from surfel_mapper.messages.grids import occupancy_grid
@@ -22,17 +24,23 @@ class CostsLayer(Layer):
     name = 'grid'
 
     def publications(self) -> Sequence[Publication]:
-        """Return the grid, computed again when the map has changed."""
+        """Return the grid, computed again when the map or the cell of its centre has changed."""
         return (
             Publication(
                 topic='~/grid',
                 type_name='nav_msgs/msg/OccupancyGrid',
                 messages=self._grid_messages,
                 rate_hz=lambda config: config.grid.rate_hz,
-                version=lambda: self.around.surfel_map.version,
+                version=self._version,
                 is_eager=True,
             ),
         )
+
+    def _version(self, now: Moment) -> tuple[float, ...]:
+        """Return a value for each map and cell of the sensor; a frozen map keeps its version."""
+        surfel_map = self.around.surfel_map
+        cell = np.floor(now.T_map_sensor[:2, 3] / surfel_map.voxel_size_m)
+        return surfel_map.version, *cell.tolist()
 
     def _grid_messages(self, now: Moment) -> list[bytes]:
         config, surfel_map = self.config, self.around.surfel_map

@@ -46,6 +46,7 @@ from surfel_mapper.layers.sensor_models import (
     range_image,
     SensorModels,
     two_beams,
+    without_sensor,
 )
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.window import WindowedScan
@@ -114,7 +115,7 @@ class TsdfLayer(Layer):
         esdf = self.config.esdf
         self._esdf = EuclideanField(self.blocks, max_m=esdf.max_m, radius_m=esdf.radius_m)
         self._position: npt.NDArray[np.float64] = np.zeros(3)
-        self._waiting: dict[int, Scan] = {}
+        self._waiting: dict[tuple[str, int], Scan] = {}
         self._num_scans = self._num_refused = self._num_labels_lost = 0
         self._num_by_points = 0
 
@@ -136,14 +137,15 @@ class TsdfLayer(Layer):
             self._clear_voxels(inserted.cleared)
         if not self.config.tsdf.when_final:
             return [self.insert(inserted.scan, inserted.T_map_sensor)]
-        self._waiting[inserted.scan.stamp_ns] = inserted.scan
-        return [done for eviction in inserted.evictions for done in self._settle(eviction.scan)]
+        self._waiting[inserted.scan.frame_id, inserted.scan.stamp_ns] = inserted.scan
+        return self._settle(eviction.scan for eviction in inserted.evictions)
 
     def finish(self) -> None:
         """Fuse the scans that still wait, at the poses that they have in the window."""
-        for scan in self.around.window:
-            self._settle(scan)
-        self._waiting.clear()
+        try:
+            self._settle(self.around.window)
+        finally:
+            self._waiting.clear()
 
     def insert(self, scan: Scan, T_map_sensor: npt.NDArray[np.float64]) -> Integrated:
         """
@@ -155,9 +157,7 @@ class TsdfLayer(Layer):
             See follow.
 
         """
-        if (T_scan_sensor := self.around.sensors.pose_in(scan)) is not None:
-            scan = centered(scan, T_scan_sensor)
-            T_map_sensor = T_map_sensor @ T_scan_sensor
+        scan, T_map_sensor = self.around.sensors.centered(scan, T_map_sensor)
         sensor = self._sensor(scan)
         self.blocks.clear_updated()
         config = self.config.tsdf
@@ -228,16 +228,7 @@ class TsdfLayer(Layer):
     def warm_up(self) -> None:
         """Compile the kernels, for points of either type."""
         for fusion in ('images', 'points'):
-            tsdf = replace(
-                self.config.tsdf,
-                fusion=fusion,
-                sensor_rows=0,
-                sensor_columns=0,
-                sensor_fov_deg=(),
-                sensor_beams_deg=(),
-                sensor_azimuth_deg=(),
-                sensor_frame='',
-            )
+            tsdf = replace(without_sensor(self.config.tsdf), fusion=fusion)
             config = replace(self.config, tsdf=tsdf)
             for dtype in (np.float32, np.float64):
                 around = replace(self.around, sensors=SensorModels(tsdf))
@@ -272,7 +263,7 @@ class TsdfLayer(Layer):
                 prepare=lambda: self._whole_mesh.prepare(),
                 messages=lambda now: self._whole_mesh.messages(now),
                 in_background=True,
-                version=lambda: (id(self.blocks), self.blocks.version),
+                version=lambda _: (id(self.blocks), self.blocks.version),
                 rate_hz=lambda config: config.tsdf.mesh_rate_hz,
             ),
             Publication(
@@ -282,7 +273,7 @@ class TsdfLayer(Layer):
                 messages=lambda now: self._live_mesh.changed(now),
                 all_messages=self._all_tiles,
                 in_background=True,
-                version=lambda: (id(self.blocks), self.blocks.version),
+                version=lambda _: (id(self.blocks), self.blocks.version),
                 depth=MESHES_KEPT,
                 rate_hz=lambda config: config.tsdf.mesh_rate_hz,
             ),
@@ -298,7 +289,7 @@ class TsdfLayer(Layer):
                 type_name='sensor_msgs/msg/PointCloud2',
                 messages=self._esdf_messages,
                 in_background=True,
-                version=lambda: (id(self.blocks), self.blocks.version),
+                version=lambda _: (id(self.blocks), self.blocks.version),
                 rate_hz=lambda config: config.esdf.rate_hz,
             ),
             Publication(
@@ -381,10 +372,24 @@ class TsdfLayer(Layer):
             return None
         return sensor
 
-    def _settle(self, windowed: WindowedScan) -> list[Integrated]:
-        """Fuse a scan of the window at its final pose, if it waits for that."""
-        scan = self._waiting.pop(windowed.stamp_ns, None)
-        return [] if scan is None else [self.insert(scan, windowed.T_map_sensor)]
+    def _settle(self, scans: Iterable[WindowedScan]) -> list[Integrated]:
+        """
+        Fuse the scans of the window that wait, at their final poses.
+
+        If one cannot be fused, the others are; the first error is raised after them.
+        """
+        results, errors = [], []
+        for windowed in scans:
+            scan = self._waiting.pop((windowed.frame_id, windowed.stamp_ns), None)
+            if scan is None:
+                continue
+            try:
+                results.append(self.insert(scan, windowed.T_map_sensor))
+            except Exception as error:  # MemoryError too
+                errors.append(error)
+        if errors:
+            raise errors[0]
+        return results
 
 
 def cleared(blocks: Blocks, *, config: TsdfConfig, contains: Contains) -> Blocks:
@@ -398,10 +403,3 @@ def cleared(blocks: Blocks, *, config: TsdfConfig, contains: Contains) -> Blocks
         found.append(one.copied(one.rows()))
         blocks = blocks.part(np.delete(np.arange(len(blocks)), first))
     return joined(found)
-
-
-def centered(scan: Scan, T_scan_sensor: npt.NDArray[np.float64]) -> Scan:
-    """Return a scan with points and free rays in the frame of its sensor."""
-    R, center = T_scan_sensor[:3, :3], T_scan_sensor[:3, 3]
-    points = ((scan.points - center) @ R).astype(scan.points.dtype)
-    return replace(scan, points=points, free=None if scan.free is None else scan.free @ R)

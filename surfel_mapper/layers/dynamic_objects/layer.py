@@ -21,7 +21,12 @@ from surfel_mapper.config import Config
 from surfel_mapper.geometry import inverse
 from surfel_mapper.layers.dynamic_objects.kernels.free_space import look_through, SEEN, THROUGH
 from surfel_mapper.layers.layer import InsertedScan, Layer, Surroundings
-from surfel_mapper.layers.sensor_models import range_image, SensorModels, two_beams
+from surfel_mapper.layers.sensor_models import (
+    range_image,
+    SensorModels,
+    two_beams,
+    without_sensor,
+)
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.scan import Scan
 
@@ -51,6 +56,8 @@ class DynamicObjectsLayer(Layer):
         ------
         CloudFormatError
             If the sensor cannot be recognised from the points.
+        PoseError
+            If ``layers.tsdf.sensor_frame`` is not connected with the frame of the scan.
 
         """
         keys = self.around.surfel_map.keys()
@@ -60,7 +67,7 @@ class DynamicObjectsLayer(Layer):
         """Compile the kernels, for points of either type."""
         for dtype in (np.float32, np.float64):
             scan = Scan(points=two_beams(dtype), stamp_ns=0, frame_id='')
-            around = replace(self.around, sensors=SensorModels(self.config.tsdf))
+            around = replace(self.around, sensors=SensorModels(without_sensor(self.config.tsdf)))
             fresh = DynamicObjectsLayer(self.config, around)
             fresh.count(scan, np.eye(4), np.zeros(1, np.int64), np.zeros(1, np.int64))
 
@@ -73,9 +80,9 @@ class DynamicObjectsLayer(Layer):
         Parameters
         ----------
         scan : Scan
-            In the frame of its sensor.
+            In its own frame; ``SensorModels.centered`` finds the sensor in it.
         T_map_sensor : (4, 4) float64
-            Its pose in the map.
+            The pose of that frame in the map.
         keys : (K,) int64
             Packed indices of all voxels of the map.
         hit : (H,) int64
@@ -85,6 +92,8 @@ class DynamicObjectsLayer(Layer):
         ------
         CloudFormatError
             If the sensor cannot be recognised from the points.
+        PoseError
+            If ``layers.tsdf.sensor_frame`` is not connected with the frame of the scan.
 
         """
         verdict = self._verdict(scan, T_map_sensor, keys)
@@ -102,6 +111,7 @@ class DynamicObjectsLayer(Layer):
         self, scan: Scan, T_map_sensor: npt.NDArray[np.float64], keys: Keys
     ) -> npt.NDArray[np.int8]:
         """Return the verdict of a scan on each voxel, (K,) int8: SEEN, THROUGH or unknown."""
+        scan, T_map_sensor = self.around.sensors.centered(scan, T_map_sensor)
         sensor, voxel_size_m = self.around.sensors.of(scan), self.around.surfel_map.voxel_size_m
         if sensor is None:  # no model fits: nothing is known about any voxel
             return np.zeros(len(keys), np.int8)
