@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Progress of long work on stderr, and stopping it with Ctrl-C.
+Progress of long work on stderr, and stopping it with Ctrl-C or SIGTERM.
 
 A bar with rate and time left on a terminal; elsewhere, as in a log, a plain line every 10 s.
 """
@@ -15,6 +15,9 @@ import sys
 import threading
 import time
 from types import FrameType
+from typing import Any
+
+from surfel_mapper.ros.main_thread import RETRY_S, swallows
 
 EVERY_S = 10.0
 """Time between plain lines, s."""
@@ -78,23 +81,55 @@ class Lines:
 @contextmanager
 def stopped_by_interrupt() -> Iterator[Callable[[], bool]]:
     """
-    Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C interrupts.
+    Yield a function that returns whether Ctrl-C or SIGTERM came; a second Ctrl-C interrupts.
 
     Mapping can thus end between two scans and its result be written. Outside of the main thread
     signals cannot be caught, and nothing changes.
     """
-    pressed: list[int] = []
+    noted: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
-        if pressed:
+        if not noted:
+            noted.append(number)
+        elif signal.SIGINT in (number, *noted):  # `timeout` sends SIGTERM twice
             raise KeyboardInterrupt
-        pressed.append(number)
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    before = signal.signal(signal.SIGINT, note)
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: bool(pressed)
+        yield lambda: bool(noted)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def interrupted_by_sigterm() -> Iterator[None]:
+    """
+    Raise KeyboardInterrupt at the first SIGTERM in a block, so that temporary files are removed.
+
+    Later ones are ignored: `timeout` sends it to the process and to its group, and the second must
+    not interrupt the removal. Outside of the main thread nothing changes.
+    """
+    before: dict[int, Any] = {}
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if not swallows(frame):
+            raise KeyboardInterrupt
+        before.setdefault(signal.SIGALRM, signal.signal(signal.SIGALRM, interrupt))
+        signal.setitimer(signal.ITIMER_REAL, RETRY_S)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before[signal.SIGTERM] = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        if signal.SIGALRM in before:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        for number, handler in before.items():
+            signal.signal(number, handler)

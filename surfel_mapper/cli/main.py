@@ -10,13 +10,15 @@ loads no ROS. A verb prints its result on stdout and everything else on stderr. 
 
 Exit code 0: done; 1: refused, with a message; 2: usage; 3: done, but the bag is cut off, with
 --strict; 4: done, but some scans have no certain place on the map, or their surroundings seem to
-move along; 130: interrupted.
+move along; 130: interrupted, by Ctrl-C or SIGTERM alike, as a replay writes its map after both. A
+page of ``view`` and the node end with 0 then.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib import import_module
 import logging
 import os
@@ -25,6 +27,7 @@ from types import ModuleType
 
 import surfel_mapper
 from surfel_mapper.cli._arguments import Parser, UsageError
+from surfel_mapper.cli._progress import interrupted_by_sigterm
 from surfel_mapper.errors import LineFormatter, one_line, SurfelMapperError
 
 VERBS = (
@@ -40,6 +43,9 @@ VERBS = (
     'view',
     'evaluate',
 )
+
+WITH_SIGNALS = ('node', 'view')
+"""Verbs that handle SIGTERM themselves."""
 
 EPILOG = 'surfel-mapper VERB --help shows the options of a verb and an example.'
 
@@ -63,7 +69,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     handler.setFormatter(LineFormatter(f'surfel-mapper {args.verb}: %(message)s'))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
     try:
-        code = int(args.run(args))
+        with nullcontext() if args.verb in WITH_SIGNALS else interrupted_by_sigterm():
+            code = int(args.run(args))
         sys.stdout.flush()
         return code
     except BrokenPipeError:  # the reader closed the pipe, as `head` does

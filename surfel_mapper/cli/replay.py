@@ -3,8 +3,8 @@
 """
 ``surfel-mapper replay``: a bag, or a folder of scans, into a map, its picture and summary.json.
 
-Ctrl-C ends the recording early, and the scans mapped until then are written; pressed again, it
-ends at once. Several bags, --workers and --scheduler make a map in tiles.
+Ctrl-C or SIGTERM ends the recording early, and the scans mapped until then are written; Ctrl-C
+pressed again ends at once. Several bags, --workers and --scheduler make a map in tiles.
 
 Exit code 3: done, but the recording is cut off and --strict was given. 4: done, but registration
 could not place some scans on the map, which became maps of their own, or the surroundings seem to
@@ -233,6 +233,7 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
         output,
         workers=args.workers,
         scheduler=args.scheduler,
+        align=args.align,
         **options,
     )
 

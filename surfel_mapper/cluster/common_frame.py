@@ -4,9 +4,10 @@
 Recordings without poses in one frame: each is registered alone, then placed on the others.
 
 Registration begins every recording at the origin. So each is replayed as a task of its own, with
-its loops closed, into ``registered_N`` of the output directory, and its map is moved onto those of
-the recordings before it (evaluation/frames.py). After that all have poses in the frame of the
-first, and are mapped as recordings with a file of poses: the map is the exact one of these poses.
+its loops closed unless ``align`` is False, into ``registered_N`` of the output directory, and its
+map is moved onto those of the recordings before it (evaluation/frames.py). After that all have
+poses in the frame of the first, and are mapped as recordings with a file of poses: the map is the
+exact one of these poses.
 
 A recording that fits none of the others stays apart, with its own map; one wrong place would spoil
 the map of all.
@@ -140,9 +141,11 @@ class CommonFrame:
         return found if motion is None else {**found, 'motion': motion.summary()}
 
 
-def register(task: tuple[Request, Config, Path]) -> Registered:
+def register(task: tuple[Request, Config, Path, bool | None]) -> Registered:
     """
     Register a recording alone and write its map and poses; runs on a worker.
+
+    The last part of a task is ``ReplayOptions.align``.
 
     Raises
     ------
@@ -152,12 +155,12 @@ def register(task: tuple[Request, Config, Path]) -> Registered:
         If a file cannot be written.
 
     """
-    request, config, directory = task
+    request, config, directory, align = task
     found = replay(
         replace(request, poses_from='registration'),
         output=directory,
         config=config,
-        options=ReplayOptions(formats=('npz',)),
+        options=ReplayOptions(formats=('npz',), align=align),
     )
     stamps_ns, poses = beyond_the_end(found.trajectory.stamps_ns, found.trajectory.of_body)
     write_tum(directory / POSES, stamps_ns, poses)

@@ -57,13 +57,14 @@ def replay_bags(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
+    align: bool | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
     stopped: Callable[[], bool] = never,
 ) -> ShelfResult:
     """
     Map recordings into one map in tiles and write it, with a picture, a report and a summary.
 
-    The same as ``surfel-mapper replay`` with several bags or with ``--workers``; seven parameters
+    The same as ``surfel-mapper replay`` with several bags or with ``--workers``; eight parameters
     because the first three suffice for most calls.
 
     Parameters
@@ -78,6 +79,8 @@ def replay_bags(
         Number of processes on this machine; without, this process does the work.
     scheduler : str, optional
         Address of a Dask scheduler instead.
+    align : bool, optional
+        As ``ReplayOptions.align``, for each recording that is registered; False: no loops.
     progress : callable
         Called with the seconds of recordings that are mapped, and all.
     stopped : callable
@@ -119,7 +122,7 @@ def replay_bags(
         started_s = time.perf_counter()
         jobs, frame = [(each.request, config) for each in found], None
         if is_registered:
-            frame = registered(found, config, output, executor, on_done, stopped)
+            frame = registered(found, config, output, align, executor, on_done, stopped)
             jobs = [(each.request, each.config) for each in frame.placed]
         registered_s = time.perf_counter()
         mapped = mapped_together(jobs, recorded_s, executor, output, on_done, stopped)
@@ -240,6 +243,7 @@ def registered(
     found: Sequence[Surveyed],
     config: Config,
     output: Path,
+    align: bool | None,
     executor: Executor,
     on_done: OnDone,
     stopped: Callable[[], bool],
@@ -249,7 +253,7 @@ def registered(
     from surfel_mapper.cluster.shards import absolute
 
     tasks = [
-        (absolute(each.request), config, output.absolute() / f'registered_{number}')
+        (absolute(each.request), config, output.absolute() / f'registered_{number}', align)
         for number, each in enumerate(found, start=1)
     ]
     done = {}

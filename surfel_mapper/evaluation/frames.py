@@ -272,6 +272,8 @@ def gauss_newton_step(position: Floats, truth: Truth, width_m: float) -> Floats:
     """Return the step (6,), m and rad, that moves positions (K, 3) towards the truth."""
     nearest = truth.nearest(position)
     known = np.isfinite(nearest.place).all(axis=1) & (nearest.distance_m < 3.0 * width_m)
+    if nearest.normal is not None:
+        known &= np.isfinite(nearest.normal).all(axis=1)
     if known.sum() < 6:
         return np.zeros(6)
     place = position[known]
@@ -280,8 +282,6 @@ def gauss_newton_step(position: Floats, truth: Truth, width_m: float) -> Floats:
         axes = np.broadcast_to(np.eye(3), (len(place), 3, 3))
     else:
         axes = nearest.normal[known][:, None]
-        has_normal = np.isfinite(axes).all(axis=(1, 2))
-        place, gap, axes = place[has_normal], gap[has_normal], axes[has_normal]
     off = np.einsum('kai,ki->ka', axes, gap)
     weight = (width_m**2 / ((off**2).sum(axis=1) + width_m**2)) ** 2
     middle = place.mean(axis=0)  # lever arms about the middle keep the system well conditioned

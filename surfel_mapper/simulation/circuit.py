@@ -41,6 +41,9 @@ TURN_RADIUS_M = 7.0
 OVERLAP_WIDTH_M, OVERLAP_LENGTH_M = 2.0 * PAVEMENT_Y_M[1], 1.0
 """Legs so near and so long beside each other would be one street, m."""
 
+MIN_STEP_M = 1e-6
+"""Two arcs that touch share a point; the heading of a shorter step, m, is rounding."""
+
 END_M = 12.0
 """Length of a street beyond its corners, m."""
 
@@ -77,10 +80,12 @@ class Route:
             along = np.linspace(0.0, 1.0, 33)[:, None]
             a, b = corner - TURN_RADIUS_M * before, corner + TURN_RADIUS_M * after
             pieces.append((1 - along) ** 2 * a + 2 * along * (1 - along) * corner + along**2 * b)
-        self._places = np.concatenate([*pieces, places[-1:]])
-        lengths = np.linalg.norm(np.diff(self._places, axis=0), axis=1)
-        self._along = np.concatenate([[0.0], np.cumsum(lengths)])
+        route = np.concatenate([*pieces, places[-1:]])
+        is_apart = np.linalg.norm(np.diff(route, axis=0), axis=1) > MIN_STEP_M
+        self._places = route[np.concatenate([[True], is_apart])]
         slopes = np.diff(self._places, axis=0)
+        lengths = np.linalg.norm(slopes, axis=1)
+        self._along = np.concatenate([[0.0], np.cumsum(lengths)])
         self._heading = np.unwrap(np.arctan2(slopes[:, 1], slopes[:, 0]))
 
     @property

@@ -44,6 +44,8 @@ def started_server(port: int, data_port: int, memory: str) -> Server:
         *('--port', str(data_port), '--web-viewer-port', str(port)),
         *('--server-memory-limit', memory),
     ]
+    for each in (data_port, port):
+        check_free(each)
     server = subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     )
@@ -93,6 +95,21 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def check_free(port: int) -> None:
+    """
+    Raise SurfelMapperError if a program listens at a port.
+
+    ``wait_for`` would take it for the server.
+    """
+    with socket.socket() as probe:
+        # as servers do: connections that have just ended do not keep the port
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError as error:
+            raise not_listening(port, f'cannot listen ({error.strerror})') from error
+
+
 def wait_for(port: int, server: Server) -> None:
     """Wait until a server listens at a port; raise SurfelMapperError if it does not."""
     end = time.monotonic() + START_S
@@ -102,4 +119,11 @@ def wait_for(port: int, server: Server) -> None:
                 return
         time.sleep(0.05)
     state = 'ended' if server.poll() is not None else f'did not listen within {START_S:g} s'
-    raise SurfelMapperError(f'the server of rerun at {LOOPBACK}:{port} {state}; is the port free?')
+    raise not_listening(port, state)
+
+
+def not_listening(port: int, state: str) -> SurfelMapperError:
+    """Return the error of a server that does not listen at a port."""
+    return SurfelMapperError(
+        f'the server of rerun at {LOOPBACK}:{port} {state}; is the port free?'
+    )

@@ -77,10 +77,18 @@ def test_points_without_normals_are_a_truth_too(street, capsys, tmp_path):
     bag, output = street
     scan = load_simulation(bag).scan(0)
     points = scan.points[np.isfinite(scan.points).all(axis=1)]
-    write_points(tmp_path / 'truth.ply', dict(zip('xyz', points.T, strict=True)))
-    result = evaluated(capsys, output, '--truth', tmp_path / 'truth.ply', '--max-distance', '50')
+    columns = dict(zip('xyz', points.T, strict=True))
+    unfilled = dict.fromkeys(('nx', 'ny', 'nz'), np.zeros(len(points), np.float32))  # as PCL does
+    write_points(tmp_path / 'truth.ply', columns)
+    write_points(tmp_path / 'unfilled.ply', columns | unfilled)
+    result, same = (
+        evaluated(capsys, output, '--truth', tmp_path / name, '--max-distance', '50')
+        for name in ('truth.ply', 'unfilled.ply')
+    )
     assert 'normal_deg' not in result
     assert result['position_m']['mean'] > 0.0
+    assert same['position_m'] == result['position_m']
+    assert 'normal_deg' not in same
 
 
 def test_a_map_in_another_frame_is_moved_onto_its_truth_if_asked(street, capsys, tmp_path, caplog):

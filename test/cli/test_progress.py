@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.cli import _progress as progress_module
-from surfel_mapper.cli._progress import progress, stopped_by_interrupt
+from surfel_mapper.cli._progress import interrupted_by_sigterm, progress, stopped_by_interrupt
 from surfel_mapper.cli.main import main
 from surfel_mapper.files.parquet import read_map
 from surfel_mapper.viz import picture
@@ -67,6 +67,57 @@ def test_the_first_interrupt_is_reported_and_the_second_interrupts():
             signal.raise_signal(signal.SIGINT)
 
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_sigterm_sent_twice_ends_early_and_ctrl_c_then_interrupts():
+    before = signal.getsignal(signal.SIGTERM)
+    with stopped_by_interrupt() as stopped:
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        assert stopped()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_the_second_sigterm_does_not_interrupt_the_removal_of_files():
+    before, removed = signal.getsignal(signal.SIGTERM), []
+
+    @interrupted_by_sigterm()
+    def work():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            signal.raise_signal(signal.SIGTERM)
+            removed.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+
+    assert removed
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+class Finalized:
+    """SIGTERM arrives in its finalizer, where Python would swallow an exception."""
+
+    def __del__(self):
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_sigterm_in_a_finalizer_interrupts_after_it():
+    before = signal.getsignal(signal.SIGALRM)
+
+    @interrupted_by_sigterm()
+    def work():
+        Finalized()
+        time.sleep(WAIT_S)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+
+    assert signal.getsignal(signal.SIGALRM) is before
 
 
 @pytest.mark.drawn
@@ -126,6 +177,41 @@ def command(long_bag, tmp_path):
     options = ['--config', str(settings), '--formats', 'parquet,bag', '--json']
     program = [sys.executable, '-c', WITH_MANY_LINES, 'replay', str(long_bag)]
     return [*program, *options, '--output', str(tmp_path / 'out')]
+
+
+def test_sigterm_ends_a_replay_early_and_the_map_is_written(command, tmp_path):
+    pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE}
+    with subprocess.Popen(command, **pipes) as process:
+        assert any(map(is_underway, process.stderr))
+        process.send_signal(signal.SIGTERM)
+        printed, said = process.communicate(timeout=WAIT_S)
+
+    assert process.returncode == 130, said
+    summary = json.loads(printed)
+    assert summary['interrupted']
+    assert 0 < summary['scans']['mapped'] < MANY
+    assert read_map(tmp_path / 'out' / 'map.parquet').digest() == summary['digest']
+
+
+@pytest.mark.parametrize('with_timeout', [False, True])
+def test_sigterm_of_another_verb_leaves_no_hidden_directory(tmp_path, with_timeout):
+    program = [sys.executable, '-m', 'surfel_mapper.cli.main', 'simulate', 'street']
+    options = ['--scans', '1000000', '--speed', '0', '--columns', '64']
+    command = [*program, *options, '--output', str(tmp_path / 'street')]
+    if with_timeout:
+        command = ['timeout', '--preserve-status', str(WAIT_S), *command]
+    with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
+        until_s = time.monotonic() + WAIT_S
+        while not list(tmp_path.rglob('*.mcap')) and time.monotonic() < until_s:
+            time.sleep(0.01)
+        (hidden,) = tmp_path.iterdir()
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=WAIT_S)
+
+    assert process.returncode == 130
+    assert said.endswith(b'surfel-mapper simulate: interrupted\n')
+    assert hidden.name.startswith('.')
+    assert list(tmp_path.iterdir()) == []
 
 
 def is_underway(shown):

@@ -110,6 +110,17 @@ def test_the_map_is_that_of_the_recordings_at_these_poses(placed, tmp_path):
     assert placed.summary['digest'] == expected.digest()
 
 
+def test_recordings_are_registered_without_loops_if_asked(placed, tmp_path):
+    bags = [str(placed.folder / name) for name in 'ab']
+
+    assert main(['replay', *bags, '--no-align', '--output', str(tmp_path)]) == 0
+
+    for output, has_loops in ((placed.output, True), (tmp_path, False)):
+        for number in (1, 2):
+            summary = json.loads((output / f'registered_{number}' / 'summary.json').read_text())
+            assert ('loops' in summary) == has_loops
+
+
 @pytest.mark.skipif(find_spec('kiss_matcher') is None, reason='kiss-matcher is not installed')
 def test_a_recording_that_begins_with_another_heading_is_placed(tmp_path, world):
     recorded(tmp_path / 'a', world, 0)

@@ -8,7 +8,13 @@ import pytest
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.evaluation import frames
 from surfel_mapper.evaluation.comparison import CloudTruth
-from surfel_mapper.evaluation.frames import find_motion, looks_needed, mean_motion, moved_discs
+from surfel_mapper.evaluation.frames import (
+    find_motion,
+    gauss_newton_step,
+    looks_needed,
+    mean_motion,
+    moved_discs,
+)
 from surfel_mapper.evaluation.map_files import Discs
 from surfel_mapper.evaluation.truth import WorldTruth
 from surfel_mapper.geometry import compose, inverse, pose_matrix, rotation_angle, se3_exp
@@ -68,6 +74,18 @@ def test_any_motion_is_found_by_features():
     way_m, turn_deg = off(found.T_truth_map, motion)
     assert way_m < 1e-3
     assert turn_deg < 0.01
+
+
+@pytest.mark.parametrize('known', [0, 5])
+def test_a_truth_with_too_few_normals_moves_no_map(known):
+    truth = faces()
+    normal = np.full_like(truth.normal, np.nan)
+    normal[:known] = truth.normal[:known]
+    position = truth.position + np.array([0.0, 0.0, 1e-4])  # next to its own point
+
+    step = gauss_newton_step(position, CloudTruth(Discs(truth.position, normal)), WIDTH_M)
+
+    np.testing.assert_array_equal(step, np.zeros(6))
 
 
 def test_a_known_start_comes_first():

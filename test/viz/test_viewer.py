@@ -15,11 +15,12 @@ import pytest
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.config import Config
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, SurfelMapperError
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.viz import scene
+from surfel_mapper.viz.server import LIVE, started_server
 from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
 from test.bags.recorded import drive, write_rosbag2
 from test.layers.test_distance_field import insert, mapper_with
@@ -96,6 +97,15 @@ echo $$ > '{pid}'
 exec '{rerun}' --serve-grpc "$@"
 """
 """A rerun without a window: this machine may have no display."""
+
+
+@pytest.mark.parametrize('taken', [0, 1])
+@pytest.mark.parametrize('address', ['127.0.0.1', '0.0.0.0'])
+def test_a_port_on_which_another_program_listens_is_refused(address, taken):
+    with socket.create_server((address, 0)) as other:
+        port = other.getsockname()[1] - taken
+        with pytest.raises(SurfelMapperError, match=f':{port + taken} .* is the port free'):
+            started_server(port, port + 1, LIVE)
 
 
 @pytest.mark.skipif(not Path('/proc/net/tcp').exists(), reason='sockets are not shown')
