@@ -19,7 +19,7 @@ from surfel_mapper.errors import one_line
 CUT, APART, INTERRUPTED = 3, 4, 130
 """
 Exit codes: a recording ends too early and --strict was given; scans were mapped apart from the
-map; Ctrl-C ended the work.
+map; Ctrl-C or SIGTERM ended the work.
 """
 
 
