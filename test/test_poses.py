@@ -482,6 +482,10 @@ def test_the_newest_stamp_between_frames_is_that_of_the_edge_that_ends_first():
     assert buffer.newest_between('lidar', 'wheel') == 5 * S
     assert buffer.newest_between('base', 'lidar') is None
     assert buffer.newest_between('map', 'map') is None
+    assert buffer.newest_beside('map', 'lidar') == 5 * S  # that of the wheel
+    buffer.add('map', 'odom', 6 * S, np.eye(4))
+    assert buffer.newest_beside('map', 'lidar') == 2 * S
+    assert buffer.newest_beside('base', 'wheel') == 6 * S
 
 
 # Gaps

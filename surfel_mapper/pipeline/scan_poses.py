@@ -151,10 +151,9 @@ class ScanPoses:
                 self._at(scan.frame_id, last_ns)
         return pose
 
-    def newest_of(self, frame_id: str) -> int | None:
-        """Return the newest stamp at which the pose of a sensor is known; of any if unknown."""
-        found = self.transforms.newest_between(self._config.frames.fixed, frame_id)
-        return self.transforms.newest_ns if found is None else found
+    def newest_for(self, frame_id: str) -> int | None:
+        """Return the newest stamp of transforms, for the wait for the pose of a sensor."""
+        return self.transforms.newest_beside(self._config.frames.fixed, frame_id)
 
     def deskewing(self, scan: Scan, times: PointTimes) -> Callable[[], Scan]:
         """Look up the poses within a sweep; return the function that deskews the scan."""

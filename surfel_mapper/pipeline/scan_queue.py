@@ -128,7 +128,7 @@ class ScanQueue:
         """Remove the next scan whose pose is there; drop those before it that get none."""
         while self._scans:
             scan = self._scans[0]
-            stamps = (self.newest_ns, self._poses.newest_of(scan.frame_id))
+            stamps = (self.newest_ns, self._poses.newest_for(scan.frame_id))
             newest_ns = max(stamp for stamp in stamps if stamp is not None)
             waited_s = (newest_ns - scan.end_ns) / 1e9
             images = self._images if waited_s <= config.max_wait_s else None

@@ -117,11 +117,25 @@ class TransformBuffer:
         """
         Return the newest stamp at which the transform between two frames is known.
 
-        None if they are the same, or static edges alone lie between them. Transforms of other
-        frames, and those that are stamped ahead as of a localisation, do not count.
+        None if they are the same, or static edges alone lie between them.
         """
+        return min((edge.stamps[-1] for edge in self._dynamic(target, source)), default=None)
+
+    def newest_beside(self, target: str, source: str) -> int | None:
+        """
+        Return the newest stamp, which tells how long a transform between two frames is awaited.
+
+        That of any edge; but an edge between the two may be stamped ahead, as by a localisation,
+        and counts only as far as they all reach.
+        """
+        if self._newest in self._dynamic(target, source):
+            return self.newest_between(target, source)
+        return self.newest_ns
+
+    def _dynamic(self, target: str, source: str) -> list[PoseTrack]:
+        """Return the dynamic edges between two frames."""
         between = {*self._edges_above(source)} ^ {*self._edges_above(target)}
-        return min((edge.stamps[-1] for edge in between if not edge.is_static), default=None)
+        return [edge for edge in between if not edge.is_static]
 
     def add(
         self,
@@ -242,8 +256,7 @@ class TransformBuffer:
 
     def stamps(self, target: str, source: str, start_ns: int, end_ns: int) -> list[int]:
         """Return the stamps of transforms between two frames in a span, ends included."""
-        above = {*self._edges_above(source)} ^ {*self._edges_above(target)}
-        held = (edge.stamps for edge in above if not edge.is_static)
+        held = (edge.stamps for edge in self._dynamic(target, source))
         return sorted({s for stamps in held for s in _within(stamps, start_ns, end_ns)})
 
     def held(self, since_ns: int | None = None) -> list[tuple[str, str, list[int], bytes]]:
