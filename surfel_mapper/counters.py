@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Counters of a pipeline: scans used and dropped, points left out, milliseconds by stage.
+Counters of a pipeline: scans used and dropped, points left out, milliseconds by stage; their text.
 
 Every dropped scan is counted under a cause, so that the numbers of the summary and of the
 diagnostics add up: scans received = mapped + gated + localised + dropped + waiting.
@@ -225,3 +225,8 @@ class _Timed(AbstractContextManager[None]):
 
     def __exit__(self, *_: object) -> None:
         self._counters.add_times({self._stage: (time.perf_counter() - self._start) * 1e3})
+
+
+def decimals(value: float | None, factor: float = 1.0) -> str:
+    """Return a number with three decimals, or a dash for None."""
+    return '-' if value is None else f'{value * factor:.3f}'

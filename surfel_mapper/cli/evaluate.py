@@ -164,14 +164,14 @@ def map_lines(result: dict[str, Any]) -> list[str]:
     return lines
 
 
-def decimals(value: float | None, unit: str, factor: float = 1.0) -> str:
+def with_unit(value: float | None, unit: str, factor: float = 1.0) -> str:
     """Return a number with its unit, or a dash for None."""
     return '-' if value is None else f'{value * factor:.3f} {unit}'
 
 
 def in_words(errors: dict[str, float | None], unit: str, factor: float = 1.0) -> str:
     """Return errors as one line of text."""
-    return '   '.join(f'{name} {decimals(value, unit, factor)}' for name, value in errors.items())
+    return '   '.join(f'{name} {with_unit(value, unit, factor)}' for name, value in errors.items())
 
 
 def trajectories(args: argparse.Namespace) -> dict[str, Any]:
@@ -201,5 +201,5 @@ def trajectory_lines(result: dict[str, Any]) -> list[str]:
         lines.append(f'{kind} {in_words(moved, "mm", 1e3)}')
         lines.append(f'{" " * len(kind)} {in_words(turned, "deg")}')
     drift_m, drift_deg = result['drift_m_per_100m'], result['drift_deg_per_100m']
-    lines.append(f'drift {decimals(drift_m, "m")}, {decimals(drift_deg, "deg")} in 100 m')
+    lines.append(f'drift {with_unit(drift_m, "m")}, {with_unit(drift_deg, "deg")} in 100 m')
     return lines

@@ -7,6 +7,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from surfel_mapper.counters import decimals
+
 MOST_SURROUNDED = 5
 """Scans that may seem to be surrounded by what moves along, before a replay says so."""
 
@@ -127,11 +129,6 @@ def errors_text(errors: Mapping[str, Any]) -> str:
         f'from scan to scan {relative}   '
         f'drift {decimals(drift_m)} m, {decimals(drift_deg)} deg in 100 m'
     )
-
-
-def decimals(value: float | None, factor: float = 1.0) -> str:
-    """Return a number with three decimals, or a dash for None."""
-    return '-' if value is None else f'{value * factor:.3f}'
 
 
 def causes_text(counts: Mapping[str, int]) -> str:

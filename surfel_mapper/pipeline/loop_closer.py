@@ -210,7 +210,7 @@ class LoopCloser:
         return self.move(search.close(progress), config)
 
     def move(self, closure: LoopClosure, config: Config) -> LoopMove:
-        """Move all scans to the poses of a closure; after any error they are where they were."""
+        """Move all scans to the poses of a closure; an error leaves all at their poses before."""
         before = self.T_map_sensor
         extents = [
             extent(compose(inverse(old), new))

@@ -343,7 +343,7 @@ class TransformBuffer:
     def _edges_between(
         self, target: str, source: str, stamp_ns: int
     ) -> tuple[list[PoseTrack], list[PoseTrack]]:
-        """Return the edges from source and from target up to the frame where they meet."""
+        """Return the edges from source and from target up to their common frame."""
         up, down = list(self._edges_above(source)), list(self._edges_above(target))
         # Both lists end at the root; edges that they share at the end cancel.
         while up and down and up[-1] is down[-1]:

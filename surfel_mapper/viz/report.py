@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from surfel_mapper.config import Config
-from surfel_mapper.counters import STAGES
+from surfel_mapper.counters import decimals, STAGES
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
@@ -258,11 +258,6 @@ def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
         f'<h2>Errors of the poses</h2><table><tr><th></th>{head}</tr>{rows}</table>'
         f'<p>{as_html(drift)}</p>'
     )
-
-
-def decimals(value: float | None, factor: float = 1.0) -> str:
-    """Return a number with three decimals, or a dash for None."""
-    return '-' if value is None else f'{value * factor:.3f}'
 
 
 def times_table(summary: Mapping[str, Any]) -> str:
