@@ -114,13 +114,16 @@ def share(work: Callable[[slice], object], num_rows: int, threads: int) -> None:
         helper.result()
 
 
-def ahead(items: Iterator[T]) -> Iterator[T]:
+def ahead(items: Iterator[T], threads: int) -> Iterator[T]:
     """
-    Yield items, of which another thread makes the next one while one is used.
+    Yield items; of two threads or more, another one makes the next item while one is used.
 
     Errors are raised in their turn. Close it before what the items are made of is closed: that
     waits for the item that has been begun.
     """
+    if threads < 2:
+        yield from items
+        return
     end: Any = object()
     with ThreadPoolExecutor(1, thread_name_prefix='surfel_mapper_ahead') as thread:
         begun = thread.submit(next, items, end)

@@ -65,7 +65,7 @@ def test_the_next_item_is_made_while_one_is_used():
             yield number
 
     used = []
-    for number in ahead(items()):
+    for number in ahead(items(), 2):
         used.append(number)
         assert made[min(number + 1, 3)].wait(10.0)
     assert used == [0, 1, 2, 3]
@@ -73,12 +73,13 @@ def test_the_next_item_is_made_while_one_is_used():
     assert threading.get_ident() not in makers
 
 
-def test_an_error_in_making_an_item_is_raised_after_those_before_it():
+@pytest.mark.parametrize('threads', [1, 2])
+def test_an_error_in_making_an_item_is_raised_after_those_before_it(threads):
     def items():
         yield 1
         raise OSError('the second')
 
-    used = ahead(items())
+    used = ahead(items(), threads)
     assert next(used) == 1
     with pytest.raises(OSError, match='the second'):
         next(used)
@@ -93,7 +94,7 @@ def test_closing_waits_for_the_item_that_has_been_begun():
         ended.set()
         yield 2
 
-    used = ahead(items())
+    used = ahead(items(), 2)
     assert next(used) == 1
     threading.Timer(0.05, may_end.set).start()
     used.close()

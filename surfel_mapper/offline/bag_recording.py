@@ -293,10 +293,7 @@ def messages(
 
 def read_ahead(found: Iterator[BagMessage], threads: int) -> Iterator[BagMessage]:
     """Yield messages; with several threads another one reads the next megabyte meanwhile."""
-    if threads < 2:
-        yield from found
-        return
-    with closing(ahead(batches(found))) as read:
+    with closing(ahead(batches(found), threads)) as read:
         for batch in read:
             yield from batch
 

@@ -7,13 +7,15 @@ With a file of poses, the scans are in frames.base, whose poses it gives; if
 frames.base_to_sensor is set, they are in a frame called sensor on it. Without poses they are
 registered. The time of a scan is that in the name of its file; else scans follow each other at
 10 Hz. With poses of other times, the time of scan i is that of pose i, if there are as many poses
-as scans. Folders of data sets have their own layout, times and poses (datasets.py), a capture of
-an Ouster lidar has all scans in one file (ouster_pcap.py).
+as scans; poses without times may be fewer, if each scan of the part has one. Folders of data sets
+have their own layout, times and poses (datasets.py), a capture of an Ouster lidar has all scans in
+one file (ouster_pcap.py).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -29,6 +31,7 @@ from surfel_mapper.offline.pose_choice import choose_for_folder, is_default, pos
 from surfel_mapper.offline.pose_sources import PosePath
 from surfel_mapper.offline.request import part, Request, Span
 from surfel_mapper.scan import Scan
+from surfel_mapper.threads import ahead
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
@@ -99,11 +102,19 @@ class ScanFolder:
             duration_s=request.duration_s,
             every=request.every,
         )
+        if poses is not None and self.num_scans:
+            poses.check_scan(self._numbers[-1])
 
     @property
     def num_scans(self) -> int:
         """Number of scans in the part that is mapped."""
-        return -(-sum(map(self.span.holds, self.stamps)) // self.span.every)
+        return len(self._numbers)
+
+    @property
+    def _numbers(self) -> list[int]:
+        """Numbers of the scans in the part that is mapped."""
+        held = [n for n, stamp_ns in enumerate(self.stamps) if self.span.holds(stamp_ns)]
+        return held[:: self.span.every]
 
     @property
     def recorded_s(self) -> float:
@@ -136,30 +147,36 @@ class ScanFolder:
     ) -> Iterator[Update]:
         """Feed the scans to a mapper; yield the update of each."""
         frames = mapper.config.frames
-        frame = SENSOR if frames.base_to_sensor else frames.base
-        held = [n for n, stamp_ns in enumerate(self.stamps) if self.span.holds(stamp_ns)]
-        for number in held[:: self.span.every]:
-            if stopped():
-                break
-            self._add(mapper, number, frame)
-            yield from mapper.insert_ready(more_follows=True)
+        scans = self._scans(SENSOR if frames.base_to_sensor else frames.base)
+        with closing(ahead(scans, mapper.config.map.threads)) as found:
+            while not stopped():
+                with mapper.counters.timed('decode'):
+                    number, scan = next(found, (0, None))
+                if scan is None:
+                    break
+                self._add(mapper, number, scan)
+                yield from mapper.insert_ready(more_follows=True)
         mapper.end_scans()
         yield from mapper.insert_ready()
         mapper.finish()
 
-    def _add(self, mapper: Mapper, number: int, frame: str) -> None:
-        """Read one scan and queue it; a bad one is counted."""
-        stamp_ns = self.stamps[number]
-        try:
-            with mapper.counters.timed('decode'):
-                scan = self._read(number, stamp_ns, frame)
-        except ConfigError:  # a wrong limit concerns all scans
-            raise
-        except (FileFormatError, ValueError) as error:
-            mapper.refuse_clouds('bad_cloud', str(self.path), str(error))
+    def _scans(self, frame: str) -> Iterator[tuple[int, Scan | Exception]]:
+        """Yield number and scan, or why it cannot be read, of the part that is mapped."""
+        for number in self._numbers:
+            try:
+                yield number, self._read(number, self.stamps[number], frame)
+            except ConfigError:  # a wrong limit concerns all scans
+                raise
+            except (FileFormatError, ValueError) as error:
+                yield number, error
+
+    def _add(self, mapper: Mapper, number: int, scan: Scan | Exception) -> None:
+        """Queue a scan; a bad one is counted."""
+        if isinstance(scan, Exception):
+            mapper.refuse_clouds('bad_cloud', str(self.path), str(scan))
             return
         if self.poses is not None:
-            self.poses.add_for(mapper, stamp_ns, number)
+            self.poses.add_for(mapper, scan.stamp_ns, number)
         mapper.add_scan(scan)
 
     def _read(self, number: int, stamp_ns: int, frame: str) -> Scan:
@@ -180,13 +197,13 @@ class ScanFolder:
         stamps = self.poses.trajectory.stamp_ns
         if stamps is not None and 2 * len(set(own).intersection(stamps.tolist())) > len(stamps):
             return own  # poses of these scans by registration, without those that it dropped
-        if len(self.poses.trajectory) == number:
-            return [PERIOD_NS * at for at in range(number)] if stamps is None else stamps.tolist()
-        if stamps is None:
+        if stamps is None and len(self.poses.trajectory) > number:
             raise BagError(
                 f'{self.poses.path}: {len(self.poses.trajectory)} poses without times for '
                 f'{number} scans in {self.path}, expected one for each'
             )
+        if stamps is None or len(stamps) == number:
+            return [PERIOD_NS * at for at in range(number)] if stamps is None else stamps.tolist()
         try:
             times = [name_ns(file) for file in self.files]
         except FileFormatError as error:

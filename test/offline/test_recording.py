@@ -328,6 +328,22 @@ def test_a_part_of_a_folder_is_mapped(tmp_path):
     assert mapper.map.digest() == digest_of([1, 3])
 
 
+@pytest.mark.parametrize(
+    ('span', 'number', 'numbers'),
+    [
+        ({'every': 2}, 5, [0, 2, 4]),
+        ({'duration_s': 0.25}, 3, [0, 1, 2]),
+        ({'start_s': 0.1, 'every': 3}, 5, [1, 4]),
+    ],
+)
+def test_poses_that_no_file_of_the_part_needs_may_be_missing(tmp_path, span, number, numbers):
+    folder, file = scan_folder(tmp_path, '.bin'), pose_file(tmp_path, 'kitti', range(number))
+
+    mapper = mapped(folder, MOUNTED, poses=file, **span)
+
+    assert mapper.map.digest() == digest_of(numbers)
+
+
 @pytest.mark.parametrize('unit_ns', [1, 1000])
 def test_scans_are_timed_by_their_names_where_there_are_more_poses(tmp_path, unit_ns):
     folder = scan_folder(tmp_path, '.ply', (STAMPS // unit_ns).tolist())
@@ -362,7 +378,10 @@ def test_a_scan_that_does_not_read_is_counted(tmp_path):
     ('number', 'format_', 'request_', 'says'),
     [
         (6, None, {'poses_from': 'tf'}, 'no messages with poses'),
-        (5, 'kitti', {}, '5 poses without times for 6 scans'),
+        (7, 'kitti', {}, '7 poses without times for 6 scans'),
+        (5, 'kitti', {}, 'kitti: 5 poses, none for scan 6; expected one for every scan'),
+        (5, 'kitti', {'start_s': 0.15}, 'kitti: 5 poses, none for scan 6'),
+        (4, 'kitti', {'every': 2}, 'kitti: 4 poses, none for scan 5'),
         (5, 'tum', {}, '5 poses for 6 scans, expected as many, or names that are times'),
         (6, 'tum', {'topics': ('/points',)}, 'files of scans have no topic /points'),
     ],
