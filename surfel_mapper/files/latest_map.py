@@ -4,8 +4,8 @@
 The map of an output directory: the one that was written last.
 
 A run replaces the files that it writes and leaves others of an earlier run, so tiles and files of
-one directory may be of different maps. It stands alone so that all verbs and map.load read the
-same map, each among the forms that it can read.
+one directory may be of different maps. It stands alone so that all verbs, map.load and
+SurfelMap.load read the same map, each among the forms that it can read.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
 """
 SurfelMap.save and SurfelMap.load: the format of a map by the suffix of its file.
 
-It stands alone because it joins the formats, which do not import each other.
+From a directory the exact map is loaded that was written last, as the verbs do. The module stands
+alone because it joins the formats, which do not import each other.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files import las, map_state, parquet, pcd, ply
+from surfel_mapper.files import las, latest_map, map_state, parquet, parquet_tiles, pcd, ply
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 EXACT = ('.npz', '.parquet')
@@ -35,6 +36,10 @@ def save_surfel_map(path: Path, surfel_map: SurfelMap) -> str:
 
 def load_surfel_map(path: Path) -> SurfelMap:
     """Return a map; see SurfelMap.load."""
+    if path.is_dir():
+        path = latest_map.map_in(path, latest_map.EXACT) or path / map_state.FILE
+    if path.is_dir():
+        return parquet_tiles.read_tiles(path)
     if path.suffix == '.parquet':
         return parquet.read_map(path)
     if path.suffix in SURFELS:

@@ -82,19 +82,27 @@ def quantised(
         )
     parts = []
     for name in names:
-        if missing_columns(columns, (name,)):
-            raise ValueError(f'column {name}: missing, expected one row for {num_points} points')
-        column = np.asarray(columns['rgba' if name not in columns else name])
-        if len(column) != num_points:
-            raise ValueError(
-                f'column {name}: of length {len(column)}, expected one row for {num_points} points'
-            )
-        is_rgb = name == 'rgb'
-        if column.ndim != 1 and not (is_rgb and column.ndim == 2 and column.shape[1] >= 3):
-            expected = f'({num_points},) packed, or ({num_points}, 3)' if is_rgb else (num_points,)
-            raise ValueError(f'column {name}: shape {column.shape}, expected {expected}')
-        parts.append(_unpacked(column) if is_rgb else _fixed(column))
+        column = checked_channels(columns, name, num_points)
+        parts.append(_unpacked(column) if name == 'rgb' else _fixed(column))
     return np.ascontiguousarray(np.concatenate(parts, axis=1))
+
+
+def checked_channels(
+    columns: Mapping[str, npt.NDArray[Any]], name: str, num_points: int
+) -> npt.NDArray[Any]:
+    """Return a named column; raise ValueError if ``quantised`` cannot take it."""
+    if missing_columns(columns, (name,)):
+        raise ValueError(f'column {name}: missing, expected one row for {num_points} points')
+    column = np.asarray(columns['rgba' if name not in columns else name])
+    if len(column) != num_points:
+        raise ValueError(
+            f'column {name}: of length {len(column)}, expected one row for {num_points} points'
+        )
+    is_rgb = name == 'rgb'
+    if column.ndim != 1 and not (is_rgb and column.ndim == 2 and column.shape[1] >= 3):
+        expected = f'({num_points},) packed, or ({num_points}, 3)' if is_rgb else (num_points,)
+        raise ValueError(f'column {name}: shape {column.shape}, expected {expected}')
+    return column
 
 
 def means(

@@ -371,7 +371,8 @@ class SurfelMap(MomentMap):
         Parameters
         ----------
         path : str or Path
-            An .npz or .parquet file, or the output directory of a replay.
+            An .npz or .parquet file, or the output directory of a replay or a merge: of the
+            exact maps in it, also one in tiles, the one that was written last.
 
         Raises
         ------

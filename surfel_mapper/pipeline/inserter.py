@@ -22,7 +22,7 @@ import numpy.typing as npt
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Laps
 from surfel_mapper.errors import AlignmentError, MapError, PoseError
-from surfel_mapper.geometry import Transform
+from surfel_mapper.geometry import compose, inverse, Transform
 from surfel_mapper.layers import InsertedScan, Surroundings
 from surfel_mapper.layers.sensor_models import SensorModels
 from surfel_mapper.mapping.moments import looks_like_millimetres, MILLIMETRES, pack_keys
@@ -222,7 +222,7 @@ class Inserter:
 
         """
         laps = Laps()
-        place = self.aligner.to_map(pose)
+        T_map_fixed, place = self.aligner.T_map_fixed, self.aligner.to_map(pose)
         begun = self._reduction.begun(scan, place, config)
         found = self.preparation.prepare(scan, place, config, laps, begun)
         if not found and len(laps.milliseconds) > 1:
@@ -230,13 +230,21 @@ class Inserter:
         for prepared in found:
             num_used = self._num_used
             try:
-                update = self._insert(prepared, config, following, laps)
+                corrected = self._corrected(prepared, T_map_fixed)
+                update = self._insert(corrected, config, following, laps)
             except Exception as error:  # MemoryError too: the next scan may fit
                 self._drops.failure(prepared.scan, error, is_used=self._num_used > num_used)
                 update = None
             if update is not None:
                 yield update
             laps = Laps()
+
+    def _corrected(self, prepared: Prepared, T_map_fixed: Transform) -> Prepared:
+        """Return a scan corrected by the alignments since its pose, those of scans before it."""
+        if self.aligner.T_map_fixed is T_map_fixed:
+            return prepared
+        T_fixed_sensor = compose(inverse(T_map_fixed), prepared.T_map_sensor)
+        return replace(prepared, T_map_sensor=self.aligner.to_map(T_fixed_sensor))
 
     @property
     def _num_used(self) -> int:

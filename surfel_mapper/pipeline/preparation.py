@@ -24,7 +24,7 @@ from surfel_mapper.errors import (
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
 from surfel_mapper.layers import Surroundings
-from surfel_mapper.mapping.channels import missing_columns
+from surfel_mapper.mapping.channels import checked_channels, missing_columns
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.local_map import LocalMap
 from surfel_mapper.pipeline.prepared import FilteredScan, Prepared
@@ -226,11 +226,19 @@ class Preparation:
 
     def _has_columns(self, scan: Scan) -> bool:
         """Return whether a scan has the columns that the map sums; if not, count the drop."""
-        missing = missing_columns(scan.columns, self._around.surfel_map.columns)
+        names = self._around.surfel_map.columns
+        missing = missing_columns(scan.columns, names)
         if missing:
             reason = f'its points have no {" and no ".join(missing)}, by images and filters'
             self._drops.scan(scan, 'missing_column', reason)
-        return not missing
+            return False
+        try:
+            for name in names:
+                checked_channels(scan.columns, name, len(scan))
+        except ValueError as error:
+            self._drops.scan(scan, 'bad_cloud', str(error))
+            return False
+        return True
 
     def _register(
         self, poses: RegisteredPoses, prepared: Prepared, times: PointTimes | None

@@ -128,7 +128,9 @@ class Outputs:
         with self._mapper.guarded('publishing of the origin'):
             self._origin.publish(self._stamp_ns)
         self._layers.expire()
-        if self._mapper.derives and self._has_clients():
+        if not self._has_clients():
+            self._changes.reset()
+        elif self._mapper.derives:
             with self._changes.undone_on_error():
                 self._publish_change(self._changes.collect())
 

@@ -65,6 +65,13 @@ def test_evaluate_merge_extract_and_view_read_the_map_written_last(tmp_path, new
     assert points[:, 0].max() == pytest.approx(LENGTHS_M[newest], abs=0.3)
 
 
+@pytest.mark.parametrize('newest', LENGTHS_M)
+def test_a_map_is_loaded_from_the_form_written_last(tmp_path, newest):
+    out = tmp_path / 'out'
+    expected = written(out, newest, LENGTHS_M)
+    assert SurfelMap.load(out) == expected
+
+
 @pytest.mark.parametrize('newest', ['map.npz', 'tiles'])
 def test_mapping_continues_from_the_map_written_last(tmp_path, newest):
     out = tmp_path / 'out'

@@ -112,6 +112,17 @@ def test_every_example_says_in_its_first_lines_how_it_is_run():
         assert f'examples/{path.name}' in doc or 'make demo' in doc
 
 
+@pytest.mark.parametrize(
+    'name', sorted({p.name for p in EXAMPLES.glob('*.py')} - {'ten_lines.py'})
+)
+def test_help_prints_the_usage_and_writes_nothing(tmp_path, run, name):
+    if name == 'mirror_map.py':
+        pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+    printed = run(name, '--help', folder=tmp_path)
+    assert printed.startswith(f'usage: {name} [-h]')
+    assert not [*tmp_path.iterdir()]
+
+
 def test_ten_lines_give_the_map_of_the_last_ten_scans(tmp_path, run):
     printed = run('ten_lines.py', folder=tmp_path)
     assert re.match(r'\d{4} surfels, \d{3} of them flat and level\n', printed)

@@ -85,9 +85,10 @@ def limits() -> list[str]:
         f'{chunked.MAX_OTHERS:,} other records or one per {chunked.LEAST_OTHER_BYTES}',
         f'{chunked.MAX_CHUNKS:,} chunks or one per {chunked.LEAST_CHUNK_BYTES}',
         f'{bag_file.MAX_CONNECTIONS:,} topics',
-        f'{decoders.MAX_DEFINED:,} characters and one per {decoders.BYTES_EACH} bytes',
-        f'and of {decoders.LEAST_DEFINITION:,} each at least',
-        f'{_rosbags.MAX_VALUES:,} values in a message of a type',
+        f'definitions that are parsed: {_rosbags.MAX_DEFINITION:,} characters each, '
+        f'{decoders.MAX_DEFINED:,} and one per {decoders.BYTES_EACH} bytes together, and each '
+        f'counts {decoders.LEAST_DEFINITION:,} more',
+        f'{_rosbags.MAX_VALUES:,} values in a message of a type of ROS 1',
         f'{budget.FLOOR_S:.0f} s or {1e6 * budget.SECONDS_PER_BYTE:.0f} us per byte of processor'
         ' time',
         f'nesting of {yaml_files.MAX_DEPTH}; {yaml_files.MAX_NODES:,} nodes '

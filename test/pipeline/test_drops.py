@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mapper: scans and points that are left out are counted and logged."""
 
+from dataclasses import replace
 import logging
 
 import numpy as np
@@ -84,6 +85,26 @@ def test_a_scan_that_the_map_refuses_is_dropped_and_the_next_one_mapped():
     assert mapper.map.num_points == 0
     assert len(insert(mapper, scan_at(2.0))) == 1
     assert_counts_add_up(mapper)
+
+
+@pytest.mark.parametrize('threads', [1, 2])
+@pytest.mark.parametrize(('name', 'switch'), [('intensity', 'intensity'), ('rgb', 'color')])
+def test_a_cloud_whose_column_has_two_numbers_a_point_is_bad_only_if_they_are_summed(
+    name, switch, threads, caplog
+):
+    first, second = scan_at(1.0), scan_at(2.0)
+    pair = np.ones((len(first), 2), np.float32)
+    bad, good = replace(first, columns={name: pair}), replace(second, columns={name: pair[:, 0]})
+    settings = {'pose__source': 'identity', 'map__threads': threads}
+    summing, other = mapper_with(**settings, **{f'map__{switch}': True}), mapper_with(**settings)
+    for scan in (bad, good):
+        summing.add_scan(scan)
+    assert [update.stamp_ns for update in summing.insert_ready()] == [good.stamp_ns]
+    assert dropped(summing) == {'bad_cloud': 1}
+    assert f'column {name}: shape (40, 2), expected (40,)' in caplog.text
+    assert_counts_add_up(summing)
+
+    assert len(insert(other, bad, good)) == 2
 
 
 def test_a_warning_names_the_cause_once_a_second_but_every_drop_is_counted(caplog):

@@ -234,6 +234,22 @@ def test_a_joined_map_is_that_of_the_scans_at_their_poses():
     assert mapper.map.digest() == expected.digest()
 
 
+def test_scans_that_are_joined_follow_an_alignment_among_them():
+    align = {'align__key_distance_m': 0.0, 'align__move_m': 0.0, 'align__move_deg': 0.0}
+    mapper = mapper_with(window__keep_points=True, align__every_scans=6, **align)
+    feed(mapper, [scan_at(number) for number in range(4)])
+    feed(mapper, [in_hall(4 + n, np.eye(4)) for n in range(2)])
+
+    _, aligned, *later = feed(mapper, [scan_at(number) for number in range(6, 10)])
+
+    T_map_fixed = aligned.alignment.T_map_fixed
+    assert np.linalg.norm(T_map_fixed[:3, 3]) > 1e-4
+    assert len(later) == 2
+    for update in later:  # the tracked frame is that of the sensor
+        expected = compose(T_map_fixed, update.T_fixed_body)
+        np.testing.assert_allclose(update.T_map_sensor, expected, rtol=0, atol=1e-9)
+
+
 def test_degenerate_registrations_are_warned_about(caplog):
     mapper = mapper_with()
 

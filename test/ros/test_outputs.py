@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from array import array
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,7 +27,9 @@ from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.scan_normals import ADDED
 from surfel_mapper.messages.surfel_markers import normal_colors, SEGMENTS, shades
+from surfel_mapper.ros.outputs import Outputs
 from test.messages.test_scan_normals import cloud as odd_cloud
+from test.pipeline.made_scans import insert, mapper_with, scan_at
 from test.ros.driving import arguments, drive, mapped, PERIOD_NS, send
 from test.ros.live import cloud, LATCHED, RVIZ, START_NS
 
@@ -121,6 +124,35 @@ def test_changed_minus_removed_equals_the_map(start, peer):
     assert peer.call('clear').success
     peer.spin_until(lambda: len(removed) > len(messages))
     assert voxels(removed[-1]) == expected
+
+
+def test_a_late_client_gets_all_surfels_once_settings_publish_more(peer):
+    """Settings that published less had been forgotten, if there was no client at that time."""
+    mapper = mapper_with(pose__source='identity')
+    outputs = Outputs(peer.node, mapper, SimpleNamespace())
+    scans = [scan_at(1.0), scan_at(2.0)]
+
+    def set_min_points(number):
+        mapper.reconfigure(mapper.config.replace({'map.min_points': number}))
+        outputs.expire()
+
+    def map_scan(scan):
+        (update,) = insert(mapper, scan)
+        outputs.publish_update(update)
+
+    map_scan(scans[0])
+    set_min_points(1000)
+    changed = peer.subscribe(PointCloud2, '~/changed', MANY)
+    peer.spin_until(outputs._changed.get_subscription_count)
+    map_scan(scans[1])
+    set_min_points(1)
+
+    peer.spin_until(lambda: len(changed) == 2)
+    first, last = ({*map(tuple, np.floor(to_scan(msg).points / 0.5).tolist())} for msg in changed)
+    assert first == set()
+    assert last == {
+        tuple(index) for scan in scans for index in np.floor(scan.points / 0.5).tolist()
+    }
 
 
 def test_the_full_map_is_published_on_request(start, peer):
