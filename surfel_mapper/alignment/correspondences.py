@@ -16,6 +16,7 @@ Source: Chen and Medioni 1992 for points and planes; Segal, Haehnel and Thrun 20
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
@@ -197,7 +198,39 @@ def surface_weights(
     return np.asarray(weight[:, None, None] * normal[:, :, None] * normal[:, None, :])
 
 
-def loop_candidates(T_map_sensor: Floats, max_distance_m: float) -> list[tuple[int, int]]:
+def path_lengths(T_map_sensor: Floats, frame_ids: Sequence[str] | None = None) -> Floats:
+    """
+    Return the path travelled until each scan, (S,) m.
+
+    Parameters
+    ----------
+    T_map_sensor : (S, 4, 4) float64
+        Poses, in the order of the path.
+    frame_ids : sequence of str, optional
+        Frames of the sensors of the scans, by default all the same. Distances are measured between
+        scans of one frame: sensors that are mounted apart do not travel from one to the other. The
+        path is that of the sensor that travelled farthest.
+
+    """
+    frames = [''] * len(T_map_sensor) if frame_ids is None else frame_ids
+    path_m, farthest_m = np.empty(len(frames)), 0.0
+    last: dict[str, tuple[Floats, float]] = {}
+    for number, (place, frame) in enumerate(zip(T_map_sensor[:, :3, 3], frames, strict=True)):
+        travelled_m = farthest_m
+        if frame in last:
+            before, travelled_m = last[frame]
+            travelled_m += float(np.sqrt(((place - before) ** 2).sum()))
+        last[frame] = place, travelled_m
+        path_m[number] = farthest_m = max(farthest_m, travelled_m)
+    return path_m
+
+
+def loop_candidates(
+    T_map_sensor: Floats,
+    max_distance_m: float,
+    path_m: Floats | None = None,
+    min_path_m: float = 0.0,
+) -> list[tuple[int, int]]:
     """
     Return the pairs of scans that are close although the path between them is long.
 
@@ -207,12 +240,16 @@ def loop_candidates(T_map_sensor: Floats, max_distance_m: float) -> list[tuple[i
         Poses, in the order of the path.
     max_distance_m : float
         Maximum distance of candidates; 0 disables loops.
+    path_m : (S,) float64, m, optional
+        Path travelled until each scan, by default the sum of the distances between the poses.
+    min_path_m : float
+        Minimum length of the path between candidates.
 
     Returns
     -------
     list of (int, int)
-        The later scan first; for each the nearest ones. The path between them is at least three
-        times ``max_distance_m`` long.
+        The later scan first; for each the nearest ones. The path between them is at least
+        ``min_path_m`` and three times ``max_distance_m`` long.
 
     """
     if max_distance_m <= 0.0:
@@ -220,10 +257,10 @@ def loop_candidates(T_map_sensor: Floats, max_distance_m: float) -> list[tuple[i
     from scipy.spatial import cKDTree
 
     position = T_map_sensor[:, :3, 3]
-    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
-    path_m = np.concatenate([[0.0], np.cumsum(steps)])
+    path_m = path_lengths(T_map_sensor) if path_m is None else path_m
     pairs = cKDTree(position).query_pairs(max_distance_m, output_type='ndarray')
-    near = pairs[path_m[pairs[:, 1]] - path_m[pairs[:, 0]] >= LOOP_FACTOR * max_distance_m]
+    least_m = max(LOOP_FACTOR * max_distance_m, min_path_m)
+    near = pairs[path_m[pairs[:, 1]] - path_m[pairs[:, 0]] >= least_m]
     distance = np.linalg.norm(position[near[:, 1]] - position[near[:, 0]], axis=1)
     num_of: dict[int, int] = {}
     found = []

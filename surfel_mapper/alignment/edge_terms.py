@@ -177,7 +177,8 @@ class EdgeTerms:
     dropped : mapping of int to str
         Row of a dropped edge and the reason.
     weak : mapping of int to (K, 6) float64
-        Row of an edge and the motions that its pairs do not determine: these are set to 0.
+        Row of an edge that is not dropped, and the motions that its pairs do not determine: these
+        are set to 0.
 
     """
 
@@ -307,6 +308,7 @@ def exact_terms(sums: EdgeSums) -> EdgeTerms:
         weak={
             int(e): np.hstack([np.zeros((weak[e].sum(), 3)), axes[e].T[weak[e]]])
             for e in np.flatnonzero(weak.any(axis=1))
+            if e not in dropped
         },
     )
 

@@ -17,7 +17,7 @@ The module is long because local maps, candidates and verification share the sta
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import logging
 from typing import Any, Protocol
@@ -25,7 +25,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.correspondences import loop_candidates
+from surfel_mapper.alignment.correspondences import loop_candidates, path_lengths
 from surfel_mapper.alignment.loops import Loop, LoopSolution, solve_loops
 from surfel_mapper.alignment.recognition import Candidate, Recognition
 from surfel_mapper.alignment.registration import means, Registration, RegistrationResult
@@ -120,6 +120,9 @@ class LoopSearch:
         Settings of the registration that verifies candidates.
     voxel_size_m : float
         Edge of the voxels of local maps.
+    frame_ids : sequence of str, optional
+        Frames of the sensors of the scans, by default all the same; distances travelled are those
+        of scans of one frame.
 
     """
 
@@ -130,6 +133,7 @@ class LoopSearch:
         settings: LoopsConfig,
         registration: RegistrationConfig,
         voxel_size_m: float,
+        frame_ids: Sequence[str] | None = None,
     ) -> None:
         self._scans = scans
         self._before = np.asarray(T_map_sensor, np.float64)
@@ -137,8 +141,7 @@ class LoopSearch:
         self._voxel_size_m = voxel_size_m
         verifying = replace(registration, coarse_levels=COARSE_LEVELS, search_deg=0.0)
         self._registration = Registration(verifying, voxel_size_m)
-        steps = np.linalg.norm(np.diff(self._before[:, :3, 3], axis=0), axis=1)
-        self._path_m = np.concatenate([[0.0], np.cumsum(steps)])
+        self._path_m = path_lengths(self._before, frame_ids)
         self.keys = key_numbers(self._path_m, settings.key_distance_m)
         self._maps: OrderedDict[int, SurfelMap] = OrderedDict()
         self._loops: dict[tuple[int, int], Loop] = {}
@@ -220,13 +223,14 @@ class LoopSearch:
         found = []
         taken: set[int] = set()
         distance_m = self._settings.near_distance_m
-        pairs = loop_candidates(T_map_key, distance_m)
+        path_m = self._path_m[self.keys]
+        pairs = loop_candidates(T_map_key, distance_m, path_m, self._least_loop_m)
         pairs.sort(
             key=lambda p: float(np.linalg.norm(T_map_key[p[0]][:3, 3] - T_map_key[p[1]][:3, 3]))
         )
         for source, target in pairs:
             known = (source, target) in self._loops or (source, target) in self._refusals
-            if source in taken or self._path_between(source, target) <= self._least_loop_m:
+            if source in taken:
                 continue
             taken.add(source)
             if not known:

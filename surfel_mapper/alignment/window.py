@@ -28,6 +28,7 @@ from surfel_mapper.alignment.correspondences import (
     Limits,
     loop_candidates,
     match,
+    path_lengths,
     Samples,
     surface_weights,
 )
@@ -96,7 +97,10 @@ class WindowAlignment:
 
 
 def align_scans(
-    scans: Sequence[Samples], T_map_sensor: Floats, settings: AlignConfig | None = None
+    scans: Sequence[Samples],
+    T_map_sensor: Floats,
+    settings: AlignConfig | None = None,
+    frame_ids: Sequence[str] | None = None,
 ) -> WindowAlignment:
     """
     Return the poses at which the surfels of scans fit each other best.
@@ -109,29 +113,36 @@ def align_scans(
         Initial poses; the first one stays fixed.
     settings : AlignConfig, optional
         The settings, by default AlignConfig().
+    frame_ids : sequence of str, optional
+        Frames of the sensors of the scans, by default all the same; distances travelled are those
+        of scans of one frame.
 
     Raises
     ------
     AlignmentError
-        If there are fewer than two scans, the numbers of scans and poses differ, or a pose is not
-        finite.
+        If there are fewer than two scans, the numbers of scans, poses and frames differ, or a pose
+        is not finite.
 
     """
     settings = settings or AlignConfig()
     poses = np.asarray(T_map_sensor, np.float64)
+    frames = [''] * len(scans) if frame_ids is None else list(frame_ids)
     if len(scans) < 2 or poses.shape != (len(scans), 4, 4) or not np.isfinite(poses).all():
         raise AlignmentError(
             f'{len(scans)} scans and poses of shape {poses.shape}, expected two scans or more '
             'and a finite (4, 4) pose for each'
         )
+    if len(frames) != len(scans):
+        raise AlignmentError(f'{len(frames)} frames of {len(scans)} scans, expected one for each')
     usable = [number for number, scan in enumerate(scans) if len(scan) >= MIN_PAIRS]
     if len(usable) < 2:
         raise AlignmentError(
             f'{len(usable)} of {len(scans)} scans have enough surfels of '
             f'{settings.voxel_size_m:g} m, expected two or more; is align.voxel_size_m too small?'
         )
-    keys = key_scans(poses, usable, settings.key_distance_m)
-    aligner = _Aligner([scans[key] for key in keys], poses[keys], settings)
+    keys = key_scans(poses, usable, settings.key_distance_m, frames)
+    path_m = path_lengths(poses[keys], [frames[key] for key in keys])
+    aligner = _Aligner([scans[key] for key in keys], poses[keys], path_m, settings)
     settled, rounds = False, 0
     while rounds < settings.max_rounds and not settled:
         settled = aligner.round()
@@ -157,14 +168,25 @@ def extent(motion: Transform) -> tuple[float, float]:
     return float(np.linalg.norm(motion[:3, 3])), float(np.degrees(rotation_angle(motion)))
 
 
-def key_scans(T_map_sensor: Floats, usable: list[int], distance_m: float) -> list[int]:
-    """Return the scans to align: the first and last usable ones, and some between."""
-    keys = usable[:1]
-    for number in usable[1:]:
-        motion = compose(inverse(T_map_sensor[keys[-1]]), T_map_sensor[number])
-        moved_m, turned_deg = extent(motion)
-        if moved_m >= distance_m or turned_deg >= KEY_ANGLE_DEG:
-            keys.append(number)
+def key_scans(
+    T_map_sensor: Floats, usable: list[int], distance_m: float, frame_ids: Sequence[str]
+) -> list[int]:
+    """
+    Return the scans to align: the first and last usable ones, and some between.
+
+    Each sensor has its own, because sensors that are mounted apart see different surfaces.
+    """
+    keys: list[int] = []
+    last: dict[str, int] = {}
+    for number in usable:
+        frame = frame_ids[number]
+        if frame in last:
+            motion = compose(inverse(T_map_sensor[last[frame]]), T_map_sensor[number])
+            moved_m, turned_deg = extent(motion)
+            if moved_m < distance_m and turned_deg < KEY_ANGLE_DEG:
+                continue
+        last[frame] = number
+        keys.append(number)
     if keys[-1] != usable[-1]:
         keys.append(usable[-1])
     return keys
@@ -173,7 +195,9 @@ def key_scans(T_map_sensor: Floats, usable: list[int], distance_m: float) -> lis
 class _Aligner:
     """State of the alignment of the key scans."""
 
-    def __init__(self, scans: list[Samples], T_map_sensor: Floats, settings: AlignConfig) -> None:
+    def __init__(
+        self, scans: list[Samples], T_map_sensor: Floats, path_m: Floats, settings: AlignConfig
+    ) -> None:
         self._scans = scans
         self._settings = settings
         self._T_map_first = T_map_sensor[0]
@@ -183,7 +207,7 @@ class _Aligner:
         self._finest_m = FINEST * settings.voxel_size_m
         self._scale_m = max(0.5 * settings.max_distance_m, self._finest_m)
         self._ends = _neighbours(T_map_sensor) + loop_candidates(
-            T_map_sensor, settings.loop_distance_m
+            T_map_sensor, settings.loop_distance_m, path_m
         )
         poses = poses_of(inverse(self._T_map_first) @ T_map_sensor, np.zeros((len(scans), 6)))
         self._matched: dict[tuple[int, int], tuple[Floats, float]] = {}

@@ -219,7 +219,7 @@ class MapMirror:
         self.stamp_ns = stamp_ns
         for changed_ns, changed in dropwhile(lambda change: change[0] < stamp_ns, self._recent):
             self._put(changed)
-            self.stamp_ns = changed_ns
+            self.stamp_ns = max(self.stamp_ns, changed_ns)
         self.is_complete = True
 
     def change(self, msg: Any) -> None:
@@ -227,9 +227,10 @@ class MapMirror:
         stamp_ns, moments = self._read(msg)
         if stamp_ns < self.stamp_ns - RESET_NS:
             self._recent.clear()
+            self.stamp_ns = stamp_ns
         self._recent.append((stamp_ns, moments))
         self._put(moments)
-        self.stamp_ns = stamp_ns
+        self.stamp_ns = max(self.stamp_ns, stamp_ns)
 
     def _read(self, msg: Any) -> tuple[int, ScanMoments]:
         """Return the stamp and the moments in a message."""

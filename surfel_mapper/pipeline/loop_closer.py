@@ -128,6 +128,7 @@ class LoopCloser:
         self._window = window
         self._spool = ScanSpool(config.loops.directory)
         self._stamps_ns: list[int] = []
+        self._frames: list[str] = []
         self._poses: list[Transform] = []
         self._emptied = [Emptied()]
         self._poses_before: list[list[Transform]] = []
@@ -157,6 +158,7 @@ class LoopCloser:
         entered = scan.select(within(scan.points, limits.min_range_m, limits.max_range_m))
         self._spool.append(entered.points, summed_columns(entered.columns, self._map.columns))
         self._stamps_ns.append(scan.stamp_ns)
+        self._frames.append(scan.frame_id)
         self._poses.append(T_map_sensor)
 
     def follow_window(self) -> None:
@@ -174,6 +176,7 @@ class LoopCloser:
         """Drop all scans."""
         self._spool.clear()
         self._stamps_ns.clear()
+        self._frames.clear()
         self._poses.clear()
         self._emptied = [Emptied()]
         self._poses_before.clear()
@@ -205,7 +208,12 @@ class LoopCloser:
             )
         before = self.T_map_sensor
         search = LoopSearch(
-            self._spool, before, config.loops, config.registration, config.map.voxel_size_m
+            self._spool,
+            before,
+            config.loops,
+            config.registration,
+            config.map.voxel_size_m,
+            self._frames,
         )
         return self.move(search.close(progress), config)
 

@@ -168,7 +168,8 @@ class WindowAligner:
         self._check(len(window), scans, config.map.columns)
         before = np.array([scan.T_map_sensor for scan in scans]).reshape(-1, 4, 4)
         samples = self._samples_of(scans, config.align.voxel_size_m)
-        alignment = align_scans(samples, before, config.align)
+        frames = [scan.frame_id for scan in scans]
+        alignment = align_scans(samples, before, config.align, frames)
         extents = [
             extent(compose(inverse(old), new))
             for old, new in zip(before, alignment.T_map_sensor, strict=True)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import combinations, pairwise
+from itertools import pairwise, permutations
 import math
 
 import numpy as np
@@ -60,7 +60,8 @@ class Route:
     Raises
     ------
     ConfigError
-        If there are fewer than two corners, or two are too near to each other for the arcs.
+        If there are fewer than two corners, one is not finite, or two are too near to each other
+        for the arcs.
 
     """
 
@@ -68,6 +69,8 @@ class Route:
         if len(corners) < 2:
             raise ConfigError(f'corners: {len(corners)}, expected two or more')
         places = np.array(corners, np.float64)
+        if not np.isfinite(places).all():
+            raise ConfigError(f'corners: {places.tolist()}, expected finite places')
         ways = np.linalg.norm(np.diff(places, axis=0), axis=1)
         if not ways.min() >= 2.0 * TURN_RADIUS_M:
             raise ConfigError(
@@ -122,14 +125,15 @@ def circuit_primitives(seed: int, corners: Corners) -> list[Primitive]:
         another.
 
     """
-    legs = sorted({tuple(sorted(leg)) for leg in pairwise(corners)})
+    places = [(float(x), float(y)) for x, y in corners]
+    legs = sorted({tuple(sorted(leg)) for leg in pairwise(places)})
     if not legs:
         raise ConfigError(f'corners: {len(corners)}, expected two or more')
     check_overlap(legs)
     pose = street_pose()
     T_world_street = pose_matrix(pose[:3], pose[3:])
     T_street_world = inverse(T_world_street)
-    kept = [_ground(T_world_street, np.array(corners, np.float64))]
+    kept = [_ground(T_world_street, np.array(places))]
     for number, (first, last) in enumerate(legs):
         others = np.array([leg for leg in legs if leg != (first, last)]).reshape(-1, 2, 2)
         T_street_leg = _leg_pose(first, last)
@@ -156,7 +160,7 @@ def check_overlap(legs: Sequence[Leg]) -> None:
     Both would have houses of their own in one street. A leg that is driven again has to have the
     same corners.
     """
-    for (a, b), (c, d) in combinations(legs, 2):
+    for (a, b), (c, d) in permutations(legs, 2):
         way = np.subtract(b, a) / math.dist(a, b)
         aside = np.array([-way[1], way[0]])
         ends = np.subtract((c, d), a)

@@ -9,6 +9,7 @@ import pytest
 
 from surfel_mapper.alignment import Limits, loop_candidates, match, Samples, surface_weights
 from surfel_mapper.alignment.angles import transforms
+from surfel_mapper.alignment.correspondences import path_lengths
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
@@ -135,6 +136,27 @@ def test_loops_are_near_in_space_and_far_on_the_way():
     assert max(sum(s == source for s, _ in found) for source, _ in found) <= 3
     assert loop_candidates(T, 0.0) == []
     assert loop_candidates(T[:20], 5.0) == []
+
+
+def test_loops_of_a_long_path_are_found_among_nearer_ones_of_a_short_path():
+    # past a place, away for 200 m, and then to and fro 3 m beside it
+    x = [3.0, 103.0, 0.0, 20.0, 0.0, 20.0, 0.0, 20.0, 0.0, 20.0, 0.0]
+    T = np.tile(np.eye(4), (len(x), 1, 1))
+    T[:, 0, 3] = x
+
+    found = loop_candidates(T, 5.0, min_path_m=170.0)
+
+    assert found == [(2, 0), (4, 0), (6, 0), (8, 0), (10, 0)]
+
+
+def test_paths_of_sensors_mounted_apart_are_those_of_each():
+    # the one in front travels 3 m, the one behind it 2.5 m from the third scan on
+    T = np.tile(np.eye(4), (6, 1, 1))
+    T[:, 0, 3] = [0.0, 1.0, -2.0, 2.0, 0.5, 3.0]
+    frames = ['front', 'front', 'rear', 'front', 'rear', 'front']
+
+    np.testing.assert_array_equal(path_lengths(T, frames), [0.0, 1.0, 1.0, 2.0, 3.5, 3.5])
+    np.testing.assert_array_equal(path_lengths(T), [0.0, 1.0, 4.0, 8.0, 9.5, 12.0])
 
 
 @pytest.mark.parametrize(

@@ -90,5 +90,29 @@ def test_small_drift_is_corrected_without_recognition(monkeypatch, caplog):
     assert closure.loops
 
 
+def test_an_earlier_visit_is_compared_although_later_ones_are_nearer():
+    # past a place, away for 200 m, and then to and fro 3 m beside it
+    poses = np.tile(np.eye(4), (11, 1, 1))
+    poses[:, 0, 3] = [3.0, 103.0, 0.0, 20.0, 0.0, 20.0, 0.0, 20.0, 0.0, 20.0, 0.0]
+    loops = search((), poses, **{'loops.near_distance_m': 5.0, 'loops.local_map_m': 85.0})
+
+    found = [(each.source, each.target) for each in loops._near(poses)]
+
+    assert found == [(2, 0), (4, 0), (6, 0), (8, 0), (10, 0)]  # others within 170 m of path
+
+
+def test_keyframes_of_two_sensors_follow_the_path_of_each():
+    poses = np.tile(np.eye(4), (82, 1, 1))
+    poses[:, 0, 3] = 0.25 * np.repeat(np.arange(41), 2)  # 10 m
+    poses[1::2, 0, 3] -= 3.0
+    config = Config()
+
+    found = LoopSearch(
+        (), poses, config.loops, config.registration, 0.5, frame_ids=['front', 'rear'] * 41
+    )
+
+    assert found.keys == [0, 40, 80, 81]
+
+
 def test_keyframes_are_first_last_and_those_far_enough():
     assert key_numbers(np.array([0.0, 1.0, 5.0, 5.5, 10.0, 11.0]), 5.0) == [0, 2, 4, 5]

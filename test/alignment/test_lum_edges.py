@@ -95,6 +95,15 @@ def test_pairs_in_one_point_are_dropped(pair):
     assert result.unconnected == (1,)
 
 
+def test_dropped_edges_have_no_open_motions(pair):
+    pair.set_correspondences(0, 1, [[0, 0], [1, 1]])
+
+    result = pair.compute()
+
+    assert set(result.dropped) == {(0, 1)}
+    assert not result.open_motions
+
+
 def test_edges_of_zero_weights_are_dropped(pair):
     pair.set_correspondences(0, 1, [[0, 0], [1, 1], [2, 2]], np.zeros((3, 3, 3)))
 

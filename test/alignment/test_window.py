@@ -131,8 +131,20 @@ def test_keys_are_first_last_and_those_far_enough_or_turned():
     poses[:, 0, 3] = [0.0, 0.4, 1.1, 1.2, 1.3, 1.4]
     poses[4:, :3, :3] = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.3]))[:3, :3]
 
-    assert key_scans(poses, list(range(6)), 1.0) == [0, 2, 4, 5]
-    assert key_scans(poses, [1, 3, 4], 10.0) == [1, 4]
+    assert key_scans(poses, list(range(6)), 1.0, [''] * 6) == [0, 2, 4, 5]
+    assert key_scans(poses, [1, 3, 4], 10.0, [''] * 6) == [1, 4]
+
+
+def test_sensors_that_look_apart_have_keys_of_their_own():
+    # two sensors back to back, 2 m apart, on a drive of 4 m
+    poses = np.tile(np.eye(4), (34, 1, 1))
+    poses[:, 0, 3] = 0.25 * np.repeat(np.arange(17), 2)
+    poses[1::2, 0, 3] -= 2.0
+    poses[1::2, :3, :3] = np.diag([-1.0, -1.0, 1.0])
+
+    keys = key_scans(poses, list(range(34)), 1.0, ['front', 'rear'] * 17)
+
+    assert keys == [0, 1, 8, 9, 16, 17, 24, 25, 32, 33]
 
 
 def test_scans_without_surfels_go_with_their_neighbours():
@@ -184,6 +196,13 @@ def test_invalid_scans_and_poses_are_refused(num_scans, poses, message):
 
     with pytest.raises(AlignmentError, match=message):
         align_scans([scan] * num_scans, poses)
+
+
+def test_frames_that_are_not_one_for_each_scan_are_refused():
+    scan = Samples(np.eye(3), np.eye(3), np.ones(3), np.ones(3))
+
+    with pytest.raises(AlignmentError, match='1 frames of 2 scans'):
+        align_scans([scan] * 2, np.array([np.eye(4)] * 2), frame_ids=['front'])
 
 
 def test_scans_with_nothing_to_match_are_refused():

@@ -10,12 +10,14 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.config import Config
+from surfel_mapper.config import Config, WindowConfig
 from surfel_mapper.errors import AlignmentError, ConfigError
 from surfel_mapper.geometry import q_xyzw
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball
+from surfel_mapper.pipeline.window_aligner import WindowAligner
 from test.alignment.street import drifted, relative_errors, street_scans
 
 NUM_SCANS = 8
@@ -81,6 +83,31 @@ def test_the_map_equals_one_built_at_the_corrected_poses(drive):
     np.testing.assert_array_equal(
         aligned.T_map_sensor, [scan.T_map_sensor for scan in mapper.window]
     )
+
+
+def test_scans_of_another_sensor_are_no_key_scans_for_its_place():
+    # both sensors stand still: of their ten scans the first of each is one, and the last
+    rng = np.random.default_rng(1)
+    places = np.repeat(rng.integers(-8, 8, (40, 3)) + 0.5, 12, axis=0)
+    points = places + rng.normal(scale=[0.1, 0.1, 0.001], size=places.shape)
+    surfel_map = SurfelMap(0.5)
+    window = SlidingWindow(surfel_map, WindowConfig(keep_points=True))
+    for number in range(10):
+        pose = np.eye(4)
+        pose[0, 3] = 2.0 * (number % 2)
+        seen = points - pose[:3, 3]
+        moments = surfel_map.reduce(seen, pose, origin=pose[:3, 3])
+        frame = ('front', 'rear')[number % 2]
+        window.insert(
+            WindowedScan(
+                moments=moments, stamp_ns=number, T_map_sensor=pose, points=seen, frame_id=frame
+            )
+        )
+    aligner = WindowAligner(lambda scan, pose: surfel_map.reduce(scan.points, pose))
+
+    aligned = aligner.align(window, Config())
+
+    assert set(aligned.solution.residuals) == {(1, 0), (9, 1), (9, 0)}
 
 
 def test_errors_of_relative_poses_fall(drive):

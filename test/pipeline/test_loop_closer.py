@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 
 from surfel_mapper.alignment.loop_search import LoopClosure
-from surfel_mapper.config import Config
+from surfel_mapper.config import Config, WindowConfig
 from surfel_mapper.errors import AlignmentError, ConfigError, FileFormatError
 from surfel_mapper.files.scan_spool import ScanSpool
 from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.checkpoints import load_start
+from surfel_mapper.pipeline.loop_closer import LoopCloser
 from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.pipeline.saved_state import load_mapper, save_mapper
 from surfel_mapper.scan import Scan
@@ -340,6 +342,23 @@ def test_colours_named_rgba_move_with_their_scans():
     assert mapper.map.digest() == expected.digest()
     assert not mapper.counters.dropped
     assert not mapper.counters.messages_ignored
+
+
+def test_keyframes_follow_the_path_of_each_sensor():
+    # ten scans of two sensors, 3 m apart, that stand still
+    surfel_map = SurfelMap(0.5)
+    window = SlidingWindow(surfel_map, WindowConfig(max_scans=0, keep_points=True))
+    closer = LoopCloser(Config(), surfel_map, window)
+    points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
+    for number in range(10):
+        pose = np.eye(4)
+        pose[0, 3] = 3.0 * (number % 2)
+        scan = Scan(points=points, stamp_ns=number, frame_id=('front', 'rear')[number % 2])
+        moments = surfel_map.reduce(points, pose)
+        window.insert(WindowedScan(moments=moments, stamp_ns=number, T_map_sensor=pose))
+        closer.add(scan, pose, Config())
+
+    assert closer.close(Config()).closure.keys == (0, 9)
 
 
 def test_a_window_that_evicted_scans_is_refused():

@@ -210,6 +210,7 @@ def test_a_mirror_follows_a_reset_of_time():
             node.mapper.add_pose('odom', 'base_link', at, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         mirror.change(node.map_scan(stamp_s * SECOND)[1])
         assert_equal(mirror, node)
+        assert mirror.stamp_ns == stamp_s * SECOND
     assert node.mapper.counters.resets == 1
     mirror.replace(node.full())
     assert_equal(mirror, node)
@@ -224,8 +225,10 @@ def test_stamps_of_several_sensors_may_be_out_of_order():
         mirror.change(message)
         if number == 1:
             full = node.full()
+        assert mirror.stamp_ns == round(max(stamps[: number + 1]) * SECOND)
     mirror.replace(full)
     assert_equal(mirror, node)
+    assert mirror.stamp_ns == round(5.5 * SECOND)
 
 
 @pytest.mark.parametrize('fails_first', [False, True])

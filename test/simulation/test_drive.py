@@ -141,6 +141,8 @@ def test_a_scan_does_not_depend_on_what_was_simulated_before(street):
         dict(start_ns=-1),
         dict(base_to_sensor=(0.0,) * 7),
         dict(start=(0.0, 0.0)),
+        dict(corners=((0.0, 0.0), (np.inf, 0.0))),
+        dict(corners=((0.0, 0.0), (np.nan, 0.0))),
     ],
 )
 def test_an_invalid_drive_is_refused_by_its_setting(setting):

@@ -11,7 +11,13 @@ import pytest
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.layers.drawings import PointsPicture, Section, Table
-from surfel_mapper.layers.models.pictures import drawings_of, MOST_ROWS, panels_of, section_of
+from surfel_mapper.layers.models.pictures import (
+    drawings_of,
+    MOST_POINTS,
+    MOST_ROWS,
+    panels_of,
+    section_of,
+)
 from surfel_mapper.messages.model_messages import GREY, primitive_colors
 from surfel_mapper.models import fit
 from surfel_mapper.models.outlines import areas
@@ -102,6 +108,16 @@ def test_models_are_a_layer_and_a_section_of_the_report(seen, tmp_path):
     assert [a['src'][:22] for _, a in parsed.tags if a.get('class') == 'wide'] == [
         'data:image/png;base64,'
     ]
+
+
+@pytest.mark.parametrize(
+    ('num', 'step'), [(1, 1), (MOST_POINTS, 1), (MOST_POINTS + 1, 2), (2 * MOST_POINTS + 1, 3)]
+)
+def test_no_picture_has_more_points_than_its_limit(seen, num, step):
+    points = np.repeat(np.arange(float(num))[:, None], 3, axis=1)
+    cloud = panels_of(points, seen[0])[0].points
+    assert len(cloud) <= MOST_POINTS
+    np.testing.assert_array_equal(cloud, points[::step])
 
 
 def test_texts_of_a_section_are_escaped():

@@ -31,7 +31,7 @@ from surfel_mapper.models.shapes import ellipsoid_frames, PatchShape
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 
 MOST_POINTS = 120_000
-"""Points drawn of a cloud; a larger one is subsampled evenly."""
+"""Maximum number of points drawn of a cloud; a larger one is subsampled evenly."""
 
 MOST_OF_GAUSSIAN = 50
 """Points drawn of one Gaussian: a voxel of a map may have thousands."""
@@ -95,7 +95,7 @@ def panels_of(points: npt.NDArray[Any], model: MultiModel, title: str = '') -> l
 
     """
     cloud = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-    cloud = cloud[:: max(len(cloud) // MOST_POINTS, 1)]
+    cloud = cloud[:: -(-len(cloud) // MOST_POINTS) or 1]
     parts = [patch.samples(0.5 * model.voxel_size_m) for patch in model.patches]
     colors = np.concatenate([primitive_colors([p.id for p in model.patches]), [GREY]])
     few = np.minimum(model.gaussians.num_points, MOST_OF_GAUSSIAN)
