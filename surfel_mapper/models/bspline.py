@@ -129,7 +129,7 @@ class HeightField:
     control: Array
 
     def heights(self, xy: Array) -> Array:
-        """Return z at (M, 2) x and y, m; beyond the grid, the height at its boundary."""
+        """Return z at (M, 2) x and y, m; beyond the grid, that at its boundary; at nan, nan."""
         result = np.empty(len(xy))
         evaluate_field(np.ascontiguousarray(xy), self.parts(), result)
         return result
@@ -327,7 +327,8 @@ def fit_grids(
     found = []
     for pitch_m, origin, (x, y), low, high in parts:
         degrees = axis_degree(x - 2, degree), axis_degree(y - 2, degree)
-        found.append(HeightField(pitch_m, origin, degrees, control[low:high].reshape(x, y)))
+        own = control[low:high].reshape(x, y).copy()  # a view would keep those of all fields
+        found.append(HeightField(pitch_m, origin, degrees, own))
     return found, heights
 
 

@@ -357,6 +357,12 @@ def assembled(
 ABOVE_EXTENTS = 1.0
 """Height of the virtual viewpoint above a map, in diagonals of the map."""
 
+INSET = 1e-6
+"""
+Least distance of points across surfels from the faces of their voxel, in voxels: more than the
+rounding of coordinates as far as voxels are numbered.
+"""
+
 
 def surfel_points(surfels: Surfels, voxel_size_m: float) -> Array:
     """
@@ -379,10 +385,10 @@ def surfel_points(surfels: Surfels, voxel_size_m: float) -> Array:
     # a line is one point
     wide[surfels.eigenvalues[:, 1] < LEAST_WIDTH * surfels.eigenvalues[:, 2]] = 0.0
     half = np.minimum(wide, voxel_size_m * np.sqrt(0.5))[:, None]
-    low = surfels.voxel_index * voxel_size_m
+    low, high = ((surfels.voxel_index + to) * voxel_size_m for to in (INSET, 1.0 - INSET))
     steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     parts = [surfels.position + half * (i * x + j * y) for i, j in steps]
-    inside = [np.clip(part, low, np.nextafter(low + voxel_size_m, low)) for part in parts]
+    inside = [np.clip(part, low, high) for part in parts]
     points: Array = np.stack(inside, axis=1).reshape(-1, 3)
     return points
 

@@ -108,7 +108,7 @@ class Cells:
         return slice(begin, begin + x * y)
 
     def grids(self) -> list[Grid]:
-        """Return the coverage of every patch."""
+        """Return the coverage of every patch; copies, as a view would keep the cells of all."""
         filled = self.sums[:, 3] > 0.0
         rows = zip(self.first.tolist(), self.sizes.tolist(), strict=True)
         spans = [(low, low + x * y, (x, y)) for low, (x, y) in rows]
@@ -116,10 +116,10 @@ class Cells:
             Grid(
                 pitch_m=pitch_m,
                 origin=origin,
-                filled=filled[low:high].reshape(shape),
-                rim=self.rim[low:high].reshape(shape),
-                corner=self.corner[low:high].reshape(shape),
-                cuts=self.cuts[low:high].reshape(*shape, 3),
+                filled=filled[low:high].reshape(shape).copy(),
+                rim=self.rim[low:high].reshape(shape).copy(),
+                corner=self.corner[low:high].reshape(shape).copy(),
+                cuts=self.cuts[low:high].reshape(*shape, 3).copy(),
             )
             for pitch_m, origin, (low, high, shape) in zip(
                 self.pitches.tolist(), self.origins, spans, strict=True

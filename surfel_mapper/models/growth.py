@@ -63,7 +63,7 @@ MOST_SPARSE = 0.3
 """If more voxels are sparse, they are outliers; planes alone clip fewer to sparse ones."""
 
 BLOCKS, BLOCK_POINTS = 120, 100
-"""Blocks for the estimate of the noise, and points used in each, at most."""
+"""Blocks for the estimate of the noise, up to twice as many, and most points used in each."""
 
 NOISE_BINS, NOISE_QUANTILE = 4, 0.3
 """Bins of range; the quantile is below the median, as edges add to the noise of a block."""
@@ -178,11 +178,15 @@ def estimate_noise(
 
 
 def line_above_zero(x: Array, y: Array) -> tuple[float, float]:
-    """Return a and b of a + b x, neither negative, nearest to y relative to y."""
+    """
+    Return a and b of a + b x, neither negative, nearest to y relative to y.
+
+    If x does not determine b, b is 0: noise at one range says nothing of other ranges.
+    """
     weight = 1.0 / np.maximum(y, 1e-9)
     design = np.stack([np.ones_like(x), x], axis=1) * weight[:, None]
     best, least = (0.0, 0.0), math.inf
-    for used in ([0, 1], [0], [1]):
+    for used in ([0], [0, 1], [1]):
         part = np.zeros(2)
         part[used] = np.linalg.lstsq(design[:, used], y * weight, rcond=None)[0]
         error = float(((design @ part - y * weight) ** 2).sum())

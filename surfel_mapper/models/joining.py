@@ -33,7 +33,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 LEAST_TOUCH = 2
-"""Voxels of the smaller patch that touch the other one, at least."""
+"""Voxels of a patch that touch another one, at least, as the mean of both."""
 
 LAYER_SHARE = 0.6
 """Least share of the voxels of a layer that touch the larger patch."""
@@ -103,8 +103,8 @@ def join_patches(
     ----------
     pieces : Pieces
         K patches.
-    view : (3,) float64, m
-        Position of the sensor, that normals face.
+    view : (3,) or (K, 3) float64, m
+        Position of the sensor, or a place for each patch, that normals face.
     noise : n0 and n2
         Sigma of the points is n0 + n2 range^2, m.
     size_m : float

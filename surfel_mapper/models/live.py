@@ -230,7 +230,8 @@ class LiveModels:
         kept = rows[np.repeat(large, np.diff(starts))]
         angles = self.config.fold_angle_deg, self.config.max_angle_deg
         for chart in chart_components(graph, kept, ends, angles, least):
-            self._charts.setdefault(int(graph.component[chart[0]]), []).append(chart)
+            # a view would keep the rows of all charts
+            self._charts.setdefault(int(graph.component[chart[0]]), []).append(chart.copy())
 
     def _joined(self, changed: Rows) -> Rows:
         """Return the patch of each row, -1 for none: charts with what they grow over, joined."""
@@ -293,7 +294,7 @@ class LiveModels:
         others = set(matched.ids)
         is_material = np.logical_or.reduceat(self._graph.is_material[members], ends[:-1])
         chosen = {
-            number: members[ends[k] : ends[k + 1]]
+            number: members[ends[k] : ends[k + 1]].copy()  # a view would keep all members
             for k, (number, matters) in enumerate(zip(ids.tolist(), is_material, strict=True))
             if matters or number in others
         }

@@ -231,7 +231,7 @@ class PatchFitter:
         small = is_small(cells.sizes[chosen], DEGREE)
         fitted, heights = fit_grids(cells, chosen[small], DEGREE, SMOOTHING)
         found = {
-            k: FittedField(field, heights[cells.of(k)].reshape(cells.sizes[k]))
+            k: FittedField(field, heights[cells.of(k)].reshape(cells.sizes[k]).copy())
             for k, field in zip(chosen[small].tolist(), fitted, strict=True)
         }
         for k in chosen[~small].tolist():

@@ -49,10 +49,10 @@ def rows_beyond(
     now += [
         (n, t.rows, t.normal, t.box) for n, t in patches.items() if t.is_surface and n not in gone
     ]
-    if not len(changed) or not now:
-        return {}
-    boxes = np.array([box for *_, box in now])
+    boxes = np.array([box for *_, box in now]).reshape(-1, 2, 3)
     is_target = near_any(boxes, changed, REACH_VOXELS * size_m)
+    if not is_target.any():
+        return {}
     used = np.flatnonzero(near_any(boxes, boxes[is_target], REACH_VOXELS * size_m)).tolist()
     parts = [now[k][1][graph.kind[now[k][1]] == FLAT] for k in used]
     rows = np.concatenate(parts)

@@ -12,11 +12,13 @@ rings that touch.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.geometry import face_normals
+from surfel_mapper.models.grid import Grid
 from surfel_mapper.models.kernels.outlines import (
     mark_sides,
     simplify_loop,
@@ -48,17 +50,13 @@ def outline(patch: Plane) -> list[Array]:
 
 def local_outline(patch: Plane) -> list[Array]:
     """Return the outline as locations (M, 2) in the frame of the patch, m."""
-    side_m = patch.grid.pitch_m / PARTS
-    return [
-        patch.grid.origin + side_m * simplified(midpoints(ring))
-        for ring in rings(patch.grid.mask(PARTS))
-    ]
+    mask, side_m = covered_squares(patch.grid, PARTS)
+    return [patch.grid.origin + side_m * simplified(midpoints(ring)) for ring in rings(mask)]
 
 
 def triangles(patch: Plane) -> tuple[Array, npt.NDArray[np.int64]]:
     """Return vertices, (V, 3) m, and triangles, (T, 3), of a patch, facing along its normal."""
-    side_m = patch.grid.pitch_m / PARTS_OF_SURFACE
-    mask = patch.grid.mask(PARTS_OF_SURFACE)
+    mask, side_m = covered_squares(patch.grid, PARTS_OF_SURFACE)
     squares = np.argwhere(mask)
     steps = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     x, y = np.moveaxis(squares[:, None] + steps, 2, 0)
@@ -68,6 +66,20 @@ def triangles(patch: Plane) -> tuple[Array, npt.NDArray[np.int64]]:
     quads = number[x, y]
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     return patch.lifted(patch.grid.origin + side_m * np.argwhere(lattice)), faces
+
+
+def covered_squares(grid: Grid, parts: int) -> tuple[npt.NDArray[np.bool_], float]:
+    """
+    Return which squares of divided cells are covered, and their edge, m.
+
+    If no square is, they are halved: a small patch may be in the corners of its cells only. Cuts
+    leave a 255th of a cell, so this ends.
+    """
+    mask = grid.mask(parts)
+    while not mask.any() and grid.filled.any():
+        parts *= 2
+        mask = grid.mask(parts)
+    return mask, grid.pitch_m / parts
 
 
 def rings(mask: npt.NDArray[np.bool_]) -> list[Array]:
@@ -131,19 +143,57 @@ def areas(triangles: Array) -> Array:
 
 def bridged(rings: Sequence[Array]) -> Array:
     """
-    Return one ring (M, D) of all rings, connected by bridges between their nearest corners.
+    Return one ring (M, D) of all rings, connected by bridges between near corners.
 
     A bridge is traversed both ways and encloses nothing, so the signed area is the sum of those of
     the rings, and the even-odd rule gives the same inside.
     """
     if not rings:
         return np.empty((0, 3))
-    ordered = sorted(rings, key=len, reverse=True)
-    whole = ordered[0]
-    for ring in ordered[1:]:
-        apart = ((whole[:, None] - ring[None]) ** 2).sum(axis=2)
-        here, there = np.unravel_index(int(apart.argmin()), apart.shape)
-        way = np.roll(ring, -int(there), axis=0)
-        parts = [whole[: here + 1], way, way[:1], whole[here:]]
-        whole = np.concatenate(parts)
+    mixed = np.random.default_rng(0).permutation(len(rings))  # traced ones are sorted by place
+    ordered = sorted((rings[k] for k in mixed), key=len, reverse=True)
+    starts = np.cumsum([0, *map(len, ordered)])
+    corners = np.concatenate(ordered)
+    bridges = nearest_corners(corners, starts)
+    after = np.arange(1, len(corners) + 1)
+    after[starts[1:] - 1] = starts[:-1]
+    before, ways = np.argsort(after).tolist(), after.tolist()
+    for host, entry in bridges:  # to the entry, around its ring, and back by copies of both
+        ways[before[entry]] = len(ways)
+        ways += [len(ways) + 1, ways[host]]
+        ways[host] = entry
+    copies = [place for host, entry in bridges for place in (entry, host)]
+    order = [0]
+    while len(order) < len(ways):
+        order.append(ways[order[-1]])
+    whole: Array = np.concatenate([corners, corners[copies]])[order]
     return whole
+
+
+def nearest_corners(corners: Array, starts: npt.NDArray[np.int64]) -> list[tuple[int, int]]:
+    """
+    Return a corner of an earlier ring for each but the first, and its own nearest corner to that.
+
+    A search tree of the corners before finds those of a quarter more rings: 18,000 corners of
+    3,400 rings take 40 ms, while comparing all corners takes 18 s.
+
+    Parameters
+    ----------
+    corners : (M, D) float64
+        Ring after ring.
+    starts : (R + 1,) int64
+        First corner of each, and M.
+
+    """
+    from scipy.spatial import cKDTree  # 0.4 s that mapping without models saves
+
+    found: list[tuple[int, int]] = []
+    known, number = 1, len(starts) - 1
+    while known < number:
+        some = starts[known : known + max(known // 4, 1) + 1]
+        apart, host = cKDTree(corners[: some[0]]).query(corners[some[0] : some[-1]])
+        for first, end in pairwise((some - some[0]).tolist()):
+            place = first + int(apart[first:end].argmin())
+            found.append((int(host[place]), int(some[0]) + place))
+        known += len(some) - 1
+    return found

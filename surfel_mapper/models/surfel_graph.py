@@ -430,6 +430,7 @@ class RemovedVoxels:
         is_gaussian[came[same]] = self.is_gaussian[back[same]]
         kept = np.ones(len(self.key), np.bool_)
         kept[back[same]] = False
+        self.key, self.component = self.key[kept], self.component[kept]
         self.label, self.is_gaussian = self.label[kept], self.is_gaussian[kept]
 
     @property

@@ -46,8 +46,12 @@ BLOCK_BITS = 9
 """Blocks have two to this power of voxels a side."""
 
 ONES = 1 << (2 * INDEX_BITS) | 1 << INDEX_BITS | 1
-INSIDE, HALF = ONES * ((1 << BLOCK_BITS) - 1), ONES << (BLOCK_BITS - 1)
-"""Keys of the last voxel of a block and of its middle: the origin is in the middle of a block."""
+BLOCK = ONES * ((1 << INDEX_BITS) - (1 << BLOCK_BITS))
+HALF = ONES << (BLOCK_BITS - 1)
+"""
+Bits of a key that name its block, and the key of the middle of a block: the origin is in the
+middle of one. The last half block of an axis wraps around to the first one.
+"""
 
 
 class SurfelJoining:
@@ -121,7 +125,7 @@ class SurfelJoining:
         moved = np.flatnonzero(key != self._key)
         was: Rows = np.unique(self._block[moved])
         self._key[moved] = key[moved]
-        block = np.where(key[moved] >= 0, (key[moved] + HALF) & ~INSIDE, -1)
+        block = np.where(key[moved] >= 0, (key[moved] + HALF) & BLOCK, -1)
         names, which = np.unique(block, return_inverse=True)
         numbers = [-1 if n < 0 else self._blocks.setdefault(n, len(self._blocks)) for n in names]
         self._block[moved] = np.array(numbers, np.int32)[which]
@@ -145,12 +149,15 @@ class SurfelJoining:
             self._overlaps[code] = known[code]
             if known[code]:
                 mine = np.flatnonzero(patch == name)
-                found[mine] = np.where(owner[mine] < 0, -1, number + owner[mine])
+                charts, which = np.unique(owner[mine], return_inverse=True)
+                found[mine] = np.where(owner[mine] < 0, -1, number + which)
+                number += len(charts)  # fewer than its voxels: names stay below R
         return found
 
     def _overlaps_itself(self, rows: Indices) -> bool:
         """Return whether voxels are no height field."""
         graph, size_m = self._graph, self._graph.map.voxel_size_m
+        rows = rows[graph.kind[rows] == FLAT]  # others are on no chart, or have no normal
         rules, starts = (self._limit, STACKED_VOXELS * size_m), np.array([0, len(rows)])
         mean, doubtful = np.empty((1, 3)), np.empty(1, np.bool_)
         every = np.ones(len(graph.key), np.bool_)

@@ -9,14 +9,14 @@ through a window of 20; a step reduces it, inserts it, evicts the oldest and der
 all changed voxels. Points are arrays already, so decoding is not included. Invalid points are
 removed before, as drivers do.
 
-``numpy`` is the same job in numpy_map.py. Both take turns of ten steps, and every other turn in the
+``numpy`` is the same job in numpy_map.py. Both take turns of ten steps, every other turn in the
 opposite order, so that changes of the machine affect both; ``x_numpy`` is the median of the ratios
-of the turns. The first step of a turn finds the caches full of what the other one used, as no step
-of a stream of scans does: it is not counted, but ``first_ms`` and ``first_x`` are the medians of
-these steps and their ratio. Times are those of the processor, on which other load has less effect
-than on clock times. The integers of both maps are compared at the end. ``B_voxel`` are the bytes of
-a voxel in the map, hash table and free rows included, ``B_scan_voxel`` those of a voxel of a scan
-in the window.
+of the turns. The first step of a turn finds the caches full of what the other one used, as no
+step of a stream of scans does: it is not counted, but ``first_ms`` and ``first_x`` are the medians
+of these steps and their ratio. Times are those of the processor, on which other load has less
+effect than on clock times. The integers of both maps are compared at the end. ``B_voxel`` are the
+bytes of a voxel in the map, hash table and free rows included, ``B_scan_voxel`` those of a voxel
+of a scan in the window.
 
 The scans come from SURFEL_MAPPER_TEST_DATA; without it there is only the simulated street, which
 the mean does not include.
@@ -82,7 +82,9 @@ def run(options: Options) -> list[Row]:
             found = [step_row(*scan, size_m, options) for scan in real_scans()]
             rows += found
             if found:
-                mean = {c: geometric_mean([row[c] for row in found]) for c in ('x_numpy', 'first_x')}
+                mean = {
+                    c: geometric_mean([row[c] for row in found]) for c in ('x_numpy', 'first_x')
+                }
                 rows.append({'scan': 'geometric mean', 'voxel_m': size_m, **mean})
             rows.append(step_row('simulated street', street, size_m, options))
     return rows

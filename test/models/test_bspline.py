@@ -17,7 +17,7 @@ from surfel_mapper.models.bspline import (
     knots,
     RIDGE,
 )
-from surfel_mapper.models.kernels.bspline import fit_fields, solve_band
+from surfel_mapper.models.kernels.bspline import fit_fields, nonzero, solve_band
 from test.kernels.modes import both
 
 SIZES = [1, 2, 3, 4, 5, 30]
@@ -171,6 +171,22 @@ def test_slopes_are_the_derivatives_of_the_heights():
         by = step * np.eye(2)[axis]
         expected = (field.heights(xy + by) - field.heights(xy - by)) / (2 * step)
         np.testing.assert_allclose(field.slopes(xy)[:, axis], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize('cells', [(1, 1), (5, 3), (9, 6)])
+def test_heights_and_slopes_are_nan_at_nan_only(cells):
+    start, xy, z = scene(lambda x, y: 0.3 * x - 0.2 * y, cells)
+    field = fit_pspline(start, xy, z, np.ones(len(z)), 1e-2)
+    places = np.array([[np.nan, xy[0, 1]], [xy[0, 0], np.nan], [np.nan, np.nan], xy[0]])
+    assert np.isnan(field.heights(places)).tolist() == [True, True, True, False]
+    assert np.isnan(field.slopes(places)).tolist() == [[True] * 2] * 3 + [[False] * 2]
+
+
+@both
+def test_basis_at_nan_stays_within_the_knots(call):
+    knot, values, lower = knots(4, 3), np.empty(4), np.empty(4)
+    assert 0 <= call(nonzero, np.nan, knot, 3, values, lower) <= 6 - 4
+    assert np.isnan(values).all()
 
 
 @pytest.mark.parametrize('cells', [(1, 2), (4, 5), (12, 3)])

@@ -13,8 +13,9 @@ import pytest
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ConfigError, ModelError
 from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models import evaluate, fit
-from surfel_mapper.models.fitting import separated
+from surfel_mapper.models.fitting import separated, surfel_points
 from surfel_mapper.models.growth import grown, owner_table
 from surfel_mapper.models.segmentation import folded, merge_clusters, segment_cloud
 from surfel_mapper.models.thinning import thin
@@ -332,6 +333,17 @@ def test_samples_of_gaussians_end_at_three_sigma_and_have_their_moments():
     distance_sq = np.einsum('ij,jk,ik->i', away, np.linalg.inv(covariance), away)
     assert distance_sq.max() <= 9.0 + 1e-9
     assert drawn.mean(axis=0) == pytest.approx(mean, abs=0.01)
+
+
+@pytest.mark.parametrize('size_m', [0.07, 0.1, 0.3])
+def test_points_across_surfels_stay_in_their_voxels(size_m):
+    surfel_map = SurfelMap(size_m)
+    surfel_map.add(sheet(10.0, 10.0, 0.02, normal=(0.3, 0.2, 1.0), centre=(30.0, -20.0, 1.0)))
+    surfels = surfel_map.surfels(min_points=3)
+    surfels = surfels.select(np.flatnonzero(np.isfinite(surfels.planarity)))
+    points = surfel_points(surfels, size_m).reshape(-1, 9, 3)
+    assert len(points) == len(surfels) > 1000
+    assert (np.floor(points / size_m) == surfels.voxel_index[:, None]).all()
 
 
 @pytest.mark.parametrize(

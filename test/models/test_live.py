@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import ModelsLayerConfig
+from surfel_mapper.kernels.layout import INDEX_OFFSET
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models.live import LiveModels
-from surfel_mapper.models.surfel_joining import BLOCK_BITS
+from surfel_mapper.models.surfel_joining import BLOCK_BITS, SurfelJoining
 from test.models.live_scenes import (
     groups,
     id_at,
@@ -247,6 +248,36 @@ def test_a_plane_that_leaves_is_removed_and_its_id_does_not_come_back():
     assert len({first, second, third}) == 3
 
 
+def test_a_surface_that_leaves_is_removed_and_a_far_one_stays():
+    x, y = np.meshgrid(np.arange(-0.6, 0.6, 0.02), np.arange(-0.6, 0.6, 0.02))
+    bowl = np.stack([x, y, 0.4 * (x**2 + y**2)], -1).reshape(-1, 3)
+    surfel_map = SurfelMap(VOXEL_M)
+    surfel_map.add(bowl, origin=(0, 0, 5))
+    moments = surfel_map.add(bowl + np.array((9.0, 0.0, 0.0)), origin=(9, 0, 5))
+    models = live(surfel_map)
+    stays, leaves = (surface.id for surface in models.model.surfaces)
+    surfel_map.remove(moments)
+    update = models.update()
+    assert (update.created, update.updated, update.removed) == ((), (), (leaves,))
+    assert [surface.id for surface in models.model.surfaces] == [stays]
+
+
+def test_a_patch_keeps_no_arrays_of_patches_fitted_with_it():
+    x, y = np.meshgrid(np.arange(0.0, 1.2, 0.02), np.arange(0.0, 1.2, 0.02))
+    bowl = np.stack([x, y, 0.4 * ((x - 0.6) ** 2 + (y - 0.6) ** 2) + 2.0], -1).reshape(-1, 3)
+    _, models = of_points(
+        np.concatenate([cells((0, 6), (0, 6)), bowl, bowl + np.array((3.0, 0.0, 0.0))])
+    )
+    assert len(models.model.surfaces) == 2
+    kept = [rows for charts in models._charts.values() for rows in charts]
+    for tracked in models._patches.values():
+        grid = tracked.patch.grid
+        kept += [tracked.rows, grid.filled, grid.rim, grid.corner, grid.cuts]
+        if tracked.fitted is not None:
+            kept += [tracked.fitted.heights, tracked.fitted.field.control]
+    assert all(array.base is None for array in kept)
+
+
 @pytest.mark.parametrize('at_once', [True, False])
 def test_a_cleared_map_clears_the_models(at_once):
     surfel_map, models = of_points(cells((0, 2), (0, 2)))
@@ -271,6 +302,7 @@ def test_a_restored_map_keeps_its_ids():
     update = models.update()
     assert update.removed == ()
     assert before < ids(models)
+    assert update.num_changed == surfel_map.num_voxels
     assert groups(models) == groups(live(surfel_map))
 
 
@@ -342,10 +374,22 @@ def test_roofs_are_two_planes_from_between_33_and_44_degrees_on(slope, planes, s
     assert (len(models.model.planes), len(models.model.surfaces)) == (planes, surfaces)
 
 
-def test_a_ramp_over_itself_is_cut():
-    turn, out = np.meshgrid(np.arange(0, 14, 0.004), np.arange(3.0, 5.0, 0.02), indexing='ij')
-    ramp = np.stack([out * np.cos(turn), out * np.sin(turn), 0.25 * turn], -1).reshape(-1, 3)
-    _, models = of_points(ramp, origin=(0, 0, 30), voxel_size_m=0.2)
+def spiral(radius_m, middle_m):
+    """Return points on a ramp 2 m wide of more than two turns, 1.57 m above each other."""
+    turn = np.arange(0, 14, 0.06 / radius_m)
+    turn, out = np.meshgrid(turn, radius_m + np.arange(0.0, 2.0, 0.06), indexing='ij')
+    x, y = out * np.cos(turn), out * np.sin(turn)
+    return np.stack([middle_m + x, y, 0.25 * turn], -1).reshape(-1, 3)
+
+
+ACROSS_BLOCKS_M = 0.2 * 2 ** (BLOCK_BITS - 1)
+"""Coordinate at which two blocks of voxels of 0.2 m meet, m."""
+
+
+@pytest.mark.parametrize(('radius_m', 'middle_m'), [(3.0, 0.0), (12.0, ACROSS_BLOCKS_M)])
+def test_a_ramp_over_itself_is_cut(radius_m, middle_m):
+    ramp = spiral(radius_m, middle_m)
+    _, models = of_points(ramp, origin=(middle_m, 0, 30), voxel_size_m=0.2)
     patches = [p for p in models.model.patches if p.num_points > 1000]
     assert len(patches) >= 2
     for patch in patches:
@@ -355,6 +399,41 @@ def test_a_ramp_over_itself_is_cut():
         for place in np.unique(column, axis=0)[::10]:
             heights = local[(column == place).all(axis=1), 2]
             assert heights.max() - heights.min() < 0.9  # the next turn is 1.57 m higher
+
+
+def test_patches_have_fewer_names_than_voxels(monkeypatch):
+    """Also if most patches are single voxels, and one across blocks is cut into its charts."""
+    found, update = [], SurfelJoining.update
+
+    def joined(*arguments):
+        found.append(update(*arguments))
+        return found[-1]
+
+    monkeypatch.setattr(SurfelJoining, 'update', joined)
+    x, y = np.meshgrid(np.arange(200), np.arange(100), indexing='ij')
+    middle = np.stack([x + 0.1, y + 100.1, np.full(x.shape, 20.1)], -1).reshape(-1, 1, 3)
+    alone = (middle + cells((-0.08, 0.08), (-0.08, 0.08), spacing=0.05)).reshape(-1, 3)
+    ramp = spiral(12.0, ACROSS_BLOCKS_M)
+    settings = ModelsLayerConfig(min_points=4, noise_m=0.005, min_voxels=1)
+    surfel_map, models = of_points(
+        np.concatenate([alone, ramp]), (ACROSS_BLOCKS_M, 0, 30), settings, 0.2
+    )
+    (names,) = found
+    assert len(models.model.patches) > x.size
+    assert len(models.model.patches) <= names.max() + 1 <= surfel_map.num_voxels
+
+
+@pytest.mark.parametrize('axis', range(3))
+@pytest.mark.parametrize('voxel', [-INDEX_OFFSET, INDEX_OFFSET - 20])
+def test_planes_at_the_ends_of_the_grid_are_not_joined(axis, voxel):
+    planes = np.concatenate([cells((0.02, 2.0), (0.02, 2.0), z) for z in (0.06, 2.0)])
+    lone = [[1.0, 1.0, 1.0]]
+    points = np.roll(np.concatenate([planes, lone]), axis, axis=1)
+    points[:, axis] += voxel * VOXEL_M
+    lone = points[-1] - voxel * VOXEL_M * np.eye(3)[axis]  # far away
+    _, models = of_points(np.concatenate([points, [lone]]), points[-1])
+    assert [len(models.model.planes), len(models.model.surfaces)] == [2, 0]
+    assert (models.model.labels < 0).sum() == 2
 
 
 def test_sparse_voxels_join_the_plane_that_they_lie_on():

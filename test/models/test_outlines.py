@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -299,3 +300,25 @@ def test_bridged_ring_encloses_the_same_area_and_points():
     assert len(whole) == 30 + 9 + 5 + 4  # there and back: two corners more for each ring bridged
     points = np.random.default_rng(3).uniform(-4.0, 4.0, (3000, 2))
     assert np.array_equal(crossings(points, [whole]) % 2, crossings(points, around) % 2)
+
+
+def test_bridges_of_many_rings_are_short():
+    holes = [0.1 * HOLE + 2.0 * place for place in np.argwhere(np.ones((20, 20)))]
+    around = [np.array([[-1.0, -1], [41, -1], [41, 41], [-1, 41]]), *holes]
+    whole = bridged(around)
+    assert len(whole) == 4 + 400 * 4 + 400 * 2
+    assert area(whole) == pytest.approx(42.0**2 - 400 * 0.2**2, rel=1e-9)
+    side = np.linalg.norm(whole - np.roll(whole, 1, axis=0), axis=1)
+    bridges_m = 0.5 * (side.sum() - 4 * 42.0 - 400 * 4 * 0.2)
+    assert bridges_m < 2.0 * 400 * 1.8  # the nearest hole is 1.8 away
+
+
+def test_memory_of_bridges_follows_the_corners_and_not_their_pairs():
+    around = [polygon(4000, 9.0), polygon(3000, 8.0)[::-1]]
+    bridged(around[:1])
+    tracemalloc.start()
+    whole = bridged(around)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(whole) == 7002
+    assert peak < 500 * len(whole)  # a table of all pairs: 192 MB

@@ -19,6 +19,7 @@ from surfel_mapper.models.shapes import (
     Shapes,
     SIGMAS,
 )
+from test.models.live_scenes import of_points
 from test.models.scenes import A, room, sheet, VIEW
 from test.models.test_outlines import area
 
@@ -77,6 +78,27 @@ def test_box_of_a_plane_encloses_it(frame):
     # the frame of a square may be turned within its plane: its box is no larger than its diagonal
     assert min(length_x, length_y) > 2.0 - A
     assert max(length_x, length_y) < 2.0 * 2**0.5 + 4 * A
+
+
+def test_patch_in_the_corners_of_large_cells_has_a_shape():
+    config = ModelsConfig(voxel_size_m=0.04, plane_pitch_voxels=100.0)
+    (plane,) = fit(sheet(0.4, 0.4, 0.01), config, (0, 0, 5)).planes
+    shape = shape_of(plane)
+    # a cut leaves half a voxel beside the points, and is rounded down to a 255th of a cell
+    reach = 0.2 + 0.5 * 0.04 + 4.0 / 255
+    assert 0.5 * 0.4**2 < shape.area_m2 < (2.0 * reach) ** 2
+    assert (shape.low[:2] < 0.0).all()
+    assert (shape.high[:2] > 0.0).all()
+
+
+def test_small_board_on_the_edges_of_large_voxels_has_a_shape():
+    board = sheet(0.04, 0.04, 0.002, centre=(0.0, 0.0, 0.5), sigma=5e-4)
+    _, models = of_points(board, voxel_size_m=1.0)
+    (plane,) = models.model.planes
+    shape = shape_of(plane)
+    reach = 0.02 + 0.25 * 1.0 + 2.0 / 255
+    assert 0.04**2 < shape.area_m2 < (2.0 * reach) ** 2
+    assert np.abs(shape.middle - [0.0, 0.0, 0.5]).max() < reach
 
 
 def test_shapes_of_surfaces_are_curved():

@@ -23,13 +23,13 @@ def nonzero(t, knot, degree, values, lower):
     """
     Evaluate the basis functions that are non-zero at a parameter; return the index of the first.
 
-    t       parameter in [0, 1]
+    t       parameter in [0, 1], or nan
     knot    (n,) float64, clamped, uniform in between
-    values  (degree + 1,) float64, out
+    values  (degree + 1,) float64, out; nan for nan
     lower   (degree + 1,) float64, out: the basis functions of one degree less
     """
     last = len(knot) - degree - 2
-    span = min(degree + np.int64(t * (last + 1 - degree)), last)
+    span = last if math.isnan(t) else min(degree + np.int64(t * (last + 1 - degree)), last)
     while span > degree and t < knot[span]:  # rounding
         span -= 1
     while span < last and t >= knot[span + 1]:

@@ -6,6 +6,8 @@ Join patches to regions, the pair first that gains most; see models/joining.py.
 A region is a chain of patches, named by the first. The means of the points of patch k are rows
 starts[k] to starts[k + 1] - 1 of points (P, 3) and weights (P,). Interpreted, a fit of 200,000
 points compares 10,000 pairs in 0.7 s, of which the height fields take a tenth.
+
+One module: joining and description of regions share the fits of height fields.
 """
 
 from heapq import heappop, heappush
@@ -38,6 +40,12 @@ POINTS_PER_TERM = 3.0
 
 CHUNK = 64
 """Points with a common box: those of a chunk too far away are skipped together."""
+
+LARGE_REGION = 100
+"""
+Patches of a region, beyond which only pairs with its latest patches are compared again at once,
+others when their turn comes: 1,500 patches of rough ground take 2 s instead of 26.
+"""
 
 LAYER_SIGMAS = 3.0
 """Distance, in deviations of the noise, of a layer of a patch."""
@@ -159,11 +167,16 @@ def join_smooth(edges, adjacent, points, weights, starts, floor, regions):
     joined = 0
     while heap[0][0] < 0.0:
         _, a, b, size_a, size_b = heappop(heap)
-        if root[a] != a or root[b] != b or patches[a] != size_a or patches[b] != size_b:
+        if root[a] != a or root[b] != b:
+            continue
+        if patches[a] != size_a or patches[b] != size_b:
+            known_a = patches[a] == size_a or size_a > LARGE_REGION
+            if known_a and (patches[b] == size_b or size_b > LARGE_REGION):
+                push(heap, a, b, state, regions)
             continue
         small, large = (a, b) if regions.rows[a] < regions.rows[b] else (b, a)
+        part = large if patches[large] <= LARGE_REGION else small  # a chain ends with the latest
         join_pair(small, large, regions)
-        part = large
         while part >= 0:
             for n in range(first[part], first[part + 1]):
                 other = root[others[n]]

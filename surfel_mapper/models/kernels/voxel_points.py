@@ -76,23 +76,22 @@ def neighbour_table(keys, to_y, to_z, starts, rows):
     starts  (V + 1,) int64, out: first neighbour of each voxel in rows
     rows    (26 V,) int32, out: the neighbours; see starts for how many there are
     """
-    mask_x, mask_y, num = (np.int64(1) << to_y) - 1, (np.int64(1) << (to_z - to_y)) - 1, 0
+    mask_y, num = (np.int64(1) << (to_z - to_y)) - 1, 0
     shifts, first = np.empty(9, np.int64), np.zeros(9, np.int64)
     for row in range(9):
         shifts[row] = ((row % 3 - 1) << to_y) + ((row // 3 - 1) << to_z)
     for i in range(len(keys)):
         starts[i] = num
-        key, x, y = keys[i], keys[i] & mask_x, keys[i] >> to_y & mask_y
+        key, y = keys[i], keys[i] >> to_y & mask_y
         for row in range(9):
             middle, j = key + shifts[row], first[row]
             while j < len(keys) and keys[j] < middle - 1:
                 j += 1
             first[row] = j
-            while j < len(keys) and keys[j] <= middle + 1:
-                # rows at the end of the grid continue in the next one
-                near_x = abs((keys[j] & mask_x) - x) <= 1
-                near_y = abs((keys[j] >> to_y & mask_y) - y) <= 1
-                if near_x and near_y and j != i:
+            # rows at the end of a grid continue in the next one, and its layers, too
+            inside = 0 <= y + row % 3 - 1 <= mask_y
+            while inside and j < len(keys) and keys[j] <= middle + 1:
+                if keys[j] >> to_y == middle >> to_y and j != i:
                     rows[num] = j
                     num += 1
                 j += 1

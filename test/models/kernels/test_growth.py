@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.models.growth import estimate_noise, line_above_zero
+from surfel_mapper.models.kernels import growth
 from surfel_mapper.models.kernels.growth import (
     assign_points,
     classify_free,
@@ -25,7 +26,7 @@ from surfel_mapper.models.kernels.voxel_points import (
     owner_means,
 )
 from surfel_mapper.models.thinning import thin
-from test.kernels.modes import both
+from test.kernels.modes import both, interpreted
 
 SIZE = 0.1
 
@@ -46,8 +47,20 @@ def by_voxel(points, size=SIZE):
     return thinned, thinned.by_voxel()
 
 
-def test_neighbours_equal_brute_force():
-    points = np.random.default_rng(2).uniform(0.0, 1.0, (150, 3)) * [1.0, 0.3, 0.6]
+@pytest.mark.parametrize(
+    'extent',
+    [
+        (1.0, 0.3, 0.6),
+        (1.0, 0.1, 1.0),
+        (0.1, 1.0, 1.0),
+        (1.0, 0.2, 1.0),
+        (0.2, 1.0, 1.0),
+        (0.1, 0.1, 9.0),
+        (0.2, 0.1, 5.0),
+    ],
+)  # walls and poles one or two voxels thick
+def test_neighbours_equal_brute_force(extent):
+    points = np.random.default_rng(2).uniform(0.0, 1.0, (150, 3)) * extent
     thinned, voxels = by_voxel(points)
     index = np.floor(thinned.means / SIZE).astype(int)
     first, rows = voxels.adjacent
@@ -158,6 +171,13 @@ def test_line_above_zero_is_clamped():
     assert line_above_zero(x, 2.0 * x - 0.5)[0] == 0.0
 
 
+@pytest.mark.parametrize('number', [1, 4])
+def test_noise_at_one_range_is_constant(number):
+    for unit in (1.0, 1e3):  # of length: x is its square
+        x, y = np.full(number, 9.0 * unit**2), np.full(number, 0.02 * unit)
+        assert line_above_zero(x, y) == pytest.approx((0.02 * unit, 0.0))
+
+
 @both
 def test_points_of_a_corner_go_to_the_face_that_they_lie_on(call):
     points, face = corner()
@@ -218,3 +238,25 @@ def test_facets_of_a_corner_are_its_faces(call):
         assert (own == side).mean() > 0.95
         assert abs(planes[k, side]) > 0.999
     assert (owner >= 0).mean() > 0.97
+
+
+@pytest.mark.parametrize(('width_m', 'least_points'), [(0.06, 30), (0.09, 100_000)])
+def test_a_long_region_that_is_no_facet_is_grown_once(monkeypatch, width_m, least_points):
+    along, across = np.meshgrid(np.arange(0.005, 15.0, 0.01), np.linspace(0.0, width_m, 4))
+    points = np.stack([along, across + 0.005, np.full_like(along, 0.05)], -1).reshape(-1, 3)
+    _, voxels = by_voxel(points)
+    number, owner = len(voxels.starts) - 1, np.full(len(points), -1, np.int32)
+    assert number == 150
+    count, flat = np.empty(number, np.int64), np.empty(number, bool)
+    free = count, flat, np.zeros((number, 3)), np.zeros((number, 3))
+    growth.classify_free(voxels.points, voxels.starts, owner, 0.02, *free)
+    assert flat.all()
+    calls, grow_facet = [], growth.grow_facet
+    monkeypatch.setattr(
+        growth, 'grow_facet', lambda *args: calls.append(grow_facet(*args)) or calls[-1]
+    )
+    state = voxels.points, voxels.starts, voxels.adjacent
+    rules = (0.005, 3, least_points, 0.9, 0.08)
+    assert interpreted(find_facets, *state, free, rules, owner, np.empty((10, 4)), 0) == 0
+    assert calls == [number]
+    assert (owner == -1).all()
