@@ -10,11 +10,13 @@ viewpoint.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_real
 from surfel_mapper.models.bspline import HeightField
 from surfel_mapper.models.evaluation import compare, Evaluation
 from surfel_mapper.models.grid import Grid
@@ -148,9 +150,9 @@ class Gaussians:
         """Return the number of Gaussians."""
         return len(self.id)
 
-    def samples(self, seed: int = 0, sigmas: float = SIGMAS) -> Array:
+    def samples(self, seed: int = 0) -> Array:
         """
-        Draw num_points points of each, (M, 3), none farther out than `sigmas`.
+        Draw num_points points of each, (M, 3), none farther out than SIGMAS.
 
         Without that limit the tails alone make the samples a tenth less precise.
         """
@@ -158,7 +160,7 @@ class Gaussians:
         scale = np.repeat(np.sqrt(np.maximum(values, 0.0)), self.num_points, axis=0)
         rng = np.random.default_rng(seed)
         drawn = rng.standard_normal(scale.shape)
-        while (far := np.flatnonzero((drawn**2).sum(axis=1) > sigmas**2)).size:
+        while (far := np.flatnonzero((drawn**2).sum(axis=1) > SIGMAS**2)).size:
             drawn[far] = rng.standard_normal((len(far), 3))
         turned = np.einsum(
             'nij,nj->ni', np.repeat(vectors, self.num_points, axis=0), drawn * scale
@@ -237,8 +239,15 @@ class MultiModel:
         seed : int
             Seed of the samples of Gaussians.
 
+        Raises
+        ------
+        ValueError
+            If the spacing is not positive and finite.
+
         """
-        step_m = self.voxel_size_m if step_m is None else step_m
+        step_m = self.voxel_size_m if step_m is None else as_real('step_m', step_m)
+        if not 0.0 < step_m < math.inf:
+            raise ValueError(f'step_m: {step_m:g}, expected a positive distance, m')
         parts = [patch.samples(step_m) for patch in self.patches]
         return np.concatenate([*parts, self.gaussians.samples(seed)])
 

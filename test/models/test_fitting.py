@@ -322,6 +322,13 @@ def test_an_organised_cloud_has_labels_for_all_its_points():
     assert (model.labels[250:] >= 0).all()
 
 
+@pytest.mark.parametrize('step_m', [0.0, -0.1, math.nan, math.inf])
+def test_a_spacing_of_samples_that_is_no_distance_is_refused(step_m):
+    points = np.random.default_rng(3).uniform(0.0, 1.0, (2000, 3)) * [1.0, 1.0, 0.0]
+    with pytest.raises(ValueError, match=f'step_m: {step_m:g}, expected a positive distance'):
+        fit(points, ModelsConfig(voxel_size_m=0.1)).resample(step_m)
+
+
 def test_samples_of_gaussians_end_at_three_sigma_and_have_their_moments():
     rng = np.random.default_rng(8)
     blob = rng.standard_normal((30_000, 3)) * [0.3, 0.2, 0.1]
