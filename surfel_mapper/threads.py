@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Threads: process the rows of arrays with several threads, and make items ahead of their use.
+Threads: process the rows of arrays with several threads.
 
 The kernels release Python's lock, so plain threads suffice. Every row is computed independently,
 so the result has the same bits for any number of threads. Stands alone: filters, map and models
@@ -23,9 +23,6 @@ import itertools
 import os
 import sys
 import threading
-from typing import Any, TypeVar
-
-T = TypeVar('T')
 
 PARTS = 4
 """Number of parts per thread into which rows are divided; an idle thread takes the next part."""
@@ -112,21 +109,3 @@ def share(work: Callable[[slice], object], num_rows: int, threads: int) -> None:
         wait(begun)
     for helper in begun:
         helper.result()
-
-
-def ahead(items: Iterator[T], threads: int) -> Iterator[T]:
-    """
-    Yield items; of two threads or more, another one makes the next item while one is used.
-
-    Errors are raised in their turn. Close it before what the items are made of is closed: that
-    waits for the item that has been begun.
-    """
-    if threads < 2:
-        yield from items
-        return
-    end: Any = object()
-    with ThreadPoolExecutor(1, thread_name_prefix='surfel_mapper_ahead') as thread:
-        begun = thread.submit(next, items, end)
-        while (item := begun.result()) is not end:
-            begun = thread.submit(next, items, end)
-            yield item

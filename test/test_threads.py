@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Several threads: the same bits as one, down to the order of the voxels; items made ahead."""
+"""Several threads: the same bits as one, down to the order of the voxels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ import pytest
 
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.threads import (
-    ahead,
     BACKGROUND_NICE,
     pool,
     real_time_threads,
@@ -52,53 +51,6 @@ def test_every_row_is_in_one_part():
     for num_rows in range(7):
         rows = [row for part in split(num_rows, 3) for row in range(num_rows)[part]]
         assert rows == list(range(num_rows))
-
-
-def test_the_next_item_is_made_while_one_is_used():
-    made = [threading.Event() for _ in range(4)]
-    makers = set()
-
-    def items():
-        for number, event in enumerate(made):
-            makers.add(threading.get_ident())
-            event.set()
-            yield number
-
-    used = []
-    for number in ahead(items(), 2):
-        used.append(number)
-        assert made[min(number + 1, 3)].wait(10.0)
-    assert used == [0, 1, 2, 3]
-    assert len(makers) == 1
-    assert threading.get_ident() not in makers
-
-
-@pytest.mark.parametrize('threads', [1, 2])
-def test_an_error_in_making_an_item_is_raised_after_those_before_it(threads):
-    def items():
-        yield 1
-        raise OSError('the second')
-
-    used = ahead(items(), threads)
-    assert next(used) == 1
-    with pytest.raises(OSError, match='the second'):
-        next(used)
-
-
-def test_closing_waits_for_the_item_that_has_been_begun():
-    may_end, ended = threading.Event(), threading.Event()
-
-    def items():
-        yield 1
-        may_end.wait(10.0)
-        ended.set()
-        yield 2
-
-    used = ahead(items(), 2)
-    assert next(used) == 1
-    threading.Timer(0.05, may_end.set).start()
-    used.close()
-    assert ended.is_set()
 
 
 def test_a_failed_part_ends_the_work_of_all_threads():

@@ -4,7 +4,7 @@
 A bag through the pipeline: its clouds and poses into a Mapper, in the order of record time.
 
 That order is the one in which the node receives them, so that both make the same map; no message
-is used before its turn, although a bag would allow it. ``BagRecording`` chooses topics and poses,
+is looked up ahead, although a bag would allow it. ``BagRecording`` chooses topics and poses,
 ``feed`` is the loop over messages.
 
 One module although it is long: choosing and feeding rely on the same rules about topics.
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from contextlib import closing
 from dataclasses import replace
 from functools import partial
 import math
@@ -29,7 +28,6 @@ from surfel_mapper.messages.poses import raw_poses
 from surfel_mapper.offline.pose_choice import choose_for_bag, pose_summary
 from surfel_mapper.offline.pose_sources import pose_topics, PosePath, PoseTopics, static_topics
 from surfel_mapper.offline.request import part, Request, Span, WHOLE
-from surfel_mapper.threads import ahead
 
 if TYPE_CHECKING:  # they load the compiler, which `info` does not need
     from surfel_mapper.offline.image_feeds import Decode, DepthFeed, SceneFeed
@@ -37,10 +35,6 @@ if TYPE_CHECKING:  # they load the compiler, which `info` does not need
 
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 """Type of the calibrations that the feeds of images read."""
-
-
-BATCH, BATCH_BYTES = 64, 1 << 20
-"""Messages that are read ahead at once: as many, or as soon as they have as many bytes."""
 
 
 class BagRecording:
@@ -234,26 +228,25 @@ def feed(
     infos = images.info_topics if images else {}
     scenes = scene_feed(mapper)
     scene_topics = scenes.topics if scenes else set()
-    wanted = messages(reader, {*clouds, *infos, *scene_topics}, poses, span)
-    with closing(read_ahead(wanted, mapper.config.map.threads)) as found:
-        while not stopped():
-            with mapper.counters.timed('read'):
-                message = next(found, None)
-            if message is None:
-                break
-            if scenes and message.topic in scene_topics:
-                scenes.add(reader, message)
-            elif images and message.topic in infos:
-                add_camera_info(reader, mapper, message, images)
-            elif message.topic not in clouds:
-                with mapper.counters.timed('poses'):
-                    add_poses(reader, mapper, message, poses)
-            elif span.holds(message.record_ns):
-                if seen[message.topic] % span.every == 0:
-                    number = first[message.topic] + seen[message.topic]
-                    (images.add_image if images else add)(message, number)
-                seen[message.topic] += 1
-            yield from mapper.insert_ready(more_follows=True)
+    found = messages(reader, {*clouds, *infos, *scene_topics}, poses, span)
+    while not stopped():
+        with mapper.counters.timed('read'):
+            message = next(found, None)
+        if message is None:
+            break
+        if scenes and message.topic in scene_topics:
+            scenes.add(reader, message)
+        elif images and message.topic in infos:
+            add_camera_info(reader, mapper, message, images)
+        elif message.topic not in clouds:
+            with mapper.counters.timed('poses'):
+                add_poses(reader, mapper, message, poses)
+        elif span.holds(message.record_ns):
+            if seen[message.topic] % span.every == 0:
+                number = first[message.topic] + seen[message.topic]
+                (images.add_image if images else add)(message, number)
+            seen[message.topic] += 1
+        yield from mapper.insert_ready(more_follows=True)
     if scenes:
         mapper.end_images()
     mapper.end_scans()
@@ -289,30 +282,6 @@ def messages(
         if lasting:
             yield from reader.messages(lasting, None, span.poses_start_ns)
     yield from reader.messages(names, span.poses_start_ns, span.poses_stop_ns)
-
-
-def read_ahead(found: Iterator[BagMessage], threads: int) -> Iterator[BagMessage]:
-    """Yield messages; with several threads another one reads the next megabyte meanwhile."""
-    with closing(ahead(batches(found), threads)) as read:
-        for batch in read:
-            yield from batch
-
-
-def batches(found: Iterator[BagMessage]) -> Iterator[list[BagMessage]]:
-    """Yield messages in lists; after an error those before it come first."""
-    batch: list[BagMessage] = []
-    num_bytes = 0
-    try:
-        for message in found:
-            batch.append(message)
-            num_bytes += len(message.raw)
-            if num_bytes >= BATCH_BYTES or len(batch) == BATCH:
-                yield batch
-                batch, num_bytes = [], 0
-    except Exception:
-        yield batch
-        raise
-    yield batch
 
 
 def early_calibrations(reader: BagReader, names: Collection[str], span: Span) -> list[str]:

@@ -15,7 +15,6 @@ one file (ouster_pcap.py).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -31,7 +30,6 @@ from surfel_mapper.offline.pose_choice import choose_for_folder, is_default, pos
 from surfel_mapper.offline.pose_sources import PosePath
 from surfel_mapper.offline.request import part, Request, Span
 from surfel_mapper.scan import Scan
-from surfel_mapper.threads import ahead
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
@@ -147,36 +145,29 @@ class ScanFolder:
     ) -> Iterator[Update]:
         """Feed the scans to a mapper; yield the update of each."""
         frames = mapper.config.frames
-        scans = self._scans(SENSOR if frames.base_to_sensor else frames.base)
-        with closing(ahead(scans, mapper.config.map.threads)) as found:
-            while not stopped():
-                with mapper.counters.timed('decode'):
-                    number, scan = next(found, (0, None))
-                if scan is None:
-                    break
-                self._add(mapper, number, scan)
-                yield from mapper.insert_ready(more_follows=True)
+        frame = SENSOR if frames.base_to_sensor else frames.base
+        for number in self._numbers:
+            if stopped():
+                break
+            self._add(mapper, number, frame)
+            yield from mapper.insert_ready(more_follows=True)
         mapper.end_scans()
         yield from mapper.insert_ready()
         mapper.finish()
 
-    def _scans(self, frame: str) -> Iterator[tuple[int, Scan | Exception]]:
-        """Yield number and scan, or why it cannot be read, of the part that is mapped."""
-        for number in self._numbers:
-            try:
-                yield number, self._read(number, self.stamps[number], frame)
-            except ConfigError:  # a wrong limit concerns all scans
-                raise
-            except (FileFormatError, ValueError) as error:
-                yield number, error
-
-    def _add(self, mapper: Mapper, number: int, scan: Scan | Exception) -> None:
-        """Queue a scan; a bad one is counted."""
-        if isinstance(scan, Exception):
-            mapper.refuse_clouds('bad_cloud', str(self.path), str(scan))
+    def _add(self, mapper: Mapper, number: int, frame: str) -> None:
+        """Read one scan and queue it; a bad one is counted."""
+        stamp_ns = self.stamps[number]
+        try:
+            with mapper.counters.timed('decode'):
+                scan = self._read(number, stamp_ns, frame)
+        except ConfigError:  # a wrong limit concerns all scans
+            raise
+        except (FileFormatError, ValueError) as error:
+            mapper.refuse_clouds('bad_cloud', str(self.path), str(error))
             return
         if self.poses is not None:
-            self.poses.add_for(mapper, scan.stamp_ns, number)
+            self.poses.add_for(mapper, stamp_ns, number)
         mapper.add_scan(scan)
 
     def _read(self, number: int, stamp_ns: int, frame: str) -> Scan:

@@ -10,7 +10,6 @@ import pytest
 from surfel_mapper import Config, Mapper, SurfelMap
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.errors import BagError
-from surfel_mapper.offline import bag_recording
 from surfel_mapper.offline.bag_recording import feed
 from surfel_mapper.offline.pose_sources import pose_topics
 from surfel_mapper.offline.replay import ALL_SCANS
@@ -66,40 +65,6 @@ def test_every_source_of_poses_gives_the_map_made_by_hand(tmp_path, source, moun
 
     assert mapper.counters.mapped == NUM_SCANS
     assert mapper.map.digest() == expected_digest(entries)
-
-
-@pytest.mark.parametrize('most', [1, 2, 7, 64])
-def test_messages_that_another_thread_reads_ahead_make_the_same_map(tmp_path, monkeypatch, most):
-    monkeypatch.setattr(bag_recording, 'BATCH', most)
-    entries = drive()
-
-    mapper = mapped(write_rosbag2(tmp_path / 'a', entries), {'map.threads': 2})
-
-    assert mapper.counters.mapped == NUM_SCANS
-    assert mapper.map.digest() == expected_digest(entries)
-
-
-@pytest.mark.parametrize('threads', [1, 2])
-def test_all_messages_before_an_error_of_the_bag_are_mapped(tmp_path, monkeypatch, threads):
-    entries = drive()
-    path = write_rosbag2(tmp_path / 'a', entries)
-    read = BagReader.messages
-
-    def damaged(*args):
-        found = list(read(*args))
-        yield from found[:-1]
-        raise BagError('the last message')
-
-    monkeypatch.setattr(BagReader, 'messages', damaged)
-    mapper = Mapper(Config.from_mapping({**ALL_SCANS, 'map.threads': threads}))
-    with BagReader(path) as reader:
-        poses = pose_topics(reader.topics, mapper.config)
-        updates = feed(reader, mapper, '/points', poses)
-        with pytest.raises(BagError, match='the last message'):
-            list(updates)
-
-    clouds = sum(type_ == CLOUD for _, type_, _, _ in sorted(entries, key=lambda e: e[2])[:-1])
-    assert mapper.counters.received == clouds
 
 
 def test_a_ros1_bag_gives_the_same_map(tmp_path):
