@@ -35,6 +35,9 @@ from surfel_mapper.simulation.world import World
 START_NS = 1_700_000_000_000_000_000
 """Default stamp of the first scan, ns."""
 
+END_NS = 2**31 * 10**9
+"""First time whose seconds do not fit a stamp of ROS, ns."""
+
 TWIST_STEP_NS = 1_000_000
 """Half the interval over which the twist is computed, ns."""
 
@@ -89,8 +92,8 @@ class Drive:
         """Check every value."""
         if not 0.0 <= self.speed_m_s <= 100.0:
             raise ConfigError(f'speed_m_s: {self.speed_m_s}, expected a value in [0, 100]')
-        if not 0 <= self.start_ns < 2**62:
-            raise ConfigError(f'start_ns: {self.start_ns}, expected a value in [0, 2^62)')
+        if not 0 <= self.start_ns < END_NS:
+            raise ConfigError(f'start_ns: {self.start_ns}, expected a value in [0, {END_NS})')
         if self.corners:
             places = tuple((float(x), float(y)) for x, y in self.corners)
             object.__setattr__(self, 'corners', places)

@@ -115,7 +115,7 @@ def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_
         for scan in (name, 'geometric mean', 'simulated street')
     ]
     assert rows[0]['points'] == (np.isfinite(points).all(1) & points[:, :3].any(1)).sum()
-    assert all(row['x_numpy'] > 0.0 for row in rows)
+    assert all(row['x_numpy'] > 0.0 and row['first_x'] > 0.0 for row in rows)
 
 
 @pytest.fixture

@@ -139,6 +139,7 @@ def test_a_scan_does_not_depend_on_what_was_simulated_before(street):
         dict(speed_m_s=-1.0),
         dict(speed_m_s=np.nan),
         dict(start_ns=-1),
+        dict(start_ns=2**31 * 10**9),
         dict(base_to_sensor=(0.0,) * 7),
         dict(start=(0.0, 0.0)),
         dict(corners=((0.0, 0.0), (np.inf, 0.0))),
