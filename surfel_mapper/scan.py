@@ -4,14 +4,15 @@
 Scan: the points of one sweep of a sensor, as arrays.
 
 Coordinates keep the type of the cloud (float32 or float64), because the map quantises a point
-once, in float64; rounding it before would be a second quantisation.
+once, in float64; rounding it before would be a second quantisation. Those of a message are decoded
+when they are first read: by the thread that reduces the scan, and never if it is dropped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -62,6 +63,28 @@ class DepthImage:
     label: npt.NDArray[np.int32] | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LazyPoints:
+    """
+    Points of a scan that are decoded when they are first read.
+
+    Attributes
+    ----------
+    num_points : int
+        N.
+    decode : callable
+        Returns the points, (N, 3) float32 or float64, m.
+
+    """
+
+    num_points: int
+    decode: Callable[[], npt.NDArray[Any]]
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return self.num_points
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:
     """
@@ -71,7 +94,7 @@ class Scan:
     ----------
     points : (N, 3) float32 or float64, m
         In ``frame_id``. May contain nan and inf, which consumers leave out. In Fortran order
-        the map takes them without a copy.
+        the map takes them without a copy. LazyPoints are decoded when they are first read.
     stamp_ns : int
         Stamp of the message's header, nanoseconds.
     frame_id : str
@@ -114,16 +137,16 @@ class Scan:
     depth: DepthImage | None = None
     free: npt.NDArray[Any] | None = None
     msg: Any = None
+    _lazy: LazyPoints | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the shapes."""
-        points = self.points
-        if isinstance(points, np.ma.MaskedArray):
-            raise ValueError('points: a MaskedArray, expected an array: points.filled(np.nan)')
-        if not isinstance(points, np.ndarray):
-            raise ValueError(f'points: {type(points).__name__}, expected an array (N, 3)')
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise ValueError(f'points: shape {points.shape}, expected (N, 3)')
+        points: Any = self.points
+        if isinstance(points, LazyPoints):
+            object.__setattr__(self, '_lazy', points)
+            object.__delattr__(self, 'points')
+        else:
+            check_points(points)
         if isinstance(self.stamp_ns, bool) or not isinstance(self.stamp_ns, (int, np.integer)):
             raise ValueError(
                 f'stamp_ns: {self.stamp_ns!r}, expected whole nanoseconds as an int, such as '
@@ -131,8 +154,6 @@ class Scan:
             )
         if not isinstance(self.frame_id, str):
             raise TypeError(f'frame_id: {self.frame_id!r:.60}, expected the name of a frame')
-        if points.dtype not in (np.float32, np.float64):
-            raise ValueError(f'points: dtype {points.dtype}, expected float32 or float64')
         for name, kind in (('times', PointTimes), ('depth', DepthImage)):
             value = getattr(self, name)
             if not isinstance(value, (kind, type(None))):
@@ -158,9 +179,19 @@ class Scan:
                     f'{len(points)} points'
                 )
 
+    if not TYPE_CHECKING:  # hidden from mypy: any other attribute is an error
+
+        def __getattr__(self, name: str) -> Any:
+            """Decode the points: Python asks for an attribute here while it is not set."""
+            if name != 'points' or self._lazy is None:
+                raise AttributeError(f'{type(self).__name__!r} object has no attribute {name!r}')
+            points = self._lazy.decode()  # two threads may do so at once, to the same bits
+            object.__setattr__(self, 'points', points)
+            return points
+
     def __len__(self) -> int:
         """Return the number of points."""
-        return len(self.points)
+        return len(self.points if self._lazy is None else self._lazy)
 
     @property
     def end_ns(self) -> int:
@@ -181,3 +212,15 @@ class Scan:
         columns = {name: column[rows] for name, column in self.columns.items()}
         times = self.times and replace(self.times, offsets=self.times.offsets[rows])
         return replace(self, points=self.points[rows], columns=columns, times=times, msg=None)
+
+
+def check_points(points: object) -> None:
+    """Raise ValueError unless points are an array (N, 3) of float32 or float64."""
+    if isinstance(points, np.ma.MaskedArray):
+        raise ValueError('points: a MaskedArray, expected an array: points.filled(np.nan)')
+    if not isinstance(points, np.ndarray):
+        raise ValueError(f'points: {type(points).__name__}, expected an array (N, 3)')
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f'points: shape {points.shape}, expected (N, 3)')
+    if points.dtype not in (np.float32, np.float64):
+        raise ValueError(f'points: dtype {points.dtype}, expected float32 or float64')

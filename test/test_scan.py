@@ -2,10 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scan: accepted content and refused input."""
 
+from dataclasses import replace
+import pickle
+
 import numpy as np
 import pytest
 
 from surfel_mapper import Scan
+from surfel_mapper.scan import LazyPoints
 
 POINTS = np.arange(12.0).reshape(4, 3)
 
@@ -40,3 +44,55 @@ def test_columns_go_with_the_points_that_are_selected():
     np.testing.assert_array_equal(chosen.columns['ring'], [2, 0])
     masked = scan(ring=np.arange(4)).select(np.array([False, True, False, True]))
     np.testing.assert_array_equal(masked.columns['ring'], [1, 3])
+
+
+class Decoding:
+    """Returns the points and counts how often it was asked for them."""
+
+    number = 0
+
+    def __call__(self):
+        self.number += 1
+        return POINTS
+
+
+def test_points_are_decoded_once_when_they_are_first_read():
+    decode = Decoding()
+    lazy = scan(LazyPoints(4, decode), ring=np.arange(4))
+    assert len(lazy) == 4
+    assert decode.number == 0
+
+    assert lazy.points is POINTS
+    assert lazy.points is POINTS
+    assert len(lazy) == 4
+    assert decode.number == 1
+
+
+def test_scans_made_of_a_lazy_one_have_its_points():
+    chosen = scan(LazyPoints(4, Decoding())).select(np.array([3]))
+    np.testing.assert_array_equal(chosen.points, POINTS[3:])
+    moved = replace(scan(LazyPoints(4, Decoding())), T_map_sensor=np.eye(4))
+    assert moved.points is POINTS
+    copied = pickle.loads(pickle.dumps(scan(LazyPoints(4, Decoding()))))
+    np.testing.assert_array_equal(copied.points, POINTS)
+
+
+def test_columns_of_lazy_points_have_a_row_for_each():
+    with pytest.raises(ValueError, match='column ring: 3 rows, expected one for each of 4 points'):
+        scan(LazyPoints(4, Decoding()), ring=np.zeros(3))
+
+
+@pytest.mark.parametrize('made', [scan(), scan(LazyPoints(4, Decoding()))])
+def test_a_scan_has_no_other_attributes(made):
+    with pytest.raises(AttributeError, match="'Scan' object has no attribute 'point'"):
+        made.point  # noqa: B018
+
+
+def test_an_error_in_decoding_is_raised_to_the_reader():
+    def decode():
+        raise MemoryError('of the points')
+
+    lazy = scan(LazyPoints(4, decode))
+    for _ in range(2):
+        with pytest.raises(MemoryError, match='of the points'):
+            lazy.points  # noqa: B018

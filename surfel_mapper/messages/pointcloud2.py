@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 import math
 import struct
@@ -38,7 +39,7 @@ from surfel_mapper.messages.cdr import (
     read_header,
     write_header,
 )
-from surfel_mapper.scan import Scan
+from surfel_mapper.scan import LazyPoints, Scan
 
 UINT32, FLOAT32, FLOAT64 = 6, 7, 8
 
@@ -93,7 +94,8 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
     -------
     Scan
         ``points`` is float32 if x, y and z are, else float64. ``columns`` has every other field
-        in its own type, (N,) or (N, count), read-only and mostly views into the message. Fields
+        in its own type, (N,) or (N, count), read-only and mostly views into the message. Both are
+        decoded when they are first read, so the message must not change before. Fields
         without a name are padding and left out; of fields with the same name the first is taken.
         A cloud without points gives an empty scan without columns.
 
@@ -116,9 +118,10 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
     xyz = [checked_coordinate(fields, name, topic) for name in 'xyz']
     check_overlap(fields, topic)
     points = Points.of(msg, data)
+    lazy: Any = coordinates(points, xyz, budget)
     others = {name: field for name, field in fields.items() if name not in ('x', 'y', 'z')}
     return Scan(
-        points=coordinates(points, xyz, budget),
+        points=lazy,
         stamp_ns=stamp_ns,
         frame_id=frame_id,
         columns=MessageColumns(points, others, budget),
@@ -288,14 +291,21 @@ def column(points: Points, field: Field, budget: Budget) -> npt.NDArray[Any]:
     return values
 
 
-def coordinates(points: Points, xyz: list[Field], budget: Budget) -> npt.NDArray[Any]:
-    """Return three fields as a new (N, 3) array in Fortran order and native byte order."""
+def coordinates(points: Points, xyz: list[Field], budget: Budget) -> LazyPoints:
+    """Return three fields as points that are decoded when they are first read."""
     views = [points.view(f.offset, points.order + DTYPES[f.datatype]) for f in xyz]
-    kinds = {values.dtype for values in views}
     dtype = np.result_type(*views).newbyteorder('=')
     num_points = math.prod(points.shape)
     budget.take(3 * num_points * dtype.itemsize, f'coordinates of {num_points} points')
-    packed: npt.NDArray[Any] = np.empty((num_points, 3), dtype, order='F')
+    return LazyPoints(num_points, partial(packed, views, num_points, dtype))
+
+
+def packed(
+    views: list[npt.NDArray[Any]], num_points: int, dtype: np.dtype[Any]
+) -> npt.NDArray[Any]:
+    """Return three views of all points as a new (N, 3) array in Fortran order."""
+    kinds = {values.dtype for values in views}
+    found: npt.NDArray[Any] = np.empty((num_points, 3), dtype, order='F')
     if len(kinds) == 1 and dtype in kinds:
         # loads numba, for which an `info` of a bag without clouds does not wait
         from surfel_mapper.messages.kernels.coordinates import gather_coordinates
@@ -303,18 +313,18 @@ def coordinates(points: Points, xyz: list[Field], budget: Budget) -> npt.NDArray
         for values in views:
             values.flags.writeable = False  # as of bytes: a writable array is another type
         x, y, z = map(np.atleast_2d, views)
-        gather_coordinates(x, y, z, packed.T)
-        return packed
+        gather_coordinates(x, y, z, found.T)
+        return found
     for axis, values in enumerate(views):  # other byte orders, or float32 beside float64
-        packed[:, axis].reshape(points.shape)[...] = values
-    return packed
+        found[:, axis].reshape(values.shape)[...] = values
+    return found
 
 
 def warm_up() -> None:
     """Compile the kernel that decodes clouds of float32."""
     points = np.zeros((2, 3), np.float32)  # a view of a single one would be contiguous
     cloud = from_columns(dict(zip('xyz', points.T, strict=True)))
-    to_scan(parse_cloud(cloud_bytes(cloud, stamp_ns=0, frame_id='')))
+    assert len(to_scan(parse_cloud(cloud_bytes(cloud, stamp_ns=0, frame_id=''))).points) == 2
 
 
 def from_columns(columns: Mapping[str, npt.NDArray[Any]]) -> CloudBytes:

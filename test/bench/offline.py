@@ -108,7 +108,7 @@ def decode(bag: Path, config: Path) -> None:
     with BagReader(bag) as reader:
         for message in reader.messages({POINTS, ODOMETRY}):
             if message.type == CLOUD:
-                to_scan(reader.decode(message))
+                assert len(to_scan(reader.decode(message)).points)
             else:
                 raw_poses('odometry', message.raw, 'base_link', message.topic)
 

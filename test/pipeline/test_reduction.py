@@ -10,6 +10,7 @@ comes between two scans.
 from __future__ import annotations
 
 from pathlib import Path
+import threading
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.prepared import FilteredScan
 from surfel_mapper.pipeline.reduction import Reduction
 from surfel_mapper.pipeline.regions import Ball
-from surfel_mapper.scan import Scan
+from surfel_mapper.scan import LazyPoints, Scan
 from surfel_mapper.threads import share
 
 S = 10**9
@@ -119,6 +120,28 @@ def test_every_update_is_that_of_one_thread(threads, way, settings_of):
     found += several.insert_ready()
     same(found, expected)
     assert without_times(several) == without_times(one)
+
+
+@pytest.mark.parametrize(('threads', 'is_here'), [(1, True), (2, False)])
+def test_points_are_decoded_by_the_thread_that_reduces_them(threads, is_here):
+    mapper, decoded_by = mapper_with(threads), []
+
+    def decode():
+        decoded_by.append(threading.get_ident())
+        return np.random.default_rng(0).uniform(-3.0, 3.0, (100, 3))
+
+    for number in range(3):
+        mapper.add_pose('odom', 'base_link', number * S, (0.0, 0.0, 0.0), LEVEL)
+        points = LazyPoints(100, decode)
+        mapper.add_scan(Scan(points=points, stamp_ns=number * S, frame_id='lidar'))
+    late = Scan(points=LazyPoints(100, decode), stamp_ns=3 * S, frame_id='lidar')
+    mapper.add_scan(late)  # without a pose it is dropped
+    assert len(list(mapper.insert_ready())) == 3
+    mapper.finish()
+
+    assert mapper.counters.dropped['no_pose'] == 1
+    assert [thread == threading.get_ident() for thread in decoded_by[1:]] == [is_here] * 2
+    assert len(decoded_by) == 3
 
 
 def test_scans_that_wait_together_are_mapped_together():
