@@ -4,9 +4,10 @@
 From a PointCloud2 to the normals of all voxels that changed, by stage, on one core.
 
 ``calls`` are direct calls of map and decoder, ``Mapper`` is the pipeline of node and replay, with
-poses from odometry (its insert includes evict, its reduce decodes the points). ``total`` is measured around all stages, so it is
-slightly more than their sum. Points per second include missing returns. Bytes are those of a
-voxel in the map, with its share of the hash table, and of a voxel of a scan in the window.
+poses from odometry (its insert includes evict, its reduce decodes the points). ``total`` is
+measured around all stages, so it is slightly more than their sum. Points per second include
+missing returns. Bytes are those of a voxel in the map, with its share of the hash table, and of a
+voxel of a scan in the window.
 """
 
 from __future__ import annotations
