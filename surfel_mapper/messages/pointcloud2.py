@@ -324,7 +324,7 @@ def warm_up() -> None:
     """Compile the kernel that decodes clouds of float32."""
     points = np.zeros((2, 3), np.float32)  # a view of a single one would be contiguous
     cloud = from_columns(dict(zip('xyz', points.T, strict=True)))
-    assert len(to_scan(parse_cloud(cloud_bytes(cloud, stamp_ns=0, frame_id=''))).points) == 2
+    _ = to_scan(parse_cloud(cloud_bytes(cloud, stamp_ns=0, frame_id=''))).points  # decodes them
 
 
 def from_columns(columns: Mapping[str, npt.NDArray[Any]]) -> CloudBytes:
