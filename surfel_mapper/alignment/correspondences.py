@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.window import Travel
 
 Floats = npt.NDArray[np.float64]
 Pairs = npt.NDArray[np.int32]
@@ -207,22 +208,12 @@ def path_lengths(T_map_sensor: Floats, frame_ids: Sequence[str] | None = None) -
     T_map_sensor : (S, 4, 4) float64
         Poses, in the order of the path.
     frame_ids : sequence of str, optional
-        Frames of the sensors of the scans, by default all the same. Distances are measured between
-        scans of one frame: sensors that are mounted apart do not travel from one to the other. The
-        path is that of the sensor that travelled farthest.
+        Frames of the sensors of the scans, by default all the same; see Travel.
 
     """
     frames = [''] * len(T_map_sensor) if frame_ids is None else frame_ids
-    path_m, farthest_m = np.empty(len(frames)), 0.0
-    last: dict[str, tuple[Floats, float]] = {}
-    for number, (place, frame) in enumerate(zip(T_map_sensor[:, :3, 3], frames, strict=True)):
-        travelled_m = farthest_m
-        if frame in last:
-            before, travelled_m = last[frame]
-            travelled_m += float(np.sqrt(((place - before) ** 2).sum()))
-        last[frame] = place, travelled_m
-        path_m[number] = farthest_m = max(farthest_m, travelled_m)
-    return path_m
+    travel = Travel()
+    return np.array([travel.add(*scan) for scan in zip(frames, T_map_sensor, strict=True)])
 
 
 def loop_candidates(

@@ -7,8 +7,8 @@ The window keeps the moments of every scan; an evicted scan is subtracted from t
 equals the sum of the scans in the window at any time, to the bit. A new scan is added before old
 ones are evicted, so that a voxel observed by both is not removed and created again.
 
-Distances are measured between scans of one frame: sensors that are mounted apart do not travel
-from one to the other. The window has travelled as far as the sensor that travelled farthest.
+Distances are measured between scans of one frame (Travel); alignment and loops measure theirs so
+too.
 
 (One module because it is one class and its scans; the rest is the description of its methods.)
 """
@@ -91,6 +91,45 @@ class Eviction:
     fallen: npt.NDArray[np.int32]
 
 
+class Travel:
+    """
+    The path of sensors, each measured between its own scans.
+
+    Sensors that are mounted apart do not travel from one to the other.
+
+    Parameters
+    ----------
+    travelled_m : float
+        Path until the first scan, m.
+
+    Attributes
+    ----------
+    travelled_m : float
+        Path of the sensor that travelled farthest, m.
+
+    """
+
+    def __init__(self, travelled_m: float = 0.0) -> None:
+        self.travelled_m = travelled_m
+        self._last: dict[str, tuple[npt.NDArray[np.float64], float]] = {}
+
+    def add(self, frame_id: str, T_map_sensor: npt.NDArray[np.float64]) -> float:
+        """Add the pose (4, 4) of a scan of a frame; return the path until then, m."""
+        own_m = self.travelled_m
+        if frame_id in self._last:
+            T_map_last, own_m = self._last[frame_id]
+            step = T_map_sensor[:3, 3] - T_map_last[:3, 3]
+            own_m += float(np.sqrt((step * step).sum()))
+        self._last[frame_id] = T_map_sensor, own_m
+        self.travelled_m = max(self.travelled_m, own_m)
+        return self.travelled_m
+
+    def last_pose(self, frame_id: str) -> npt.NDArray[np.float64] | None:
+        """Return the pose (4, 4) of a frame added last, None without any."""
+        last = self._last.get(frame_id)
+        return None if last is None else last[0]
+
+
 class SlidingWindow:
     """
     The scans of a map, oldest first.
@@ -130,14 +169,12 @@ class SlidingWindow:
         self.keeps_scans = False
         self._map = surfel_map
         self._scans: deque[tuple[WindowedScan, float]] = deque()
-        self._last: dict[str, tuple[npt.NDArray[np.float64], float]] = {}
         self._reset()
 
     def _reset(self) -> None:
         self._scans.clear()
-        self._last.clear()
+        self._travel = Travel()
         self._num_settled = 0
-        self._travelled_m = 0.0
         self._nbytes = 0
 
     def __len__(self) -> int:
@@ -165,8 +202,7 @@ class SlidingWindow:
         None if no scan of the frame was added since the window was cleared or restored; after
         ``move`` the kept scans alone count, as evicted ones have no pose that fits the others.
         """
-        last = self._last.get(frame_id)
-        return None if last is None else last[0]
+        return self._travel.last_pose(frame_id)
 
     def insert(self, scan: WindowedScan, min_points: int = 1) -> list[Eviction]:
         """
@@ -288,10 +324,9 @@ class SlidingWindow:
                 self._map.remove(old[place].moments)
                 undo.callback(self._map.insert, old[place].moments)
             undo.pop_all()
-        travelled_m = self._scans[0][1] if self._scans else 0.0
+        self._travel = Travel(self._scans[0][1] if self._scans else 0.0)
         self._scans.clear()
-        self._last.clear()
-        self._nbytes, self._travelled_m = 0, travelled_m
+        self._nbytes = 0
         for place, scan in enumerate(old):
             self._append(scans.get(place, scan))
         return unpack_keys(np.setdiff1d(full, self._full(left, min_points)))
@@ -307,14 +342,7 @@ class SlidingWindow:
         self._map.clear()
 
     def _append(self, scan: WindowedScan) -> None:
-        travelled_m = self._travelled_m
-        if scan.frame_id in self._last:
-            T_map_last, travelled_m = self._last[scan.frame_id]
-            step = scan.T_map_sensor[:3, 3] - T_map_last[:3, 3]
-            travelled_m += float(np.sqrt((step * step).sum()))
-        self._last[scan.frame_id] = scan.T_map_sensor, travelled_m
-        self._travelled_m = max(self._travelled_m, travelled_m)
-        self._scans.append((scan, self._travelled_m))
+        self._scans.append((scan, self._travel.add(scan.frame_id, scan.T_map_sensor)))
         self._nbytes += scan.nbytes
 
     @property
@@ -341,7 +369,7 @@ class SlidingWindow:
         limits = {
             'max_scans': (len(self._scans), config.max_scans),
             'max_age_s': (age_ns, round(config.max_age_s * 1e9)),
-            'max_distance_m': (self._travelled_m - travelled_m, config.max_distance_m),
+            'max_distance_m': (self._travel.travelled_m - travelled_m, config.max_distance_m),
             'max_bytes': (self._nbytes, config.max_bytes),
             'max_voxels': (num_voxels, self.max_voxels),
             'max_total_bytes': (total_bytes, self.max_total_bytes),
