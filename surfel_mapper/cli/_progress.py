@@ -106,12 +106,13 @@ def stopped_by_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 @contextmanager
-def interrupted_by_sigterm() -> Iterator[None]:
+def interrupted_by_sigterm(*, ends_process: bool = False) -> Iterator[None]:
     """
     Raise KeyboardInterrupt at the first SIGTERM in a block, so that temporary files are removed.
 
     Later ones are ignored: `timeout` sends it to the process and to its group, and the second must
-    not interrupt the removal. Outside of the main thread nothing changes.
+    not interrupt the removal. If the first ends the process, later ones are ignored after the
+    block too: they would replace the exit code. Outside of the main thread nothing changes.
     """
     before: dict[int, Any] = {}
 
@@ -129,6 +130,8 @@ def interrupted_by_sigterm() -> Iterator[None]:
     try:
         yield
     finally:
+        if ends_process and signal.getsignal(signal.SIGTERM) is signal.SIG_IGN:
+            del before[signal.SIGTERM]
         if signal.SIGALRM in before:
             signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in before.items():

@@ -69,7 +69,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     handler.setFormatter(LineFormatter(f'surfel-mapper {args.verb}: %(message)s'))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
     try:
-        with nullcontext() if args.verb in WITH_SIGNALS else interrupted_by_sigterm():
+        ends_early = interrupted_by_sigterm(ends_process=argv is None)
+        with nullcontext() if args.verb in WITH_SIGNALS else ends_early:
             code = int(args.run(args))
         sys.stdout.flush()
         return code

@@ -35,6 +35,20 @@ from surfel_mapper.cli import _progress, main
 _progress.EVERY_S = 0.02
 sys.exit(main.main())
 """
+ALONE = """
+import sys
+from surfel_mapper.cli import main
+sys.exit(main.main())
+"""
+"""As the installed script; with ``python -m`` an interrupt within an import ends Python (3.11) by
+SIGINT, also if it was caught."""
+WITH_LATE_SIGTERM = """
+import signal, sys
+from surfel_mapper.cli import main
+code = main.main()
+signal.raise_signal(signal.SIGTERM)
+sys.exit(code)
+"""
 
 
 def test_lines_state_progress_rate_and_time_left(monkeypatch, capsys):
@@ -193,25 +207,41 @@ def test_sigterm_ends_a_replay_early_and_the_map_is_written(command, tmp_path):
     assert read_map(tmp_path / 'out' / 'map.parquet').digest() == summary['digest']
 
 
-@pytest.mark.parametrize('with_timeout', [False, True])
-def test_sigterm_of_another_verb_leaves_no_hidden_directory(tmp_path, with_timeout):
-    program = [sys.executable, '-m', 'surfel_mapper.cli.main', 'simulate', 'street']
-    options = ['--scans', '1000000', '--speed', '0', '--columns', '64']
-    command = [*program, *options, '--output', str(tmp_path / 'street')]
-    if with_timeout:
-        command = ['timeout', '--preserve-status', str(WAIT_S), *command]
+def interrupted_simulation(program, output):
+    """Send SIGTERM to a simulation; return its exit code, stderr, and the hidden directory."""
+    options = ['--scans', '1000000', '--speed', '0', '--columns', '64', '--output', str(output)]
+    command = [*program, 'simulate', 'street', *options]
     with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
         until_s = time.monotonic() + WAIT_S
-        while not list(tmp_path.rglob('*.mcap')) and time.monotonic() < until_s:
+        while not list(output.parent.rglob('*.mcap')) and time.monotonic() < until_s:
             time.sleep(0.01)
-        (hidden,) = tmp_path.iterdir()
+        (hidden,) = output.parent.iterdir()
         process.send_signal(signal.SIGTERM)
         _, said = process.communicate(timeout=WAIT_S)
+    return process.returncode, said, hidden
 
-    assert process.returncode == 130
+
+@pytest.mark.parametrize('with_timeout', [False, True])
+def test_sigterm_of_another_verb_leaves_no_hidden_directory(tmp_path, with_timeout):
+    program = [sys.executable, '-c', ALONE]
+    if with_timeout:
+        program = ['timeout', '--preserve-status', str(WAIT_S), *program]
+
+    code, said, hidden = interrupted_simulation(program, tmp_path / 'street')
+
+    assert code == 130
     assert said.endswith(b'surfel-mapper simulate: interrupted\n')
     assert hidden.name.startswith('.')
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_late_second_sigterm_leaves_the_exit_code_as_it_is(tmp_path):
+    program = [sys.executable, '-c', WITH_LATE_SIGTERM]
+
+    code, said, _ = interrupted_simulation(program, tmp_path / 'street')
+
+    assert code == 130
+    assert said.endswith(b'surfel-mapper simulate: interrupted\n')
 
 
 def is_underway(shown):
