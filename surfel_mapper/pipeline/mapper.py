@@ -617,8 +617,7 @@ class Mapper:
 
     def _insert(self, scan: Scan, pose: Transform) -> Iterator[Update]:
         """Map a scan whose pose is there, and those that waited for it; yield their updates."""
-        following = self._queue.posed[0] if self._queue.posed else None
-        updates = self._inserter.insert(scan, pose, self.config, following)
+        updates = self._inserter.insert(scan, pose, self.config, tuple(self._queue.posed))
         try:
             yield from updates
         except Exception as error:  # MemoryError too: the next scan may fit
