@@ -43,6 +43,7 @@ from surfel_mapper.alignment.angles import skew
 from surfel_mapper.alignment.kernels.edges import (
     COUNT,
     CROSS_SCATTER,
+    FIRST_PAIR,
     GAP_SQ,
     LINEAR,
     NUM_MOMENTS,
@@ -353,7 +354,7 @@ def weighted_terms(
 
     Parameters
     ----------
-    moments : (E, 74) float64
+    moments : (E, 80) float64
         Moments from weighted_moments.
     T_map_source, T_map_target : (E, 4, 4) float64
         Poses of the scans that each edge connects.
@@ -365,9 +366,13 @@ def weighted_terms(
         Root of the weighted mean of the squared gaps; nan without pairs.
 
     """
+    first = moments[:, FIRST_PAIR:NUM_WEIGHTED].reshape(-1, 2, 3)
+    T_map_source, T_map_target = (
+        _counted_from(T, first[:, end]) for end, T in enumerate((T_map_source, T_map_target))
+    )
     A = (np.linalg.inv(T_map_target) @ T_map_source)[:, :3]
     linear = moments[:, LINEAR:QUADRATIC].reshape(-1, 3, 4)
-    sums = moments[:, QUADRATIC:NUM_WEIGHTED].reshape(-1, 6, 10)
+    sums = moments[:, QUADRATIC:FIRST_PAIR].reshape(-1, 6, 10)
     quadratic = sums[:, _SYMMETRIC][..., _SYMMETRIC_4]
     total = np.trace(quadratic[..., 3, 3], axis1=1, axis2=2)
     center = _center(A, quadratic, total)
@@ -409,6 +414,13 @@ def _information(num: Floats, inertia: Floats, ss: Floats, dropped: dict[int, st
 
 def _floored(ss: Floats, spread: Floats) -> Floats:
     return np.maximum(ss, EXACT * spread)
+
+
+def _counted_from(T: Floats, places: Floats) -> Floats:
+    """Return the transforms (E, 4, 4) of points that are counted from places (E, 3) instead."""
+    result = T.copy()
+    result[:, :3, 3] = _moved(T, places)
+    return result
 
 
 def _moved(T: Floats, points: Floats) -> Floats:
