@@ -31,7 +31,6 @@ INTERNAL = 'internal_error'
 
 REMEDIES = {
     'apart': 'it is in a map of its own; publish the pose of the robot on /initialpose',
-    'bad_cloud': 'the log describes the damage',
     'empty_frame_id': 'set the frame in the driver of the sensor',
     'filter': 'compare the filters with the fields of the clouds',
     'filtered_out': 'are the limits of the filters too narrow?',

@@ -103,11 +103,8 @@ def _drops(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int,
         return
     level = ERROR if share > limits.error_dropped_ratio else WARN
     causes = ', '.join(f'{cause} {number}' for cause, number in dropped.most_common())
-    remedy = REMEDIES.get(dropped.most_common(1)[0][0], '')
-    yield (
-        level,
-        f'{dropped.total()} scans dropped just now ({causes})' + (f': {remedy}' if remedy else ''),
-    )
+    remedy = REMEDIES.get(dropped.most_common(1)[0][0], 'the log says why')
+    yield level, f'{dropped.total()} scans dropped just now ({causes}): {remedy}'
 
 
 def _latency(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:

@@ -61,7 +61,7 @@ def test_the_share_of_drops_decides_between_warning_and_error(num, level):
 
 def test_any_drop_is_a_warning_by_default():
     ((level, text),) = found(DiagnosticsConfig(), received=1000, dropped=Counter(no_points=1))
-    assert (level, text) == (WARN, '1 scans dropped just now (no_points 1)')
+    assert (level, text) == (WARN, '1 scans dropped just now (no_points 1): the log says why')
 
 
 def test_a_pause_is_a_warning_and_its_drops_are_ignored():
