@@ -96,7 +96,12 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
         help='source of the poses (default: pose.source of the configuration; else the first of '
         'tf, odometry, pose that the recording has; else registration)',
     )
-    add('--poses', type=Path, metavar='FILE', help='file of poses of frames.base instead')
+    add(
+        '--poses',
+        type=Path,
+        metavar='FILE',
+        help='file of poses of frames.base instead; without times, they belong to scans by number',
+    )
     add(
         '--poses-format',
         choices=('tum', 'kitti', 'csv'),

@@ -5,7 +5,8 @@ Folders of public data sets, recognised by their layout: scans, times, poses, ca
 
 ``find_dataset`` tries the layouts of KITTI odometry and raw, nuScenes, MulRan, HeLiPR, Newer
 College, NCLT and Boreas. Poses are returned as poses of the lidar, if the folder has them and the
-calibration they need; without, the scans are registered. Each file is read under a budget.
+calibration they need; without, the scans are registered. Of a KITTI drive, a part of the scans may
+have been copied: their names are the numbers of their rows. Each file is read under a budget.
 
 One module: a list of layouts, a function each.
 
@@ -15,7 +16,7 @@ not read, because the folders do not contain the calibration of the lidar.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 import json
 import math
@@ -41,6 +42,7 @@ from surfel_mapper.files.stamps import column_ns, read_dates, read_times
 from surfel_mapper.files.text_lines import finite, read_lines, Rows, table_rows
 from surfel_mapper.files.trajectory import read_trajectory, StampedPoses, Trajectory
 from surfel_mapper.geometry import pose_matrix, quaternions
+from surfel_mapper.offline.scan_times import numbered, rows_of
 
 Floats = npt.NDArray[np.float64]
 
@@ -137,17 +139,15 @@ def kitti_odometry(path: Path) -> Dataset | None:
     files, times = scans_in(path / 'velodyne', '.bin'), path / 'times.txt'
     if not files or not times.is_file():
         return None
-    stamps_ns = read_times(times).tolist()
-    check_number(times, stamps_ns, files)
+    stamps_ns = taken(times, read_times(times), files).tolist()
     candidates = (path / 'poses.txt', path.parent.parent / 'poses' / f'{path.name}.txt')
     poses_path = next((each for each in candidates if each.is_file()), None)
     mount = calibration(path / 'calib.txt').get('Tr')
     if poses_path is None or mount is None:
         return Dataset('KITTI odometry', files, stamps_ns)
-    cameras = read_trajectory(poses_path, 'kitti')
-    check_number(poses_path, cameras, files)
+    cameras = taken(poses_path, read_trajectory(poses_path, 'kitti').matrices, files)
     T_cam_velo = rigid(path / 'calib.txt', mount)
-    poses = np.linalg.inv(T_cam_velo) @ cameras.matrices @ T_cam_velo
+    poses = np.linalg.inv(T_cam_velo) @ cameras @ T_cam_velo
     found = trajectory(times, stamps_ns, poses)
     return Dataset('KITTI odometry', files, stamps_ns, found, poses_path)
 
@@ -158,10 +158,10 @@ def kitti_raw(path: Path) -> Dataset | None:
     files, times = scans_in(folder / 'data', '.bin'), folder / 'timestamps.txt'
     if not files or not times.is_file():
         return None
-    stamps_ns = read_dates(times).tolist()
-    check_number(times, stamps_ns, files)
+    stamps_ns = taken(times, read_dates(times), files).tolist()
     drive = folder.parent
-    oxts = scans_in(drive / 'oxts' / 'data', '.txt')
+    measured = {file.stem: file for file in scans_in(drive / 'oxts' / 'data', '.txt')}
+    oxts = [measured[file.stem] for file in files if file.stem in measured]
     calibrated = drive.parent / 'calib_imu_to_velo.txt'
     mount = calibration(calibrated)
     if len(oxts) != len(files) or not {'R', 'T'} <= mount.keys():
@@ -398,10 +398,15 @@ def rigid(path: Path, numbers: npt.ArrayLike) -> Floats:
     return np.asarray(poses[0], np.float64)
 
 
-def check_number(path: Path, rows: Sized, files: Sequence[Path]) -> None:
-    """Raise FileFormatError unless a file has one row for each scan."""
-    if len(rows) != len(files):
-        raise FileFormatError(f'{path}: {len(rows)} rows for {len(files)} scans, expected as many')
+def taken(path: Path, rows: npt.NDArray[Any], files: Sequence[Path]) -> npt.NDArray[Any]:
+    """Return the row of each scan; raise FileFormatError if not all scans have one."""
+    numbers = rows_of(files, len(rows))
+    if numbers is None:
+        raise FileFormatError(
+            f'{path}: {len(rows)} rows for {len(files)} scans, expected as many, or '
+            f'{numbered(len(rows))}'
+        )
+    return rows[numbers]
 
 
 def stamp_in_name(file: Path, unit_ns: int) -> int:

@@ -55,7 +55,7 @@ class PosePath:
     Attributes
     ----------
     trajectory : Trajectory
-        The poses; if they have no stamps, pose i belongs to scan i.
+        The poses; if they have no stamps, they belong to scans by number.
 
     """
 
@@ -82,7 +82,7 @@ class PosePath:
         stamp_ns : int
             Stamp of the scan.
         number : int
-            Number of the scan on its topic or in its folder, from 0.
+            Number of the pose of the scan, from 0, if poses have no stamps.
 
         Raises
         ------

@@ -5,11 +5,12 @@ Scans in files, one file each, through the pipeline: a folder of them, or a sing
 
 With a file of poses, the scans are in frames.base, whose poses it gives; if
 frames.base_to_sensor is set, they are in a frame called sensor on it. Without poses they are
-registered. The time of a scan is that in the name of its file; else scans follow each other at
-10 Hz. With poses of other times, the time of scan i is that of pose i, if there are as many poses
-as scans; poses without times may be fewer, if each scan of the part has one. Folders of data sets
-have their own layout, times and poses (datasets.py), a capture of an Ouster lidar has all scans in
-one file (ouster_pcap.py).
+registered. The time of a scan is in the name of its file or in a file of times (scan_times.py);
+else scans follow each other at 10 Hz. With as many poses, of other times, the time of scan i is
+that of pose i. Poses without times are those of the scans in their order. There may be fewer, if
+each scan of the part has one, or more, if scans are named by the numbers of their poses. Folders
+of data sets have their own layout, times and poses (datasets.py), a capture of an Ouster lidar has
+all scans in one file (ouster_pcap.py).
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from surfel_mapper.bags.paths import is_storage, METADATA
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError, FileFormatError
 from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
-from surfel_mapper.files.stamps import nanoseconds
 from surfel_mapper.offline import ouster_pcap
 from surfel_mapper.offline.datasets import find_dataset
 from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.offline.pose_choice import choose_for_folder, is_default, pose_summary
 from surfel_mapper.offline.pose_sources import PosePath
 from surfel_mapper.offline.request import part, Request, Span
+from surfel_mapper.offline.scan_times import numbered, rows_of, times_beside, times_in_names
 from surfel_mapper.scan import Scan
 
 if TYPE_CHECKING:
@@ -43,8 +44,8 @@ SURFEL_COLUMNS = {'planarity', 'num_points'}
 PERIOD_NS = 100_000_000
 """Period of scans that have no time: 10 Hz."""
 
-UNITS = {19: 'ns', 16: 'us', 13: 'ms'}
-"""Unit of a whole number in the name of a file, by its number of digits."""
+ASSUMED = 'none: 10 Hz'
+"""Source of such times."""
 
 
 class ScanFolder:
@@ -78,12 +79,14 @@ class ScanFolder:
         if self.dataset is not None:
             self.files, self.format = self.dataset.files, self.dataset.format
         else:
-            self.files = [self.path] if self.path.is_file() else scan_files(self.path)
+            files = [self.path] if self.path.is_file() else scan_files(self.path)
+            self.files = list(times_in_names(files)) or files
         is_free = poses is None and request.poses_from is None
         if self.dataset and self.dataset.trajectory and is_free and is_default(config):
             poses = PosePath(self.dataset.poses_path or self.path, None, self.dataset.trajectory)
         self.poses = poses
-        self.stamps = self._stamps()
+        self.stamps, self.times_from = self._stamps()
+        self._rows, rows_reason = self._pose_rows()
         first = self.first_scan()
         if first is not None and first.columns.keys() >= SURFEL_COLUMNS:
             raise BagError(
@@ -91,7 +94,7 @@ class ScanFolder:
                 'view take them, and map.load begins with map.npz'
             )
         choice = choose_for_folder(request, config, poses is not None, first)
-        self.config, self.pose_reason = choice.config, choice.reason
+        self.config, self.pose_reason = choice.config, choice.reason or rows_reason
         self.span: Span = part(
             str(self.path),
             self.stamps[0],
@@ -101,7 +104,7 @@ class ScanFolder:
             every=request.every,
         )
         if poses is not None and self.num_scans:
-            poses.check_scan(self._numbers[-1])
+            poses.check_scan(self._rows[self._numbers[-1]])
 
     @property
     def num_scans(self) -> int:
@@ -125,6 +128,7 @@ class ScanFolder:
         path = None if self.poses is None else self.poses.path
         return {
             'bag': str(self.path),
+            'times_from': self.times_from,
             'poses': None if path is None else str(path),
             **pose_summary(self.config, path, self.pose_reason),
         }
@@ -167,7 +171,7 @@ class ScanFolder:
             mapper.refuse_clouds('bad_cloud', str(self.path), str(error))
             return
         if self.poses is not None:
-            self.poses.add_for(mapper, stamp_ns, number)
+            self.poses.add_for(mapper, stamp_ns, self._rows[number])
         mapper.add_scan(scan)
 
     def _read(self, number: int, stamp_ns: int, frame: str) -> Scan:
@@ -177,60 +181,50 @@ class ScanFolder:
             points, columns = self.dataset.scan(number)
         return Scan(points=points, stamp_ns=stamp_ns, frame_id=frame, columns=columns)
 
-    def _stamps(self) -> list[int]:
-        """Return the time of every scan."""
-        number = len(self.files)
-        if self.dataset is not None and (self.poses is None or self.poses.has_stamps):
-            return self.dataset.stamps_ns
-        own = times_in_names(self.files) or [PERIOD_NS * at for at in range(number)]
-        if self.poses is None:
-            return own
-        stamps = self.poses.trajectory.stamp_ns
-        if stamps is not None and 2 * len(set(own).intersection(stamps.tolist())) > len(stamps):
-            return own  # poses of these scans by registration, without those that it dropped
-        if stamps is None and len(self.poses.trajectory) > number:
+    def _own_stamps(self) -> tuple[list[int], str]:
+        """Return the times of the scans, ns, by layout, names or file, and their source."""
+        if self.dataset is not None:
+            return self.dataset.stamps_ns, self.format
+        times = times_in_names(self.files)
+        if times:
+            return list(times.values()), 'names'
+        found = times_beside(self.path, self.files) if self.path.is_dir() else None
+        if found is not None:
+            return found[0], str(found[1])
+        return [PERIOD_NS * at for at in range(len(self.files))], ASSUMED
+
+    def _stamps(self) -> tuple[list[int], str]:
+        """Return the time of every scan, ns, and the source of these times."""
+        own, source = self._own_stamps()
+        stamps = None if self.poses is None else self.poses.trajectory.stamp_ns
+        if self.poses is None or stamps is None or self.dataset is not None:
+            return own, source
+        if 2 * len(set(own).intersection(stamps.tolist())) > len(stamps):
+            return own, source  # poses of these scans by registration, without those it dropped
+        if len(stamps) == len(own):
+            return stamps.tolist(), 'poses'
+        if source == ASSUMED:
             raise BagError(
-                f'{self.poses.path}: {len(self.poses.trajectory)} poses without times for '
-                f'{number} scans in {self.path}, expected one for each'
+                f'{self.poses.path}: {len(stamps)} poses for {len(own)} scans in {self.path}, '
+                'expected as many, or times of the scans: in their names (1532402927.647951.pcd), '
+                'or in a times.txt beside them with a line for each'
             )
-        if stamps is None or len(stamps) == number:
-            return [PERIOD_NS * at for at in range(number)] if stamps is None else stamps.tolist()
-        try:
-            times = [name_ns(file) for file in self.files]
-        except FileFormatError as error:
+        return own, source
+
+    def _pose_rows(self) -> tuple[list[int], str]:
+        """Return the number of the pose of every scan, for poses without times, and its reason."""
+        num_scans = len(self.files)
+        num_poses = 0 if self.poses is None else len(self.poses.trajectory)
+        if self.poses is None or self.poses.has_stamps or num_poses <= num_scans:
+            return list(range(num_scans)), ''
+        rows = rows_of(self.files, num_poses)
+        if rows is None:
             raise BagError(
-                f'{self.poses.path}: {len(stamps)} poses for {number} scans, expected as many, '
-                f'or names that are times: {error}'
-            ) from error
-        if times != sorted(set(times)):
-            raise BagError(f'{self.path}: the names of its files are no ascending times')
-        return times
-
-
-def times_in_names(files: list[Path]) -> list[int]:
-    """Return the times in the names of files; empty if they are numbers or words."""
-    texts = [stem(file) for file in files]
-    if not all('.' in text or len(text) in UNITS for text in texts):
-        return []
-    try:
-        times = [name_ns(file) for file in files]
-    except FileFormatError:
-        return []
-    return times if times == sorted(set(times)) else []
-
-
-def name_ns(file: Path) -> int:
-    """Return the time in the name of a file: 1532402927.647951.pcd, 1532402927647951.pcd.bin."""
-    text = stem(file)
-    return nanoseconds(text, str(file), UNITS.get(len(text), ''))
-
-
-def stem(file: Path) -> str:
-    """Return the name of a file without its endings of scans."""
-    text = file.name
-    for suffix in ('.bin', *SUFFIXES):
-        text = text.removesuffix(suffix)
-    return text
+                f'{self.poses.path}: {num_poses} poses without times for {num_scans} scans in '
+                f'{self.path}, expected one for each, {numbered(num_poses)}, or poses with times '
+                '(TUM)'
+            )
+        return rows, f'{self.files[0].name} has pose {rows[0]}, counted from 0, of {num_poses}'
 
 
 def is_scans(path: Path) -> bool:

@@ -61,6 +61,51 @@ def test_a_wrong_number_of_times_is_refused(tmp_path):
         find_dataset(path)
 
 
+@pytest.mark.parametrize('make', [folders.kitti_odometry, folders.kitti_raw])
+def test_the_scans_left_of_a_kitti_drive_have_their_own_times_and_poses(tmp_path, make):
+    path, _, stamps_ns = make(tmp_path)
+    next(path.rglob('*0001.bin')).unlink()
+
+    found = find_dataset(path)
+
+    assert found.stamps_ns == found.trajectory.stamp_ns.tolist() == [stamps_ns[0], stamps_ns[2]]
+    np.testing.assert_allclose(found.trajectory.matrices, lidar_poses()[::2], atol=1e-6)
+
+
+@pytest.mark.parametrize('name', ['000007.bin', 'last.bin'])
+def test_more_times_of_a_drive_than_scans_are_refused_if_names_are_not_their_numbers(
+    tmp_path, name
+):
+    path, _, _ = folders.kitti_odometry(tmp_path)
+    velodyne = path / 'velodyne'
+    (velodyne / '000001.bin').unlink()
+    (velodyne / '000002.bin').rename(velodyne / name)
+    says = (
+        'times.txt: 3 rows for 2 scans, expected as many, or scans named by the numbers of .* 2$'
+    )
+    with pytest.raises(FileFormatError, match=says):
+        find_dataset(path)
+
+
+def test_scans_of_a_drive_without_their_oxts_are_registered(tmp_path):
+    path, _, stamps_ns = folders.kitti_raw(tmp_path)
+    (path / 'oxts' / 'data' / '0000000001.txt').unlink()
+
+    found = find_dataset(path)
+
+    assert (found.stamps_ns, found.trajectory) == (stamps_ns, None)
+
+
+def test_scans_of_a_data_set_keep_their_times_at_other_poses_without_times(tmp_path):
+    path, _, stamps_ns = folders.nuscenes(tmp_path)
+    poses = tmp_path / 'poses.txt'
+    poses.write_text(folders.lines(pose[:3] for pose in lidar_poses()))
+
+    with open_recording(Request(path=path, poses=poses), Config()) as recording:
+        assert recording.stamps == stamps_ns
+        assert recording.times_from == 'nuScenes data set'
+
+
 def test_points_of_helipr_carry_times(tmp_path):
     path, _, _ = folders.helipr(tmp_path)
     (path / 'LiDAR_GT' / 'Ouster_gt.txt').unlink()
