@@ -21,10 +21,9 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.models.bspline_multigrid import least_squares
 from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.kernels.bspline import (
-    add_differences,
-    add_equations,
     clamped_knots,
     evaluate_basis,
     evaluate_field,
@@ -256,22 +255,19 @@ def fit_pspline(
     smoothing : float
         Weight of the second differences, for a mean weight of 1.
 
+    Notes
+    -----
+    Up to 100 x 100 cells the equations are solved to rounding, larger ones to TOLERANCE of
+    models/bspline_multigrid.py, in time and memory in proportion to the number of cells.
+
     """
     if start.control.shape[1] > start.control.shape[0]:  # the bandwidth is the short side
         turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, smoothing)
         return transposed(turned)
-    num_x, num_y = start.control.shape
-    reach = max(start.degrees[0] * num_y + start.degrees[1], 2 * num_y)
-    band, right = np.zeros((num_x * num_y, reach + 1)), np.zeros(num_x * num_y)
-    add_equations(np.column_stack([xy, z]), weight / weight.mean(), start.parts(), band, right)
-    add_differences(*start.greville(), smoothing, band)
-    band[:, 0] += RIDGE
-    from scipy.linalg import solveh_banded  # seconds to import
-
-    right = solveh_banded(band.T, right, lower=True, check_finite=False, overwrite_ab=True)
-    return HeightField(
-        start.pitch_m, start.origin, start.degrees, right.reshape(start.control.shape)
-    )
+    samples, share = np.column_stack([xy, z]), weight / weight.mean()
+    rules = smoothing, RIDGE
+    control = least_squares(samples, share, start.parts(), start.greville(), rules)
+    return HeightField(start.pitch_m, start.origin, start.degrees, control)
 
 
 def is_small(sizes: npt.NDArray[np.int64], degree: int) -> npt.NDArray[np.bool_]:

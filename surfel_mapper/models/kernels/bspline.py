@@ -1,15 +1,23 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-B-spline basis functions, height fields of them, and the banded solve of their normal equations.
+B-spline basis functions, height fields of them, and their normal equations.
 
 Each sample is processed in registers: temporary arrays of its sixteen weights take three times as
 long. For a field of a hundred control points, LAPACK's argument checks take longer than the solve.
 
-A band matrix is symmetric and stored by rows: band[i, k] is the entry of row i and column i + k.
+The normal equations are a symmetric matrix of the control points, counted y within x, of which the
+entries on and above the diagonal are stored by rows, in one of two layouts:
 
-Source: de Boor 1972 (recurrence); Golub and Van Loan, Matrix Computations, section 4.3 (banded
-Cholesky factorisation).
+band      band[i, k] is the entry of row i and column i + k
+stencils  stencils[i, dx * stride + dy] is the entry of row i and the control point dx and dy
+          farther, both up to a reach, stride = 2 reach + 1: 25 columns for degree 3
+
+The same kernels add to both, as dx * Ny + dy is the column of a band, so this is one module.
+Vectors that stencils are multiplied with continue with zeros, up to the largest offset.
+
+Source: de Boor 1972 (recurrence); Golub and Van Loan, Matrix Computations, sections 4.3 (banded
+Cholesky factorisation) and 10.1 (Gauss-Seidel); Hackbusch 1985 (coarse matrices).
 """
 
 import math
@@ -107,14 +115,15 @@ def evaluate_field(xy, field, height):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def add_equations(xyz, weight, field, band, right):
+def add_equations(xyz, weight, field, stride, matrix, right):
     """
-    Add the normal equations of weighted least squares for samples to a band matrix, in place.
+    Add the normal equations of weighted least squares for samples to a matrix, in place.
 
     xyz     (M, 3) float64, m
     weight  (M,) float64
     field   see evaluate_field
-    band    (n, W) float64, n control points, y within x
+    stride  of the columns, from a control point to the next along x
+    matrix  (n, W) float64, n control points: a band or stencils
     right   (n,) float64
     """
     origin, pitch, degrees, knots, control = field
@@ -126,7 +135,9 @@ def add_equations(xyz, weight, field, band, right):
     lower = np.empty(max(degree_x, degree_y) + 1)
     across = degree_y + 1
     rows = np.empty((degree_x + 1) * across, np.int64)
-    values = np.empty(len(rows))
+    columns, values = np.empty(len(rows), np.int64), np.empty(len(rows))
+    for p in range(len(rows)):
+        columns[p] = p // across * stride + p % across
     for i in range(len(xyz)):
         u = parameter(xyz[i, 0], origin[0], pitch, width_x)
         v = parameter(xyz[i, 1], origin[1], pitch, width_y)
@@ -140,23 +151,24 @@ def add_equations(xyz, weight, field, band, right):
             row, value = rows[p], weight[i] * values[p]
             right[row] += value * xyz[i, 2]
             for q in range(p, len(rows)):
-                band[row, rows[q] - row] += value * values[q]
+                matrix[row, columns[q] - columns[p]] += value * values[q]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def add_differences(places_x, places_y, smoothing, band):
+def add_differences(places_x, places_y, smoothing, stride, matrix):
     """
-    Add the squared second differences along both axes to a band matrix, in place.
+    Add the squared second differences along both axes to a matrix, in place.
 
     places_x   (Nx + 2,) float64, Greville abscissae along x; places_y: along y
     smoothing  weight of the squares
-    band       (n, W) float64, n control points, y within x
+    stride     of the columns, from a control point to the next along x
+    matrix     (n, W) float64, n control points: a band or stencils
     """
     num_x, num_y = len(places_x), len(places_y)
     second = np.empty(3)
     for axis in range(2):
         places = places_x if axis == 0 else places_y
-        step, others = (num_y, num_y) if axis == 0 else (1, num_x)
+        step, apart, others = (num_y, stride, num_y) if axis == 0 else (1, 1, num_x)
         for i in range(len(places) - 2):
             before, after = places[i + 1] - places[i], places[i + 2] - places[i + 1]
             second[0] = 2.0 * after / (before + after)
@@ -167,7 +179,7 @@ def add_differences(places_x, places_y, smoothing, band):
                 for j in range(3):
                     for k in range(j, 3):
                         product = smoothing * second[j] * second[k]
-                        band[first + j * step, (k - j) * step] += product
+                        matrix[first + j * step, (k - j) * apart] += product
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -196,6 +208,101 @@ def solve_band(band, right):
         for k in range(1, min(width, number - i)):
             value -= band[i, k] * right[i + k]
         right[i] = value / band[i, 0]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def multiply_stencils(stencils, offsets, x, result):
+    """
+    Multiply a vector by a matrix.
+
+    stencils  (n, W) float64
+    offsets   (W,) int64, from a control point to that of each column; the first is 0
+    x         (n + the largest offset,) float64, 0 from n on
+    result    like x, out
+    """
+    result[:] = 0.0
+    for i in range(len(stencils)):
+        value, total = x[i], stencils[i, 0] * x[i]
+        for k in range(1, len(offsets)):
+            other = np.uint64(i + offsets[k])  # unsigned: no wrap-around checks
+            total += stencils[i, k] * x[other]
+            result[other] += stencils[i, k] * value
+        result[i] += total
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def relax_forward(stencils, offsets, right, x, residual):
+    """
+    Start from 0 and make a Gauss-Seidel sweep, first control point first.
+
+    stencils, offsets   see multiply_stencils
+    right, x, residual  vectors like x there; x and residual are out
+
+    With the matrix L + D + U, the sweep solves (L + D) x = right: the residual is -U x.
+    """
+    x[:] = right
+    for i in range(len(stencils)):
+        x[i] = value = x[i] / stencils[i, 0]
+        for k in range(1, len(offsets)):
+            x[np.uint64(i + offsets[k])] -= stencils[i, k] * value
+    for i in range(len(stencils)):
+        total = 0.0
+        for k in range(1, len(offsets)):
+            total -= stencils[i, k] * x[np.uint64(i + offsets[k])]
+        residual[i] = total
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def relax_backward(stencils, offsets, right, x, rest):
+    """
+    Make a Gauss-Seidel sweep, last control point first, in place: the adjoint of relax_forward.
+
+    stencils, offsets  see multiply_stencils
+    right, x, rest     vectors like x there; x is changed, rest is out: right - L x
+    """
+    rest[:] = right
+    for i in range(len(stencils)):
+        value = x[i]
+        for k in range(1, len(offsets)):
+            rest[np.uint64(i + offsets[k])] -= stencils[i, k] * value
+    for i in range(len(stencils) - 1, -1, -1):
+        total = rest[i]
+        for k in range(1, len(offsets)):
+            total -= stencils[i, k] * x[np.uint64(i + offsets[k])]
+        x[i] = total / stencils[i, 0]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def coarsen_stencils(stencils, num_y, reach, coarse):
+    """
+    Halve the control points along x, and exchange the axes.
+
+    stencils  (num_x * num_y, W) float64, A
+    num_y     control points along y
+    reach     of the stencils, at least 3
+    coarse    (num_y * ((num_x + 5) // 2), W) float64, all 0; out, x within y: P^T A P, where
+              P refines a uniform cubic spline along x
+    """
+    stride, num_x = 2 * reach + 1, len(stencils) // num_y
+    halves = (num_x + 5) // 2
+    share = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 8.0
+    for i in range(len(stencils)):
+        x, y = i // num_y, i % num_y
+        for dx in range(reach + 1):
+            for dy in range(0 if dx == 0 else -reach, reach + 1):
+                entry, both = stencils[i, dx * stride + dy], dx > 0 or dy != 0
+                if entry == 0.0:
+                    continue
+                for one in range((x + 1) // 2, (x + 4) // 2 + 1):
+                    part = entry * share[x + 4 - 2 * one]
+                    for two in range((x + dx + 1) // 2, (x + dx + 4) // 2 + 1):
+                        value, step = part * share[x + dx + 4 - 2 * two], two - one
+                        if dy > 0 or (dy == 0 and step > 0):
+                            coarse[y * halves + one, dy * stride + step] += value
+                        elif dy == 0 and step == 0:
+                            coarse[y * halves + one, 0] += 2.0 * value if both else value
+                        elif both:
+                            coarse[(y + dy) * halves + two, -dy * stride - step] += value
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -264,9 +371,10 @@ def fit_fields(sums, cells, chosen, pitches, origins, rules, begin, control, hei
         width = max(degrees[0] * num_y + degrees[1], 2 * num_y) + 1
         band, right = np.zeros((num_x * num_y, width)), np.zeros(num_x * num_y)
         field = origin, pitch, degrees, knot, np.empty((num_x, num_y))
-        add_equations(xyz[:used], weight[:used], field, band, right)
+        add_equations(xyz[:used], weight[:used], field, num_y, band, right)
         places_x = greville_places(knot[0], degrees[0], pitch)
-        add_differences(places_x, greville_places(knot[1], degrees[1], pitch), smoothing, band)
+        places_y = greville_places(knot[1], degrees[1], pitch)
+        add_differences(places_x, places_y, smoothing, num_y, band)
         for i in range(len(right)):
             band[i, 0] += ridge
         solve_band(band, right)
