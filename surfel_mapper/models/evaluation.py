@@ -50,6 +50,7 @@ def compare(
     model: npt.NDArray[np.float64],
     reference: npt.NDArray[Any],
     *,
+    weight: npt.NDArray[np.float64],
     near_m: float,
     counts: tuple[int, int, int],
     size_bytes: int,
@@ -63,6 +64,8 @@ def compare(
         Points sampled from the models.
     reference : (..., 3) float, m
         The cloud as it came from the sensor, not thinned; points that are not finite are left out.
+    weight : (M,) float64
+        Points that each point of the models stands for.
     near_m : float
         Points of the cloud nearer than this are covered.
     counts : (int, int, int)
@@ -76,8 +79,8 @@ def compare(
     precise, complete = nearest(model, cloud), nearest(cloud, model)
     num_planes, num_surfaces, num_gaussians = counts
     return Evaluation(
-        precision_rms_m=rms(precise),
-        precision_p95_m=p95(precise),
+        precision_rms_m=rms(precise, weight),
+        precision_p95_m=p95(precise, weight),
         completeness_rms_m=rms(complete),
         completeness_p95_m=p95(complete),
         coverage=float(np.mean(complete < near_m)) if complete.size else np.nan,
@@ -101,11 +104,22 @@ def nearest(
     return distance
 
 
-def rms(values: npt.NDArray[np.float64]) -> float:
-    """Return the root mean square; nan for no values."""
-    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
+def rms(values: npt.NDArray[np.float64], weight: npt.NDArray[np.float64] | None = None) -> float:
+    """Return the root mean square, weighted; nan for no values."""
+    return float(np.sqrt(np.average(values**2, weights=weight))) if values.size else np.nan
 
 
-def p95(values: npt.NDArray[np.float64]) -> float:
-    """Return the 95th percentile; nan for no values."""
-    return float(np.percentile(values, 95.0)) if values.size else np.nan
+def p95(values: npt.NDArray[np.float64], weight: npt.NDArray[np.float64] | None = None) -> float:
+    """
+    Return the 95th percentile; nan for no values.
+
+    If weights differ, it is the least value with 95 % of the weight up to it, without
+    interpolation.
+    """
+    if not values.size:
+        return np.nan
+    if weight is None or (weight == weight[0]).all():
+        return float(np.percentile(values, 95.0))
+    order = np.argsort(values)
+    total = np.cumsum(weight[order])
+    return float(values[order[np.searchsorted(total, 0.95 * total[-1])]])

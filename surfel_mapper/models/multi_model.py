@@ -32,6 +32,12 @@ GAUSSIAN_BYTES = 4 + 8 + 12 + 24 + 4
 SIGMAS = 3.0
 """Samples of a Gaussian beyond this number of sigmas are drawn again."""
 
+SAMPLES_PER_VOXEL = 2.0
+"""
+A Gaussian has at most this number of samples a voxel along each axis of its box of SIGMAS, plus
+one: 88 if it fills one voxel evenly. A thinned cloud, one point a voxel, has fewer points.
+"""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
@@ -135,7 +141,7 @@ class Gaussians:
     id : (G,) int64
         Their labels.
     num_points : (G,) int64
-        Points of the thinned cloud.
+        Points of the thinned cloud; in a map, all points.
     mean : (G, 3) float64, m
     covariance : (G, 3, 3) float64, m^2
 
@@ -150,22 +156,49 @@ class Gaussians:
         """Return the number of Gaussians."""
         return len(self.id)
 
-    def samples(self, seed: int = 0) -> Array:
+    def sample_counts(self, voxel_size_m: float) -> npt.NDArray[np.int64]:
         """
-        Draw num_points points of each, (M, 3), none farther out than SIGMAS.
+        Return how many samples stand for the points of each, (G,).
+
+        One a point, see SAMPLES_PER_VOXEL for the most: voxels of a map without a window gain
+        points with every scan. A sample of a Gaussian with more points has a larger weight,
+        num_points by this number.
+
+        Parameters
+        ----------
+        voxel_size_m : float
+            Edge of the voxels, m.
+
+        """
+        sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance), 0.0))
+        per_axis = 1.0 + SAMPLES_PER_VOXEL / voxel_size_m * 2.0 * SIGMAS * sigma
+        most = np.minimum(per_axis.prod(axis=1), np.iinfo(np.int32).max)
+        counts: npt.NDArray[np.int64] = np.minimum(self.num_points, most.astype(np.int64))
+        return counts
+
+    def samples(self, seed: int = 0, counts: npt.NDArray[np.int64] | None = None) -> Array:
+        """
+        Draw points of each, (M, 3), none farther out than SIGMAS.
 
         Without that limit the tails alone make the samples a tenth less precise.
+
+        Parameters
+        ----------
+        seed : int
+            Seed of the samples.
+        counts : (G,) int64, optional
+            Number of points of each; num_points if omitted.
+
         """
+        counts = self.num_points if counts is None else counts
         values, vectors = np.linalg.eigh(self.covariance)
-        scale = np.repeat(np.sqrt(np.maximum(values, 0.0)), self.num_points, axis=0)
+        scale = np.repeat(np.sqrt(np.maximum(values, 0.0)), counts, axis=0)
         rng = np.random.default_rng(seed)
         drawn = rng.standard_normal(scale.shape)
         while (far := np.flatnonzero((drawn**2).sum(axis=1) > SIGMAS**2)).size:
             drawn[far] = rng.standard_normal((len(far), 3))
-        turned = np.einsum(
-            'nij,nj->ni', np.repeat(vectors, self.num_points, axis=0), drawn * scale
-        )
-        points: Array = turned + np.repeat(self.mean, self.num_points, axis=0)
+        turned = np.einsum('nij,nj->ni', np.repeat(vectors, counts, axis=0), drawn * scale)
+        points: Array = turned + np.repeat(self.mean, counts, axis=0)
         return points
 
     @property
@@ -232,6 +265,9 @@ class MultiModel:
         """
         Return a cloud (M, 3) sampled from the models, m.
 
+        Its size is bounded by the volume of the models, however many points a map has: see
+        Gaussians.sample_counts.
+
         Parameters
         ----------
         step_m : float, optional
@@ -249,11 +285,15 @@ class MultiModel:
         if not 0.0 < step_m < math.inf:
             raise ValueError(f'step_m: {step_m:g}, expected a positive distance, m')
         parts = [patch.samples(step_m) for patch in self.patches]
-        return np.concatenate([*parts, self.gaussians.samples(seed)])
+        counts = self.gaussians.sample_counts(self.voxel_size_m)
+        return np.concatenate([*parts, self.gaussians.samples(seed, counts)])
 
     def evaluate(self, reference: npt.NDArray[Any], seed: int = 0) -> Evaluation:
         """
         Compare samples of the models with a cloud.
+
+        The expected precision is that of one sample for each point of a Gaussian, as samples that
+        stand for several have their weight. Completeness is that of the samples.
 
         Parameters
         ----------
@@ -264,9 +304,14 @@ class MultiModel:
             Seed of the samples of Gaussians.
 
         """
+        samples, points = self.resample(seed=seed), self.gaussians.num_points
+        counts = self.gaussians.sample_counts(self.voxel_size_m)
+        weight = np.ones(len(samples))
+        weight[len(samples) - counts.sum() :] = np.repeat(points / np.maximum(counts, 1), counts)
         return compare(
-            self.resample(seed=seed),
+            samples,
             reference,
+            weight=weight,
             near_m=self.voxel_size_m,
             counts=(len(self.planes), len(self.surfaces), len(self.gaussians)),
             size_bytes=self.size_bytes,

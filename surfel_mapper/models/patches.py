@@ -78,10 +78,10 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     a = config.voxel_size_m
     means, frames = np.empty((number, 3)), np.empty((number, 3, 3))
     covariances, curved = np.empty((number, 3, 3)), np.empty(number, np.bool_)
-    thickness = groups.thickness
+    thickness, bent = groups.thickness, not by_paper
     if groups.curved is not None:
-        thickness = np.where(groups.curved, 0.0, np.inf)
-    rules = (thickness, SURFACE_PITCH_VOXELS * a, not by_paper, not by_paper)
+        thickness, bent = np.where(groups.curved, 0.0, np.inf), False
+    rules = (thickness, SURFACE_PITCH_VOXELS * a, bent, not by_paper)
     describe_patches(
         groups.points,
         groups.starts,
