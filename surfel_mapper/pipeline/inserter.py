@@ -204,7 +204,7 @@ class Inserter:
         scan: Scan,
         pose: Transform,
         config: Config,
-        following: Sequence[tuple[Scan, Transform]] = (),
+        following: tuple[Scan, Transform] | None = None,
     ) -> Iterator[Update]:
         """
         Map a scan, and those before it that waited for it; yield the update of each.
@@ -217,8 +217,8 @@ class Inserter:
             T_fixed_sensor.
         config : Config
             All settings.
-        following : scans and poses, optional
-            The next scans, which another thread begins to prepare; only if it prepares any ahead.
+        following : Scan and pose, optional
+            The next scan, which another thread begins to prepare; only if it prepares any ahead.
 
         """
         laps = Laps()
@@ -255,7 +255,7 @@ class Inserter:
         self,
         prepared: Prepared,
         config: Config,
-        following: Sequence[tuple[Scan, Transform]],
+        following: tuple[Scan, Transform] | None,
         laps: Laps,
     ) -> Update | None:
         """Insert a prepared scan; None if the map refuses it."""
@@ -304,7 +304,7 @@ class Inserter:
     def _add_to_map(
         self,
         prepared: Prepared,
-        following: Sequence[tuple[Scan, Transform]],
+        following: tuple[Scan, Transform] | None,
         config: Config,
         laps: Laps,
     ) -> tuple[InsertedScan, WindowedScan] | None:
@@ -312,8 +312,8 @@ class Inserter:
         scan, pose = prepared.filtered, prepared.T_map_sensor
         try:
             windowed = self._reduction.reduce(scan, pose, config)
-            for later, place in following:
-                self.begin(later, place, config)
+            if following is not None:
+                self.begin(*following, config)
             laps.end('reduce')
             left_out = windowed.moments.left_out
             self._drops.counters.points_left_out.update(left_out)

@@ -617,7 +617,8 @@ class Mapper:
 
     def _insert(self, scan: Scan, pose: Transform) -> Iterator[Update]:
         """Map a scan whose pose is there, and those that waited for it; yield their updates."""
-        updates = self._inserter.insert(scan, pose, self.config, tuple(self._queue.posed))
+        following = self._queue.posed[0] if self._queue.posed else None
+        updates = self._inserter.insert(scan, pose, self.config, following)
         try:
             yield from updates
         except Exception as error:  # MemoryError too: the next scan may fit
