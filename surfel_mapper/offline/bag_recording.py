@@ -80,18 +80,24 @@ class BagRecording:
             duration_s=request.duration_s,
             every=request.every,
         )
-        if path is not None:
-            self._check_last_scan(path)
+        if path is not None and not path.has_stamps:
+            self._check_number(path)
 
-    def _check_last_scan(self, path: PosePath) -> None:
+    def _check_number(self, path: PosePath) -> None:
         """
-        Raise if a file has too few poses for the last scan of a part.
+        Raise if a file has poses without times, too many, or too few for the last scan of a part.
 
-        In parts whose last number takes counting, ``PosePath.add_for`` raises at the scan.
+        In parts whose last number takes counting, ``PosePath.add_for`` raises at the scan. A bag
+        that is cut off has the first clouds of a drive, and fewer than there are poses.
         """
+        num_clouds, num_poses = self.reader.topics.num_messages(self.topics), len(path.trajectory)
+        if num_poses > num_clouds and not self.cuts:
+            raise BagError(
+                f'{path.path}: {num_poses} poses without times for {num_clouds} clouds in '
+                f'{self.reader.path}, expected one for each, or poses with times (TUM)'
+            )
         start_ns, stop_ns, every = self.span.start_ns, self.span.stop_ns, self.span.every
         if stop_ns is None and (start_ns is None or every == 1):
-            num_clouds = self.reader.topics.num_messages(self.topics)
             path.check_scan((num_clouds - 1) // every * every)
 
     def _poses(self, request: Request, config: Config, path: PosePath | None) -> PoseTopics:

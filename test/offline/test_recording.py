@@ -250,6 +250,25 @@ def test_fewer_poses_without_times_than_clouds_are_refused(tmp_path, bag):
         mapped(bag, poses=pose_file(tmp_path, 'kitti', range(5)))
 
 
+@pytest.mark.parametrize('span', [{}, {'start_s': 0.15, 'every': 2}])
+def test_more_poses_without_times_than_clouds_are_refused(tmp_path, bag, span):
+    says = r'kitti: 7 poses without times for 6 clouds in .*, expected one for each'
+    with pytest.raises(BagError, match=says):
+        mapped(bag, poses=pose_file(tmp_path, 'kitti', range(7)), **span)
+
+
+def test_a_bag_that_is_cut_off_takes_the_first_of_more_poses(tmp_path):
+    bag = write_rosbag2(tmp_path / 'bag', drive())
+    (file,) = bag.glob('*.mcap')
+    cut(file, 0.7)
+
+    mapper = mapped(bag, poses=pose_file(tmp_path, 'kitti'))
+
+    number = mapper.counters.mapped
+    assert 0 < number < 6
+    assert mapper.map.digest() == digest_of(range(number))
+
+
 @pytest.mark.parametrize(
     ('span', 'number', 'missing'),
     [
