@@ -247,14 +247,13 @@ class MomentMap:
         """
         if voxel_index is None:
             chosen = self._table.occupied()
-        else:
-            index = as_array('voxel_index', voxel_index)
-            if index.dtype.kind not in 'iu' or index.ndim != 2 or index.shape[1] != 3:
-                kind = f'{index.dtype} {index.shape}'
-                raise ValueError(f'voxel_index: {kind}, expected integers (K, 3)')
-            chosen = self._table.find(np.unique(pack_keys(index)))
-            chosen = chosen[chosen >= 0]
-        return self._moments_of(chosen[np.argsort(self._table.keys(chosen))])
+            return self._moments_of(chosen[np.argsort(self._table.keys(chosen))])
+        index = as_array('voxel_index', voxel_index)
+        if index.dtype.kind not in 'iu' or index.ndim != 2 or index.shape[1] != 3:
+            kind = f'{index.dtype} {index.shape}'
+            raise ValueError(f'voxel_index: {kind}, expected integers (K, 3)')
+        chosen = self._table.find(np.unique(pack_keys(index)))  # in this order: by voxel
+        return self._moments_of(chosen[chosen >= 0])
 
     def _moments_of(self, chosen: npt.NDArray[Any]) -> ScanMoments:
         """Return the moments of rows, in the given order; a copy."""
