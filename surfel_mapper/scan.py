@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, TYPE_CHECKING
+from typing import Any, cast, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -74,11 +74,14 @@ class LazyPoints:
         N.
     decode : callable
         Returns the points, (N, 3) float32 or float64, m.
+    xyz : tuple of three (N,) arrays, optional
+        The same coordinates where the message has them, for a look at them before that.
 
     """
 
     num_points: int
     decode: Callable[[], npt.NDArray[Any]]
+    xyz: tuple[npt.NDArray[Any], ...] | None = None
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -194,9 +197,23 @@ class Scan:
         return len(self.points if self._lazy is None else self._lazy)
 
     @property
+    def xyz(self) -> tuple[npt.NDArray[Any], ...]:
+        """Coordinates x, y and z, (N,) each; a look at them does not decode the points."""
+        if self._lazy is not None and self._lazy.xyz is not None:
+            return self._lazy.xyz
+        return tuple(np.require(self.points, None, ['F', 'A', 'W']).T)
+
+    @property
     def end_ns(self) -> int:
         """Time of the last point, or the stamp if that is later."""
         return self.stamp_ns if self.times is None else max(self.stamp_ns, self.times.last_ns)
+
+    def with_times(self, times: PointTimes) -> Scan:
+        """Return the scan with the times of its points, which are not decoded for that."""
+        if self._lazy is None:
+            return replace(self, times=times)
+        later = LazyPoints(len(self), lambda: self.points, self._lazy.xyz)  # decoded once for both
+        return replace(self, points=cast(Any, later), times=times)
 
     def select(self, rows: npt.NDArray[Any]) -> Scan:
         """

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper import Scan
-from surfel_mapper.scan import LazyPoints
+from surfel_mapper.scan import LazyPoints, PointTimes
 
 POINTS = np.arange(12.0).reshape(4, 3)
 
@@ -75,6 +75,26 @@ def test_scans_made_of_a_lazy_one_have_its_points():
     assert moved.points is POINTS
     copied = pickle.loads(pickle.dumps(scan(LazyPoints(4, Decoding()))))
     np.testing.assert_array_equal(copied.points, POINTS)
+
+
+def test_times_are_added_without_decoding_the_points():
+    decode = Decoding()
+    lazy = scan(LazyPoints(4, decode))
+    timed = lazy.with_times(PointTimes(np.arange(4), 0, 3))
+    assert timed.times.last_ns == 3
+    assert decode.number == 0
+    assert timed.points is lazy.points is POINTS
+    assert decode.number == 1
+    assert scan().with_times(timed.times).times is timed.times
+
+
+def test_coordinates_are_read_where_the_message_has_them():
+    decode = Decoding()
+    xyz = tuple(POINTS.T)
+    assert scan(LazyPoints(4, decode, xyz)).xyz is xyz
+    assert decode.number == 0
+    for points in (LazyPoints(4, decode), POINTS):
+        np.testing.assert_array_equal(scan(points).xyz, xyz)
 
 
 def test_columns_of_lazy_points_have_a_row_for_each():

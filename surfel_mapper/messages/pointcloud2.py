@@ -297,7 +297,9 @@ def coordinates(points: Points, xyz: list[Field], budget: Budget) -> LazyPoints:
     dtype = np.result_type(*views).newbyteorder('=')
     num_points = math.prod(points.shape)
     budget.take(3 * num_points * dtype.itemsize, f'coordinates of {num_points} points')
-    return LazyPoints(num_points, partial(packed, views, num_points, dtype))
+    is_uniform = all(v.dtype == dtype and v.ndim == 1 for v in views)
+    decode = partial(packed, views, num_points, dtype)
+    return LazyPoints(num_points, decode, tuple(views) if is_uniform else None)
 
 
 def packed(

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from functools import partial
 import logging
 import time
@@ -237,7 +236,7 @@ class Mapper:
         except CloudFormatError as error:
             self._drops.scan(scan, 'no_times', str(error))
             return None
-        return replace(scan, times=times)
+        return scan.with_times(times)
 
     def refuse_clouds(
         self, cause: str, topic: str, reason: str, number: int = 1, frame_id: str = ''

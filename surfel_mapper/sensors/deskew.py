@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 import math
 from typing import Any
@@ -26,7 +27,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.geometry import compose, inverse, q_xyzw, Transform
-from surfel_mapper.scan import PointTimes, Scan
+from surfel_mapper.scan import LazyPoints, PointTimes, Scan
 from surfel_mapper.sensors.kernels.deskew import count_from_stamp, fill_times, move_points
 
 FIELDS = ('t', 'time', 'timestamp', 'offset_time')
@@ -79,10 +80,11 @@ def point_times(
     column = scan.columns[name]
     if column.ndim != 1:
         raise CloudFormatError(f'field {name}: {column.shape[1]} values a point, expected a time')
-    values = _valid_times(scan.points, column)
-    if values is None:
+    values = np.empty(len(scan), np.float64 if column.dtype.kind == 'f' else np.int64)
+    is_any_valid, lowest, highest = fill_times(scan.xyz, column, values)
+    if not is_any_valid:
         return PointTimes(np.zeros(len(scan), np.int64), scan.stamp_ns, scan.stamp_ns)
-    ends = np.array([values.min(), values.max()])
+    ends = np.array([lowest, highest], values.dtype)
     low, high = ends.astype(column.dtype)
     for unit_ns, is_epoch in _readings(column.dtype, unit, reference, low, scan.stamp_ns):
         first, last = _offsets(ends, unit_ns, is_epoch, scan.stamp_ns).tolist()
@@ -158,21 +160,18 @@ def deskewing(
 
 
 def warm_up() -> None:
-    """Compile the kernels, but for reading the times of points in double precision: too rare."""
-    scan = Scan(points=np.ones((1, 3), np.float32), stamp_ns=0, frame_id='')
-    for column in (np.zeros(1, np.uint32), np.zeros(1, np.float32)):
-        times = point_times(replace(scan, columns={'t': column}))
+    """Compile the kernels, for points and times in the bytes of a message."""
+    message = np.ones((2, 4), np.float32)  # a view of a single point would be contiguous
+    message.flags.writeable = False  # as of bytes: a writable array is another type
+    x, y, z, _ = message.T
+    lazy: Any = LazyPoints(2, partial(np.ones, (2, 3)), (x, y, z))
+    for number in (np.float64, np.float32, np.uint32):
+        t = message.view(number)[:, -1]
+        scan = Scan(points=lazy, stamp_ns=0, frame_id='', columns={'t': t})
+        times = point_times(scan, unit='ns', reference='epoch')
     for dtype in (np.float32, np.float64):
-        points = scan.points.astype(dtype)
+        points = scan.points.astype(dtype, order='F')
         deskewed(replace(scan, points=points, times=times), lambda _: np.eye(4))
-
-
-def _valid_times(points: npt.NDArray[Any], column: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
-    """Return times as int64 or float64, of invalid points that of a valid one; None if none is."""
-    values = column.astype(np.float64 if column.dtype.kind == 'f' else np.int64)
-    filled = np.empty_like(values)
-    xyz = np.require(points, None, ['F', 'A', 'W']).T
-    return filled if fill_times(xyz, values, filled) else None
 
 
 def _readings(

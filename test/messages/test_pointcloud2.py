@@ -83,6 +83,7 @@ def assert_decodes(msg):
             first.setdefault(field.name, field)
     xyz = [twin(msg, first[name]) for name in 'xyz']
     expected = np.stack(xyz, axis=1)  # float64 if one of them is
+    np.testing.assert_array_equal(np.stack(scan.xyz, axis=1), expected)
     assert scan.points.dtype == expected.dtype
     assert scan.points.flags.f_contiguous
     np.testing.assert_array_equal(scan.points, expected)

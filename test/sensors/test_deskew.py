@@ -13,7 +13,7 @@ from surfel_mapper.errors import CloudFormatError, ConfigError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, se3_exp
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.poses import TransformBuffer
-from surfel_mapper.scan import PointTimes, Scan
+from surfel_mapper.scan import LazyPoints, PointTimes, Scan
 from surfel_mapper.sensors.deskew import deskewed, MAX_TURN_RAD, point_times
 from surfel_mapper.sensors.kernels.deskew import count_from_stamp, fill_times, move_points
 from surfel_mapper.simulation import Lidar, Simulation, World
@@ -59,6 +59,19 @@ def test_times_before_the_stamp_are_negative_where_the_stamp_is_that_of_the_end(
     found = point_times(sweep(np.float32([-0.1, -0.05, 0.0]), 'time'))
     np.testing.assert_allclose(found.offsets, [-100 * MS, -50 * MS, 0], atol=8)
     assert found.last_ns == START_NS
+
+
+@pytest.mark.parametrize('offset', [16, 17])
+@pytest.mark.parametrize('dtype', [np.float32, np.float64, np.uint32])
+def test_times_are_read_without_decoding_the_points(dtype, offset):
+    fields = {'names': [*'xyzt'], 'formats': [*3 * [np.float32], dtype]}
+    layout = np.dtype({**fields, 'offsets': [0, 4, 8, offset], 'itemsize': offset + 8})
+    cloud = np.ones(4, layout)
+    cloud['x'][3], cloud['t'] = np.nan, [5, 3, 4, 1000]
+    lazy = LazyPoints(4, lambda: pytest.fail('decoded'), tuple(cloud[name] for name in 'xyz'))
+    found = point_times(sweep(cloud['t'], points=lazy), unit='ns', reference='stamp')
+    assert found.offsets.tolist() == [5, 3, 4, 5]
+    assert (found.first_ns, found.last_ns) == (START_NS + 3, START_NS + 5)
 
 
 def test_near_time_zero_the_reference_nearer_to_the_stamp_is_used():
@@ -118,10 +131,11 @@ def test_times_of_invalid_points_are_those_of_the_first_valid_one(call, dtype):
         invalid[[2, 9]] = True
         times[2], times[9] = np.nan, -np.inf
     filled = np.empty_like(times)
-    assert call(fill_times, xyz, times, filled)
+    found = call(fill_times, tuple(xyz), times, filled)
     expected = np.where(invalid, times[np.flatnonzero(~invalid)[0]], times)
     np.testing.assert_array_equal(filled, expected)
-    assert not call(fill_times, xyz[:, :2], times[:2], filled[:2])
+    assert found == (True, expected.min(), expected.max())
+    assert not call(fill_times, tuple(xyz[:, :2]), times[:2], filled[:2])[0]
 
 
 @both

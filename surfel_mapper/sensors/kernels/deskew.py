@@ -21,26 +21,31 @@ NEVER = np.iinfo(np.int64).max
 
 
 @kernel()
-def fill_times(points, values, filled):
+def fill_times(xyz, values, filled):
     """
     Copy the times of points; an invalid point gets the time of the first valid one.
 
-    points  (3, N) float32 or float64, m; invalid in the origin, and if not finite
-    values  (N,) int64 or float64, times; that of a valid point is finite
-    filled  (N,) of the same type, out
+    xyz     x, y and z (N,) float32 or float64, m, views into a message or not; invalid in the
+            origin, and if not finite
+    values  (N,) of any type, times; that of a valid point is finite
+    filled  (N,) int64 or float64, out
 
-    Returns whether a point is valid; if none is, nothing is written.
+    Returns whether a point is valid, the smallest and the largest time; if none is valid, nothing
+    is written.
     """
-    x, y, z = points[0], points[1], points[2]
+    x, y, z = xyz
     num, first = len(values), 0
     while first < num and not is_valid(x[first], y[first], z[first], values[first]):
         first += 1
     if first == num:
-        return False
-    valid = values[first]
+        return False, first, first
+    filled[first] = values[first]
+    valid = low = high = filled[first]
     for i in range(np.uint64(num)):
-        filled[i] = values[i] if is_valid(x[i], y[i], z[i], values[i]) else valid
-    return True
+        filled[i] = values[i]
+        filled[i] = filled[i] if is_valid(x[i], y[i], z[i], values[i]) else valid
+        low, high = min(low, filled[i]), max(high, filled[i])
+    return True, low, high
 
 
 @part()
