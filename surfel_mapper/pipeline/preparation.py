@@ -9,7 +9,7 @@ A scan that the motion gate, the filters or the registration leave out is counte
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -215,8 +215,10 @@ class Preparation:
     def _count_filtered(self, found: FilteredScan) -> bool:
         """Count what the filters did; return whether points are left."""
         scan, filtered = found.scan, found.filtered
-        for step in found.steps:
-            self._drops.counters.add_filter(*astuple(step))
+        for s in found.steps:
+            self._drops.counters.add_filter(
+                s.name, s.points_in, s.points_out, s.milliseconds, s.not_finite
+            )
         if not found.steps:
             return True
         self._drops.counters.points_left_out['filtered'] += len(scan) - len(filtered)

@@ -138,10 +138,10 @@ def deskewing(
     assert times is not None, 'point_times comes before'
     stamps = [s for s in stamps_ns if times.first_ns < s < times.last_ns]
     ends = sorted({times.first_ns, *stamps, times.last_ns})
-    knots, poses = _track(ends, pose_at)
-    to_stamp = inverse(pose_at(scan.stamp_ns))
+    knots, poses, turns = _track(ends, pose_at)
+    at_stamp = poses[knots.index(scan.stamp_ns)] if scan.stamp_ns in knots else None
+    to_stamp = inverse(pose_at(scan.stamp_ns) if at_stamp is None else at_stamp)
     transforms = np.ascontiguousarray([compose(to_stamp, pose)[:3] for pose in poses])
-    turns = np.array([*map(_turn, poses, poses[1:]), np.zeros(3)])
 
     def move() -> Scan:
         moved = np.empty((len(scan), 3), order='F')
@@ -150,7 +150,7 @@ def deskewing(
             times.offsets,
             np.array(knots) - scan.stamp_ns,
             transforms,
-            turns,
+            np.array([*turns, np.zeros(3)]),
             min_range_m * min_range_m,
             moved.T,
         )
@@ -207,17 +207,24 @@ def _offsets(
 
 def _track(
     ends: list[int], pose_at: Callable[[int], Transform]
-) -> tuple[list[int], list[Transform]]:
-    """Return times and poses, with further ones between if the sensor turns much."""
-    knots, poses = ends[:1], [pose_at(ends[0])]
+) -> tuple[list[int], list[Transform], list[npt.NDArray[np.float64]]]:
+    """
+    Return times, poses, and the turn from each to the next; see ``_turn``.
+
+    There are further ones between the ends if the sensor turns much.
+    """
+    knots, poses, turns = ends[:1], [pose_at(ends[0])], []
     for start, end in pairwise(ends):
         pose = pose_at(end)
-        chord = 2.0 * math.sqrt(float((_turn(poses[-1], pose) ** 2).sum()))
+        turn = _turn(poses[-1], pose)
+        chord = 2.0 * math.sqrt(float((turn * turn).sum()))
         parts = min(max(math.ceil(0.5 * math.pi * chord / MAX_TURN_RAD), 1), end - start)
         between = [start + (end - start) * part // parts for part in range(1, parts)]
+        further = [*map(pose_at, between), pose]
+        turns += [turn] if parts == 1 else [*map(_turn, [poses[-1], *further], further)]
         knots += [*between, end]
-        poses += [*map(pose_at, between), pose]
-    return knots, poses
+        poses += further
+    return knots, poses, turns
 
 
 def _turn(T_fixed_a: Transform, T_fixed_b: Transform) -> npt.NDArray[np.float64]:
