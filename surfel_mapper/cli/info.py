@@ -160,6 +160,7 @@ def folder_content(path: Path) -> dict[str, Any]:
         'format': folder.format,
         'scans': len(folder.files),
         'seconds': folder.recorded_s,
+        'times_from': found['times_from'],
         'points': 0 if first is None else len(first),
         'columns': [] if first is None else sorted(first.columns),
         'replay': {name: found[name] for name in ('poses_from', 'poses_reason', 'deskewed')},
@@ -172,7 +173,7 @@ def folder_report(content: dict[str, Any]) -> str:
     return (
         f'{content["bag"]}: {content["format"]}, {content["scans"]} '
         f'{"scan" if content["scans"] == 1 else "scans"}, '
-        f'{content["seconds"]:.1f} s\n'
+        f'{content["seconds"]:.1f} s; times: {content["times_from"]}\n'
         f'  first scan: {content["points"]} points; columns beside x y z: {columns}\n\n'
         f'{replay_line(content["replay"])}'
     )
