@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, cast, TYPE_CHECKING
 
 import numpy as np
@@ -212,7 +213,8 @@ class Scan:
         """Return the scan with the times of its points, which are not decoded for that."""
         if self._lazy is None:
             return replace(self, times=times)
-        later = LazyPoints(len(self), lambda: self.points, self._lazy.xyz)  # decoded once for both
+        once = partial(getattr, self, 'points')  # decoded once for both
+        later = LazyPoints(len(self), once, self._lazy.xyz)
         return replace(self, points=cast(Any, later), times=times)
 
     def select(self, rows: npt.NDArray[Any]) -> Scan:

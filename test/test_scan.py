@@ -83,6 +83,8 @@ def test_times_are_added_without_decoding_the_points():
     timed = lazy.with_times(PointTimes(np.arange(4), 0, 3))
     assert timed.times.last_ns == 3
     assert decode.number == 0
+    copied = pickle.loads(pickle.dumps(timed))
+    np.testing.assert_array_equal(copied.points, POINTS)
     assert timed.points is lazy.points is POINTS
     assert decode.number == 1
     assert scan().with_times(timed.times).times is timed.times

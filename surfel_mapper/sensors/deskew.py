@@ -33,6 +33,9 @@ from surfel_mapper.sensors.kernels.deskew import count_from_stamp, fill_times, m
 FIELDS = ('t', 'time', 'timestamp', 'offset_time')
 """Names under which drivers write the times of points: Ouster, Velodyne, Hesai, Livox."""
 
+READ_IN_PLACE = (np.float32, np.float64, np.uint32)
+"""Types of the times of these drivers, read in the message itself; others are copied first."""
+
 UNITS_NS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
 MAX_SWEEP_NS = 1_500_000_000
@@ -81,7 +84,8 @@ def point_times(
     if column.ndim != 1:
         raise CloudFormatError(f'field {name}: {column.shape[1]} values a point, expected a time')
     values = np.empty(len(scan), np.float64 if column.dtype.kind == 'f' else np.int64)
-    is_any_valid, lowest, highest = fill_times(scan.xyz, column, values)
+    read = column if column.dtype in READ_IN_PLACE else column.astype(values.dtype)
+    is_any_valid, lowest, highest = fill_times(scan.xyz, read, values)
     if not is_any_valid:
         return PointTimes(np.zeros(len(scan), np.int64), scan.stamp_ns, scan.stamp_ns)
     ends = np.array([lowest, highest], values.dtype)
@@ -139,7 +143,7 @@ def deskewing(
     stamps = [s for s in stamps_ns if times.first_ns < s < times.last_ns]
     ends = sorted({times.first_ns, *stamps, times.last_ns})
     knots, poses, turns = _track(ends, pose_at)
-    at_stamp = poses[knots.index(scan.stamp_ns)] if scan.stamp_ns in knots else None
+    at_stamp = dict(zip(knots, poses, strict=True)).get(scan.stamp_ns)
     to_stamp = inverse(pose_at(scan.stamp_ns) if at_stamp is None else at_stamp)
     transforms = np.ascontiguousarray([compose(to_stamp, pose)[:3] for pose in poses])
 
@@ -165,7 +169,7 @@ def warm_up() -> None:
     message.flags.writeable = False  # as of bytes: a writable array is another type
     x, y, z, _ = message.T
     lazy: Any = LazyPoints(2, partial(np.ones, (2, 3)), (x, y, z))
-    for number in (np.float64, np.float32, np.uint32):
+    for number in READ_IN_PLACE:
         t = message.view(number)[:, -1]
         scan = Scan(points=lazy, stamp_ns=0, frame_id='', columns={'t': t})
         times = point_times(scan, unit='ns', reference='epoch')

@@ -74,6 +74,15 @@ def test_times_are_read_without_decoding_the_points(dtype, offset):
     assert (found.first_ns, found.last_ns) == (START_NS + 3, START_NS + 5)
 
 
+@pytest.mark.parametrize(
+    'dtype', ['>f4', '>f8', '>u4', 'f2', 'g', 'i1', 'u2', 'i8', 'u8', 'm8[ns]']
+)
+def test_times_of_any_type_and_byte_order_are_read(dtype):
+    found = point_times(sweep(np.array([7, 5, 100], dtype)), unit='ns', reference='stamp')
+    assert found.offsets.tolist() == [7, 5, 100]
+    assert (found.first_ns, found.last_ns) == (START_NS + 5, START_NS + 100)
+
+
 def test_near_time_zero_the_reference_nearer_to_the_stamp_is_used():
     stamp_ns = 1500 * MS
     since_start = point_times(sweep(np.array([1.5, 1.55]), 'timestamp', stamp_ns))
