@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         '--align',
         action='store_true',
-        help='move the map onto the truth first, if their frames differ (trajectories always are)',
+        help='move the map onto the truth first, if frames differ (trajectories always move)',
     )
     add('--json', action='store_true', help='print as JSON')
 
@@ -124,7 +124,7 @@ def maps(args: argparse.Namespace) -> dict[str, Any]:
         motion = find_motion(surfels, truth, known_starts(args.map, args.truth), max_distance_m)
         surfels = moved_discs(surfels, motion.T_truth_map)
     elif reason := looks_needed(surfels, truth, max_distance_m):
-        _log.warning('%s, %s: one frame? %s; --align moves the map', args.map, args.truth, reason)
+        _log.warning('%s, %s: frames differ? %s; try --align', args.map, args.truth, reason)
     return {
         **evaluate(surfels, truth, max_distance_m=max_distance_m, radius_m=args.radius or size_m),
         **digests,

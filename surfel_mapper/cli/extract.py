@@ -39,9 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'cloud',
         type=Path,
         metavar='CLOUD|MAP',
-        help='.ply, .pcd, .bin, .las; or a map: .npz, .parquet, output of a replay',
+        help='.ply, .pcd, .bin, .las, .laz; or a map: .npz, .parquet, output of a replay',
     )
-    parser.add_argument('--output', type=Path, required=True, metavar='DIR', help='made if needed')
+    parser.add_argument('--output', type=Path, required=True, metavar='DIR', help='directory')
     parser.add_argument(
         '--formats',
         nargs='+',
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'of {", ".join(FORMATS)}; default json obj',
     )
     parser.add_argument(
-        '--voxel-size', type=real, metavar='M', help='default 0.04; half of that of a map'
+        '--voxel-size', type=real, metavar='M', help='m (0.04; for a map half its voxel size)'
     )
     parser.add_argument(
         '--profile', default='robust', help="robust, or paper: the paper's rules to the letter"
@@ -114,8 +114,8 @@ def run(args: argparse.Namespace) -> int:
 def announce() -> None:
     """Say on stderr why the first fit takes long."""
     print(
-        'surfel-mapper extract: compiles its kernels first, about two minutes of processor time '
-        'once on a machine',
+        'surfel-mapper extract: compiling kernels, about two minutes of processor time, once per '
+        'machine',
         file=sys.stderr,
         flush=True,
     )

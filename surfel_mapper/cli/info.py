@@ -119,7 +119,7 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
         for offer in made:
             lines += offered(offer) if offer.clouds == clouds else []
     if not made:
-        lines += ['', 'no poses; clouds that are in a fixed frame map with --poses-from identity']
+        lines += ['', 'no poses; if the clouds are in a fixed frame, use --poses-from identity']
     lines += ['', replay_line(content['replay'])] if content['replay'] else []
     return '\n'.join(lines)
 

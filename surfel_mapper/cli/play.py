@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_float,
         default=1.0,
         metavar='R',
-        help='of the pace (%(default)s)',
+        help='playback speed, times real time (%(default)s)',
     )
     add('--loop', action='store_true', help='start again at the end')
     add('--clock', action='store_true', help='publish the record time on /clock')

@@ -79,7 +79,7 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
         '--topic',
         action='append',
         default=[],
-        help='PointCloud2 topic (the only one, if there is one); repeatable',
+        help='PointCloud2 topic (default: the only one of the bag); repeatable',
     )
     add(
         '--mount',
@@ -131,7 +131,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
         '--formats',
         type=formats,
         metavar='LIST',
-        help=f'with a comma between; of the map: {", ".join(MAP_FORMATS)} (ply,npz); of layers: '
+        help=f'comma-separated; of the map: {", ".join(MAP_FORMATS)} (ply,npz); of layers: '
         f'{", ".join(layer_formats())}',
     )
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
@@ -142,7 +142,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
         help='true poses of the sensor, a file or a simulated bag; states the errors of the poses',
     )
     add('--view', action='store_true', help='show the map in rerun while it grows')
-    add('--rrd', type=Path, metavar='FILE', help='write that to a file, for rerun to open')
+    add('--rrd', type=Path, metavar='FILE', help='write the content of --view to a file')
     add('--json', action='store_true', help='print the summary as JSON')
     add('--strict', action='store_true', help='exit with 3 if the bag is cut off or damaged')
 

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments; the defaults of the lidar are those of simulation.Lidar."""
     add = parser.add_argument
     add('world', choices=['street'], help='a street canyon, turned and tilted off the grid')
-    add('--output', required=True, metavar='DIR', help='directory of the bag; must not exist')
+    add('--output', required=True, metavar='DIR', help='bag directory; new, or with --overwrite')
     add('--overwrite', action='store_true', help='replace an existing bag')
     add('--storage', choices=['mcap', 'sqlite3'], default='mcap', help='format (%(default)s)')
     length = parser.add_mutually_exclusive_group()
@@ -41,9 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--duration', type=positive_float, metavar='S', help='s, instead of --scans'
     )
     add('--speed', type=real, default=5.0, metavar='V', help='of the vehicle, m/s (%(default)s)')
-    add('--beams', type=whole, default=64, metavar='N', help='points a column (%(default)s)')
-    add('--columns', type=whole, default=2048, metavar='N', help='points a turn (%(default)s)')
-    add('--rate', type=real, default=10.0, metavar='F', help='turns, Hz (%(default)s)')
+    add('--beams', type=whole, default=64, metavar='N', help='beams of the lidar (%(default)s)')
+    add('--columns', type=whole, default=2048, metavar='N', help='columns a turn (%(default)s)')
+    add('--rate', type=real, default=10.0, metavar='F', help='scan rate, Hz (%(default)s)')
     add('--noise', type=real, default=0.0, metavar='M', help='sigma of range, m (%(default)s)')
     add('--max-range', type=real, default=100.0, metavar='M', help='m (%(default)s)')
     add('--seed', type=whole, default=0, metavar='N', help='of street and noise (%(default)s)')

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from surfel_mapper.viz.scene import Scene
     from surfel_mapper.viz.show import Shown
 
-SUMMARY = 'Show maps, clouds, meshes, models, trajectories and bags.'
+SUMMARY = 'Show maps, clouds, meshes, models, trajectories, bags or a running node.'
 
 EXAMPLE = 'surfel-mapper view street_surfels/ --color height'
 
@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='N',
         help='most discs; far parts of larger maps are shown as coarser maps (250000)',
     )
-    add('--min-points', type=positive_int, default=5, metavar='N', help='of a surfel (5)')
+    add('--min-points', type=positive_int, default=5, metavar='N', help='minimum per surfel (5)')
     add('--config', type=Path, metavar='FILE', help='settings for a bag; with its window')
     add(
         '--live',
@@ -123,7 +123,7 @@ def shown(args: argparse.Namespace) -> int:
     many = len(args.what) > 1
     recordings = [path for path in args.what if path.exists() and not is_shown(path)]
     if recordings and (many or args.glb is not None):
-        reason = 'a recording is shown alone' if many else 'map it by replay first for --glb'
+        reason = 'a recording is shown alone' if many else 'for --glb map it with replay first'
         raise UsageError(f'{recordings[0]}: {reason}')
     if recordings:
         with opened(args) as scene:

@@ -227,7 +227,7 @@ def in_one_frame(found: Sequence[Registered]) -> CommonFrame:
             motions.append((each, motion))
     for each, reason in waiting:
         log.warning(
-            '%s has no certain place on the other recordings: %s', each.request.path, reason
+            '%s could not be placed on the other recordings: %s', each.request.path, reason
         )
     return CommonFrame(placed=placed, apart=waiting, motions=motions)
 

@@ -188,7 +188,7 @@ class ShardRun:
                 continue
             if any(self.results[n].resets for n in parts if n in self.results):
                 path = shard.request.path
-                log.warning('%s: time is set back in it; it cannot be mapped in parts', path)
+                log.warning('%s: its stamps jump back; it is mapped as one shard', path)
                 for part in parts:
                     del self.shards[part]
                     self.results.pop(part, None)

@@ -68,7 +68,7 @@ class TsdfConfig(Stage):
     sensor_frame: str = setting(
         '',
         'Frame of the optical centre of the lidar, for clouds that are given in another, such as '
-        'base_link; its pose comes from TF or frames.sensors. Empty: the frame of the clouds.',
+        'base_link; its pose: from TF or frames.base_to_sensor. Empty: the frame of the clouds.',
     )
     sensor_azimuth_deg: tuple[float, ...] = setting(
         (),
@@ -247,8 +247,8 @@ class TsdfConfig(Stage):
     mesh_max_step_voxels: float = setting(
         0.0,
         'The mesh has no faces where distances of neighbours across the surface differ by more, '
-        'in voxels, as at the edge of a shadow; 0: no such limit. For to_plane: the truncation '
-        'and 1.25 voxels.',
+        'in voxels, as at the edge of a shadow; 0: no such limit. With distance to_plane use the '
+        'truncation in voxels plus 1.25.',
         low=0.0,
         high=1e3,
     )
@@ -433,7 +433,7 @@ class EsdfConfig(Stage):
     )
     slice_min_m: float = setting(
         0.3,
-        'Lowest height of obstacles in ~/esdf_slice, fixed frame, m; above the ground.',
+        'Lowest height of obstacles in ~/esdf_slice, fixed frame, m; choose it above the ground.',
         low=-1e5,
         high=1e5,
     )

@@ -90,7 +90,7 @@ class RegistrationConfig(Stage):
     )
     max_speed_m_s: float = setting(
         70.0,
-        'A place of a scan that needs a higher speed since the last one is refused, m/s.',
+        'A pose that implies a higher speed since the last scan is rejected, m/s.',
         low=0.01,
         high=1e5,
         live=True,
@@ -233,8 +233,8 @@ class LoopsConfig(Stage):
     )
     odometry_map_m: float = setting(
         100.0,
-        'With pose.source registration, scans are registered to those of the last this many '
-        'metres, so that places seen before do not pull at them.',
+        'With pose.source registration, scans are registered only to scans at most this far back '
+        'along the path, m, so that earlier passes of a place do not affect them.',
         low=1.0,
         high=1e6,
     )

@@ -57,7 +57,7 @@ class MapConfig(Stage):
         '',
         'Point of the fixed frame that is the origin of the map, for poses in UTM or ECEF: '
         'text of x y z, m; auto: near the first pose. Files have the coordinates of the fixed '
-        'frame, topics those of the map. Empty: the frames are one.',
+        'frame, topics those of the map. Empty: the two are the same.',
     )
     load: str = setting(
         '',
@@ -68,7 +68,7 @@ class MapConfig(Stage):
     max_bytes: int = setting(
         -1,
         'The oldest scans are evicted while map and window need more bytes; -1: half of the '
-        'memory of the machine, for scans that a window limit keeps; 0: no such limit.',
+        'memory of the machine, if the window has a limit; 0: no such limit.',
         low=-1,
         high=2**62,
         live=True,
@@ -130,7 +130,7 @@ class WindowConfig(Stage):
     )
     max_distance_m: float = setting(
         0.0,
-        'A scan is evicted once the sensor has travelled farther than this since it, m; '
+        'A scan is evicted once the sensor has travelled farther than this since that scan, m; '
         '0: no such limit.',
         low=0.0,
         high=1e9,
@@ -230,7 +230,7 @@ class FramesConfig(Stage):
             raise ConfigError(f'{stage}.sensors: {self.sensors}, expected names that differ')
         values, number = self.base_to_sensor, len(self.sensors)
         if len(values) not in ((7 * number,) if number else (0, 7)):
-            expected = f'7 for each of {number} sensors' if number else 'or none'
+            expected = f'for each of {number} sensors' if number else 'or none'
             raise ConfigError(
                 f'{stage}.base_to_sensor: {len(values)} values, '
                 f'expected 7 (x y z qx qy qz qw) {expected}'
@@ -271,7 +271,7 @@ class InputConfig(Stage):
         0.1, 'Points nearer to the origin of their frame are ignored, m.', low=0.0, high=1e6
     )
     max_range_m: float = setting(
-        0.0, 'Points farther from it are ignored, m; 0: no such limit.', low=0.0, high=1e6
+        0.0, 'Points farther from that origin are ignored, m; 0: no limit.', low=0.0, high=1e6
     )
     reset_after_s: float = setting(
         1.0,
@@ -342,7 +342,7 @@ class ViewerConfig(Stage):
 
     enabled: bool = setting(
         False,
-        'Serve the page at http://127.0.0.1:PORT, for this machine only.',
+        'Serve a page with the map at http://127.0.0.1:PORT, for this machine only.',
     )
     port: int = setting(
         9090, 'Port of the page; the data are on the next one.', low=1024, high=65534
@@ -461,7 +461,7 @@ class DiagnosticsConfig(Stage):
     )
     error_latency_s: float = setting(
         1.0,
-        'Report an error if that percentile exceeds this, s; 0: never.',
+        'Report an error if the 99th percentile of that time exceeds this, s; 0: never.',
         low=0.0,
         high=1e6,
         live=True,
@@ -475,7 +475,7 @@ class DiagnosticsConfig(Stage):
     )
     error_dropped_ratio: float = setting(
         0.5,
-        'Report an error if a larger share of these clouds was dropped.',
+        'Report an error if a larger share of the clouds since the last report was dropped.',
         low=0.0,
         high=1.0,
         live=True,

@@ -78,7 +78,7 @@ class Session:
         self.thread = MappingThread(self.mapper, tasks.fail)
         self.inputs = Inputs(node, config, self.thread, tasks.fail)
         log, start = node.get_logger(), time.monotonic()
-        log.info('compiling kernels: a moment, the first time a quarter of a minute')
+        log.info('compiling kernels: about a second, the first time about ten seconds')
         first_scan, every_scan, rare = self.mapper.warm_up_steps()
         self._later: list[Callable[[], object]] = [partial(warm_up_outputs, config), *rare]
         with rare_collections(), compilations() as compiled:
@@ -147,7 +147,7 @@ class Session:
             self.mapper.finish()
         if self._tasks.has_failed and self.mapper.map.num_voxels:
             with self.mapper.guarded('a checkpoint'):
-                log.error(f'the node fails and ends; its map is in {self._checkpoints.save()}')
+                log.error(f'the node stops on an error; map saved: {self._checkpoints.save()}')
         if save:
             try:
                 log.info(f'saved {save_map(self.mapper)}')

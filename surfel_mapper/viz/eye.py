@@ -40,7 +40,7 @@ def followed(scene: Scene, shown: Shown) -> None:
 
         ask = ViewerClient.connect(scene.window).get_blueprint
     except (ImportError, AttributeError):
-        logger.warning('this rerun cannot say where its eye is (0.41 can): the detail stays')
+        logger.warning('this rerun reports no camera position (0.41 does): the detail stays fixed')
         return
     before: npt.NDArray[np.float64] | None = None
     deadline = time.monotonic() + STARTING_S

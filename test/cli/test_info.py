@@ -78,7 +78,7 @@ def test_a_bag_without_poses_says_so(tmp_path, capsys):
     path = write_rosbag2(tmp_path / 'a', [row for row in drive() if row[1] == CLOUD])
 
     assert main(['info', str(path)]) == 0
-    assert 'no poses; clouds that are in a fixed frame map' in capsys.readouterr().out
+    assert 'no poses; if the clouds are in a fixed frame, use --poses-from identity' in capsys.readouterr().out
 
 
 def test_a_missing_mounting_is_reported(tmp_path, capsys):
