@@ -162,6 +162,8 @@ class Scan:
             value = getattr(self, name)
             if not isinstance(value, (kind, type(None))):
                 raise TypeError(f'{name}: a {type(value).__name__}, expected a {kind.__name__}')
+        if self.times is not None:
+            check_offsets(self.times.offsets, len(points))
         for name in ('T_base_sensor', 'T_map_sensor'):
             if (T := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_numbers(name, T))
@@ -211,7 +213,7 @@ class Scan:
 
     def with_times(self, times: PointTimes) -> Scan:
         """Return the scan with the times of its points, which are not decoded for that."""
-        if self._lazy is None:
+        if self._lazy is None or self.depth is not None:  # which has these very points
             return replace(self, times=times)
         once = partial(getattr, self, 'points')  # decoded once for both
         later = LazyPoints(len(self), once, self._lazy.xyz)
@@ -231,6 +233,14 @@ class Scan:
         columns = {name: column[rows] for name, column in self.columns.items()}
         times = self.times and replace(self.times, offsets=self.times.offsets[rows])
         return replace(self, points=self.points[rows], columns=columns, times=times, msg=None)
+
+
+def check_offsets(offsets: object, num_points: int) -> None:
+    """Raise ValueError unless the times of points are an array (N,) of int64."""
+    found = offsets if isinstance(offsets, np.ndarray) else np.empty(0, object)
+    if found.shape != (num_points,) or found.dtype != np.int64:
+        kind = f'{found.dtype} {found.shape}' if found is offsets else type(offsets).__name__
+        raise ValueError(f'offsets of times: {kind}, expected int64 ({num_points},)')
 
 
 def check_points(points: object) -> None:

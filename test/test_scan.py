@@ -118,3 +118,18 @@ def test_an_error_in_decoding_is_raised_to_the_reader():
     for _ in range(2):
         with pytest.raises(MemoryError, match='of the points'):
             lazy.points  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ('offsets', 'found'),
+    [
+        (np.zeros(3, np.int64), r'int64 \(3,\)'),
+        (np.zeros(4), r'float64 \(4,\)'),
+        ([0, 0, 0, 0], 'list'),
+    ],
+)
+def test_times_of_another_length_or_type_are_refused(offsets, found):
+    times = PointTimes(offsets, 0, 1)
+    for add in (scan().with_times, lambda t: scan(LazyPoints(4, Decoding())).with_times(t)):
+        with pytest.raises(ValueError, match=f'offsets of times: {found}, expected int64'):
+            add(times)

@@ -68,8 +68,8 @@ def nanoseconds(text: str, where: str, unit: str = '') -> int:
 
 def seconds(stamp_ns: int) -> str:
     """Return a time in seconds with all nine digits."""
-    whole, rest = divmod(stamp_ns, 10**9)
-    return f'{whole}.{rest:09d}'
+    whole, rest = divmod(abs(stamp_ns), 10**9)
+    return f'{"-" if stamp_ns < 0 else ""}{whole}.{rest:09d}'
 
 
 def read_times(path: str | Path) -> npt.NDArray[np.int64]:

@@ -113,13 +113,15 @@ def means(
 
 
 def _fixed(column: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
-    scaled = np.nan_to_num(column.astype(np.float64), nan=0.0) * UNITS['intensity']
-    return np.rint(np.clip(scaled, -LARGEST, LARGEST)).astype(np.int32).reshape(-1, 1)
+    most = LARGEST / UNITS['intensity']
+    values = np.clip(np.nan_to_num(column.astype(np.float64), nan=0.0), -most, most)
+    return np.rint(values * UNITS['intensity']).astype(np.int32).reshape(-1, 1)
 
 
 def _unpacked(column: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
     if column.ndim == 2:
-        return np.asarray(np.clip(np.nan_to_num(column[:, :3]), 0, 255), np.int32)
-    packed = np.ascontiguousarray(column)
-    bits = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
+        return np.asarray(np.rint(np.clip(np.nan_to_num(column[:, :3]), 0, 255)), np.int32)
+    is_float = column.dtype.kind == 'f' and column.dtype.itemsize == 4  # of either byte order
+    packed = np.ascontiguousarray(column, np.float32 if is_float else np.uint32)
+    bits = packed.view(np.uint32)
     return np.stack([(bits >> 16) & 255, (bits >> 8) & 255, bits & 255], axis=1).astype(np.int32)

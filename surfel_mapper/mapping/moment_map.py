@@ -37,6 +37,7 @@ from surfel_mapper.mapping.moments import (
     ScanMoments,
     shifted_moments,
     whole_keys,
+    within_reach,
 )
 from surfel_mapper.mapping.voxel_table import ChangeLog, VoxelTable
 
@@ -252,7 +253,8 @@ class MomentMap:
         if index.dtype.kind not in 'iu' or index.ndim != 2 or index.shape[1] != 3:
             kind = f'{index.dtype} {index.shape}'
             raise ValueError(f'voxel_index: {kind}, expected integers (K, 3)')
-        chosen = self._table.find(np.unique(pack_keys(index)))  # in this order: by voxel
+        keys = np.unique(pack_keys(index[within_reach(index)]))  # in this order: by voxel
+        chosen = self._table.find(keys)
         return self._moments_of(chosen[chosen >= 0])
 
     def _moments_of(self, chosen: npt.NDArray[Any]) -> ScanMoments:

@@ -175,6 +175,12 @@ def pack_keys(voxel_index: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
     return np.asarray(packed, np.int64)
 
 
+def within_reach(voxel_index: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """Return which voxel indices (K, 3), of any integer type, have a key: those of 21 bits."""
+    inside = (voxel_index >= -INDEX_OFFSET) & (voxel_index < INDEX_OFFSET)
+    return np.asarray(inside.all(axis=1))
+
+
 def unpack_keys(key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
     """Return the voxel indices (K, 3) int32 of keys (K,) int64."""
     index = np.empty((len(key), 3), np.int32)

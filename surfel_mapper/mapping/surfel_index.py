@@ -135,6 +135,8 @@ class SurfelIndex:
 
     def in_radius(self, center: npt.ArrayLike, radius_m: float) -> npt.NDArray[np.int64]:
         """Return the rows of the surfels within a distance of a point, ascending."""
+        if not radius_m >= 0.0:
+            raise ValueError(f'radius_m: {radius_m}, expected zero or more')
         step = self.surfels.position - _places(np.reshape(np.asarray(center), (1, 3)))
         return np.flatnonzero((step * step).sum(axis=1) <= radius_m * radius_m)
 

@@ -167,7 +167,7 @@ class VoxelTable:
         found = as_array('rows', rows)
         if found.ndim != 1 or found.dtype.kind != 'i':
             raise IndexError(f'rows: {found.dtype} {found.shape}, expected those of find')
-        last = len(self.rows.array) - 1
+        last = self._hash.rows_used - 1
         if len(found) and not 0 <= found.min() <= found.max() <= last:
             raise IndexError(
                 f'rows {found.min()} to {found.max()}, expected 0 to {last}; find returns -1 for '

@@ -59,6 +59,14 @@ class WindowedScan:
     columns: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
     frame_id: str = ''
 
+    def __post_init__(self) -> None:
+        """Refuse what would fail only after the map has the scan."""
+        check_kind('moments', self.moments, ScanMoments)
+        if isinstance(self.stamp_ns, bool) or not isinstance(self.stamp_ns, (int, np.integer)):
+            raise ValueError(f'stamp_ns: {self.stamp_ns!r}, expected whole nanoseconds as an int')
+        if np.shape(self.T_map_sensor) != (4, 4):
+            raise ValueError(f'T_map_sensor: shape {np.shape(self.T_map_sensor)}, expected (4, 4)')
+
     @property
     def nbytes(self) -> int:
         """Size of moments, points and columns, bytes."""
@@ -307,14 +315,18 @@ class SlidingWindow:
 
         Raises
         ------
+        IndexError
+            If there is no kept scan at a position.
         MapError
-            If the map refuses a scan; nothing is changed.
+            If the map refuses a scan; nothing is changed in either case.
 
         """
         check_kind('scans', scans, Mapping)
         min_points = as_whole('min_points', min_points)
         checked_scans(scans.values())
         old = list(self)
+        if absent := [place for place in scans if place not in range(len(old))]:
+            raise IndexError(f'scan {absent[0]} of {len(old)} kept ones, expected 0 or more')
         left = np.concatenate([np.empty(0, np.int64), *(old[p].moments.key for p in scans)])
         full = self._full(left, min_points)
         with ExitStack() as undo:

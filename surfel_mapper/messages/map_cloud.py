@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.errors import CloudFormatError, MapError
 from surfel_mapper.mapping.channels import channel_names
-from surfel_mapper.mapping.moments import pack_keys, ScanMoments
+from surfel_mapper.mapping.moments import check_possible, pack_keys, ScanMoments, within_reach
 from surfel_mapper.mapping.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
@@ -112,6 +112,8 @@ def moments_in(columns: Columns, voxel_size_m: float, channels: tuple[str, ...])
             f'{", ".join(channels) or "no channels"}?'
         )
     index = np.stack([columns[name] for name in VOXEL], axis=1).astype(np.int32)
+    if not within_reach(index).all():
+        raise CloudFormatError('voxel indices beyond 21 bits, expected those of a map')
     count = columns['num_points'].astype(np.int64)
     check_size(columns, index, count > 0, voxel_size_m)
     sums = np.stack([whole(columns[name]) for name in names], axis=1)
@@ -238,7 +240,12 @@ class MapMirror:
         if not len(scan):
             return scan.stamp_ns, self.map.moments(np.empty((0, 3), np.int32))
         columns = {**dict(zip('xyz', scan.points.T, strict=True)), **scan.columns}
-        return scan.stamp_ns, moments_in(columns, self.map.voxel_size_m, self._channels)
+        moments = moments_in(columns, self.map.voxel_size_m, self._channels)
+        try:
+            check_possible(moments.select(moments.count > 0))
+        except MapError as error:
+            raise CloudFormatError(str(error)) from error
+        return scan.stamp_ns, moments
 
     def _put(self, moments: ScanMoments) -> None:
         """Replace the moments of voxels in the copy."""

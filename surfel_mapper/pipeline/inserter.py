@@ -25,7 +25,12 @@ from surfel_mapper.errors import AlignmentError, MapError, PoseError
 from surfel_mapper.geometry import compose, inverse, Transform
 from surfel_mapper.layers import InsertedScan, Surroundings
 from surfel_mapper.layers.sensor_models import SensorModels
-from surfel_mapper.mapping.moments import looks_like_millimetres, MILLIMETRES, pack_keys
+from surfel_mapper.mapping.moments import (
+    looks_like_millimetres,
+    MILLIMETRES,
+    pack_keys,
+    ScanMoments,
+)
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
@@ -135,10 +140,10 @@ class Inserter:
                 kept.clear()
         self.preparation.local_map = self._local_map
 
-    def restore(self, surfel_map: SurfelMap, scans: list[WindowedScan]) -> None:
+    def restore(self, moments: ScanMoments, scans: list[WindowedScan]) -> None:
         """Replace map and window by saved ones, which scans are registered to until cleared."""
         self.clear()
-        self.map.insert(surfel_map.moments())
+        self.map.insert(moments)
         self.window.restore(scans)
         self.preparation.local_map = None
         if self.loops is not None:

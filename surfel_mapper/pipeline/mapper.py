@@ -96,6 +96,7 @@ class Mapper:
         self.counters = Counters()
         self._drops = Drops(self.counters)
         self._guard = StampGuard(self.config.input.reset_after_s)
+        self._clears_map = False
         settings = self.config.map
         threads = settings.threads or 1
         self.map = SurfelMap(settings.voxel_size_m, columns=settings.columns, threads=threads)
@@ -308,6 +309,10 @@ class Mapper:
             same to the bit. Call it once with False at the end.
 
         """
+        if self._clears_map:  # time was set back: these scans are of the time before
+            while self._queue.posed:
+                yield from self._insert(*self._queue.posed.popleft())
+            self._clear_map()
         ahead = self._inserter.scans_ahead(self.config)
         keeps = ahead if more_follows else 0
         while self._queue.fill_posed(1 + ahead, self.config.pose) > keeps:
@@ -370,6 +375,11 @@ class Mapper:
         self._queue.drop_all('cleared', 'the map was cleared')
         if self.registered is not None:
             self.registered.finish()
+        self._clear_map()
+
+    def _clear_map(self) -> None:
+        """Empty the map, unless it is frozen."""
+        self._clears_map = False
         if self.config.map.mode != 'frozen':
             self._inserter.clear()
 
@@ -527,9 +537,10 @@ class Mapper:
             found, expected = getattr(surfel_map, name), getattr(self.map, name)
             if found != expected:
                 raise MapError(f'map with {name} {found}, expected {expected} as configured')
+        moments = surfel_map.moments()  # before clearing: it may be the map of this mapper
         self._origin.take_from(surfel_map)
         self.clear()
-        self._inserter.restore(surfel_map, scans)
+        self._inserter.restore(moments, scans)
 
     def reconfigure(self, config: Config) -> None:
         """
@@ -596,7 +607,12 @@ class Mapper:
         }
 
     def _start_anew(self, scan: Scan, back_s: float) -> None:
-        """Clear the map after time was set back, and drop the poses of the time before."""
+        """
+        Clear the map after time was set back, and drop the poses of the time before.
+
+        Scans that have their poses are mapped first, by ``insert_ready``, so that the map does
+        not depend on ``more_follows``; those that wait for theirs are dropped.
+        """
         reset_after_s = self.config.input.reset_after_s
         _log.warning(
             'scan in frame %s: time went back by %.3f s, more than input.reset_after_s '
@@ -606,7 +622,10 @@ class Mapper:
             reset_after_s,
         )
         self.counters.resets += 1
-        self.clear()
+        self._queue.drop_waiting('cleared', 'the map was cleared')
+        self._clears_map = True
+        if not self._queue.posed:
+            self._clear_map()
         if self.registered is not None:
             self.registered.restart()
         self._queue.forget_stamps()

@@ -38,6 +38,11 @@ READ_IN_PLACE = (np.float32, np.float64, np.uint32)
 
 UNITS_NS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
+REFERENCES = ('stamp', 'epoch')
+
+UNTIMED = np.iinfo(np.int64).min
+"""Offset of a point whose time is not finite; deskewing makes the point invalid."""
+
 MAX_SWEEP_NS = 1_500_000_000
 """
 Largest difference of a time from the stamp, ns; a larger one has another unit or clock. Seconds
@@ -70,23 +75,31 @@ def point_times(
     Raises
     ------
     CloudFormatError
-        If there is no such column, or its times are more than 1.5 s from the stamp in every
-        unit.
+        If there is no such column, none of its times is finite, or they are more than 1.5 s from
+        the stamp in every unit.
+    ValueError
+        If the unit or the reference is none of these.
 
     """
+    for what, given, known in (('unit', unit, UNITS_NS), ('reference', reference, REFERENCES)):
+        if given != 'auto' and given not in known:
+            raise ValueError(f'{what}: {given!r}, expected one of auto, {", ".join(known)}')
     name = field or next((name for name in FIELDS if name in scan.columns), '')
     if name not in scan.columns:
         raise CloudFormatError(
             f'no field {field or " or ".join(FIELDS)} among {", ".join(scan.columns) or "none"}; '
             'name the times of points in deskew.field'
         )
-    column = scan.columns[name]
+    column = np.asarray(scan.columns[name])
+    if column.dtype.kind not in 'iuf':
+        raise CloudFormatError(f'field {name}: {column.dtype}, expected numbers')
     if column.ndim != 1:
         raise CloudFormatError(f'field {name}: {column.shape[1]} values a point, expected a time')
     values = np.empty(len(scan), np.float64 if column.dtype.kind == 'f' else np.int64)
-    read = column if column.dtype in READ_IN_PLACE else column.astype(values.dtype)
-    is_any_valid, lowest, highest = fill_times(scan.xyz, read, values)
-    if not is_any_valid:
+    is_any_timed, num_untimed, lowest, highest = fill_times(scan.xyz, readable(column), values)
+    if num_untimed and not is_any_timed:
+        raise CloudFormatError(f'field {name}: no finite time of {num_untimed} valid points')
+    if not is_any_timed:
         return PointTimes(np.zeros(len(scan), np.int64), scan.stamp_ns, scan.stamp_ns)
     ends = np.array([lowest, highest], values.dtype)
     low, high = ends.astype(column.dtype)
@@ -94,6 +107,8 @@ def point_times(
         first, last = _offsets(ends, unit_ns, is_epoch, scan.stamp_ns).tolist()
         if first >= -MAX_SWEEP_NS and last <= MAX_SWEEP_NS:
             offsets = _offsets(values, unit_ns, is_epoch, scan.stamp_ns)
+            if num_untimed:
+                offsets[~np.isfinite(column)] = UNTIMED
             return PointTimes(offsets, scan.stamp_ns + first, scan.stamp_ns + last)
     raise CloudFormatError(
         f'field {name}: times from {low} to {high} of type {column.dtype} are more than '
@@ -125,7 +140,7 @@ def deskewed(
     Returns
     -------
     Scan
-        The points in the same order, (N, 3) float64, all at the stamp.
+        The points in the same order, (N, 3) float64, all at the stamp; those without a time nan.
 
     """
     return deskewing(scan, pose_at, stamps_ns, min_range_m)()
@@ -158,6 +173,8 @@ def deskewing(
             min_range_m * min_range_m,
             moved.T,
         )
+        if times.offsets.min(initial=0) == UNTIMED:
+            moved[times.offsets == UNTIMED] = np.nan
         return replace(scan, points=moved, times=None)
 
     return move
@@ -176,6 +193,15 @@ def warm_up() -> None:
     for dtype in (np.float32, np.float64):
         points = scan.points.astype(dtype, order='F')
         deskewed(replace(scan, points=points, times=times), lambda _: np.eye(4))
+
+
+def readable(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return times as they are if the kernel reads them so, else a copy, float64 or int64."""
+    if column.dtype in READ_IN_PLACE:
+        return column
+    if column.dtype == np.uint64:  # beyond int64 there is no time, and it must not wrap around
+        column = np.minimum(column, np.uint64(np.iinfo(np.int64).max))
+    return column.astype(np.float64 if column.dtype.kind == 'f' else np.int64)
 
 
 def _readings(

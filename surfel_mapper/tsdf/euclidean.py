@@ -308,7 +308,7 @@ class EuclideanField:
             (1, index[number[place.reshape(-1)] < FULL]),
         ):
             kernels.transform(
-                part,
+                part[np.lexsort(part.T[::-1])],  # upwards: each tile knows blocks of the one below
                 size,
                 self._most,
                 self._bits,

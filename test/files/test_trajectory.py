@@ -227,3 +227,11 @@ def test_numbers_of_any_length_need_no_end_of_the_last_line(tmp_path, caplog, la
     )
     assert len(read_trajectory(path)) == 3
     assert 'poses.tum:3: the last line has no end; is the file cut off there?' in caplog.text
+
+
+def test_stamps_before_1970_are_written_with_their_sign(tmp_path):
+    Trajectory.from_matrices(np.tile(np.eye(4), (2, 1, 1)), [-5_000_000_123, -1]).save(
+        tmp_path / 'a.tum'
+    )
+    lines = (tmp_path / 'a.tum').read_text().splitlines()
+    assert [line.split()[0] for line in lines[-2:]] == ['-5.000000123', '-0.000000001']

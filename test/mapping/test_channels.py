@@ -149,3 +149,22 @@ def test_maps_with_other_columns_do_not_mix():
         SurfelMap(0.5, columns=('intensity',)).merge(SurfelMap(0.5))
     with pytest.raises(ValueError, match='columns'):
         SurfelMap(0.5, columns=('ring',))
+
+
+def test_colours_of_another_byte_order_or_between_two_integers_are_read():
+    points, columns, colors = coloured(5)
+    expected = SurfelMap(0.5, columns=('rgb',))
+    expected.add(points, columns=columns)
+    packed = columns['rgb'].view(np.float32)
+    near = colors.astype(np.float64) + 0.4
+    for column in (packed.astype('>f4'), packed.view(np.uint32).astype('>u4'), near, near - 0.8):
+        surfel_map = SurfelMap(0.5, columns=('rgb',))
+        surfel_map.add(points, columns={'rgb': column})
+        assert surfel_map == expected
+
+
+@pytest.mark.filterwarnings('error')
+def test_infinite_intensities_are_cut_off_without_a_warning():
+    surfel_map = SurfelMap(0.5, columns=('intensity',))
+    surfel_map.add([[0.1, 0.1, 0.1]], columns={'intensity': np.array([np.inf])})
+    assert surfel_map.surfels().channels['intensity'].tolist() == [2**23 - 1]

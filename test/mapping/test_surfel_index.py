@@ -116,3 +116,5 @@ def test_invalid_queries_are_refused(index):
         index.best_planar([[0.0, 0.0, 0.0]], 0, 1.0)
     with pytest.raises(ValueError, match='max_distance_m: nan'):
         index.nearest([[0.0, 0.0, 0.0]], float('nan'))
+    with pytest.raises(ValueError, match=r'radius_m: -5\.0, expected zero or more'):
+        index.in_radius([0.0, 0.0, 0.0], -5.0)

@@ -15,6 +15,7 @@ import pytest
 
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SlidingWindow
 from test.mapping.made_maps import map_of, scans_at
 from test.reference import add_moments, as_twin, digest, scan_moments
 
@@ -231,3 +232,22 @@ def test_returned_surfels_do_not_change_with_the_map():
         surfel_map.add(points, origin)
     assert (surfels.position == position).all()
     assert (moments.total == total).all()
+
+
+@pytest.mark.parametrize('far', [2**21, -(2**21), 2**30])
+def test_voxels_beyond_the_range_of_indices_are_not_in_the_map(far):
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add([[0.1, 0.6, 0.1]])
+    for index in ([0, 0, far], [far, 1, 0]):
+        assert len(surfel_map.moments(np.array([index]))) == 0
+    assert len(surfel_map.moments(np.array([[0, 1, 0], [2**64 - 1, 1, 0]], np.uint64))) == 1
+    window = SlidingWindow(surfel_map)
+    assert len(window.drop_voxels(np.array([[0, 0, far]]))) == 0
+    assert surfel_map.num_voxels == 1
+
+
+def test_rows_that_were_never_used_are_refused():
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add([[0.1, 0.6, 0.1]])
+    with pytest.raises(IndexError, match='rows 500 to 500, expected 0 to 0'):
+        surfel_map.surfels_of(np.array([500]))

@@ -378,3 +378,20 @@ def test_points_are_found_in_the_voxels_that_the_map_puts_them_in(dtype):
     assert dict(zip(found, counts, strict=True)) == dict(
         zip(moments.key, moments.count, strict=True)
     )
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error', 'message'),
+    [
+        ({'T_map_sensor': None}, ValueError, r'T_map_sensor: shape \(\), expected \(4, 4\)'),
+        ({'T_map_sensor': np.eye(3)}, ValueError, r'T_map_sensor: shape \(3, 3\)'),
+        ({'stamp_ns': None}, ValueError, 'stamp_ns: None, expected whole nanoseconds'),
+        ({'moments': None}, TypeError, 'moments: a NoneType, expected a ScanMoments'),
+    ],
+)
+def test_a_scan_that_a_window_cannot_hold_is_refused_before_the_map_has_it(
+    changes, error, message
+):
+    scan = scan_at(SurfelMap(0.5), 0, 0.0, (0, 0, 0))
+    with pytest.raises(error, match=message):
+        replace(scan, **changes)

@@ -117,3 +117,13 @@ def test_moving_nothing_changes_nothing(window):
 
     assert window.move({}).shape == (0, 3)
     assert surfel_map.version == before
+
+
+@pytest.mark.parametrize('place', [-1, 3])
+def test_a_place_without_a_scan_is_refused(window, place):
+    surfel_map, window = window
+    before = surfel_map.digest()
+    scan = scan_at(surfel_map, np.ones((1, 3)), shifted(9.0))
+    with pytest.raises(IndexError, match=f'scan {place} of 3 kept ones'):
+        window.move({place: scan})
+    assert surfel_map.digest() == before

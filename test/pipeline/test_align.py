@@ -317,6 +317,13 @@ def test_scans_whose_columns_were_not_kept_are_refused(drive):
         mapper.align()
 
 
+def test_a_mapper_may_be_restored_to_its_own_map(drive):
+    mapper, _ = mapped(drive, {}, number=3)
+    digest, scans = mapper.map.digest(), list(mapper.window)
+    mapper.restore(mapper.map, scans)
+    assert (mapper.map.digest(), len(mapper.window)) == (digest, 3)
+
+
 def test_the_first_scan_alone_is_nothing_to_align_or_to_warn_of(drive, caplog):
     _, updates = mapped(drive, {'align.every_scans': 1}, number=2)
 

@@ -363,6 +363,28 @@ def test_clouds_without_moments_are_refused_and_change_nothing():
     assert mirror.map.digest() == digest
 
 
+def test_impossible_moments_are_refused_and_change_nothing():
+    node, mirror = Node(), MapMirror(0.5)
+    node.map_scan(0)
+    mirror.replace(node.full())
+    digest = mirror.map.digest()
+    surfels = node.mapper.map.surfels(1)
+    bad = node.mapper.map.moments()
+    bad.product[0] = -1
+    content = moment_cloud(surfels, bad, NO_VOXELS)
+    header = node.full().header
+    names = content.__slots__
+    message = SimpleNamespace(header=header, **{n: getattr(content, n) for n in names})
+    far = node.message(surfels, np.array([[0, 0, 2**21]], np.int32))
+    for refused in (message, far):
+        for take in (mirror.replace, mirror.change):
+            with pytest.raises(CloudFormatError):
+                take(refused)
+            assert mirror.map.digest() == digest
+    mirror.replace(node.full())
+    assert mirror.map.digest() == digest
+
+
 def test_an_empty_map_is_mirrored():
     mirror = MapMirror(0.5)
     node = Node()

@@ -14,7 +14,7 @@ from surfel_mapper.geometry import compose, inverse, pose_matrix, se3_exp
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import LazyPoints, PointTimes, Scan
-from surfel_mapper.sensors.deskew import deskewed, MAX_TURN_RAD, point_times
+from surfel_mapper.sensors.deskew import deskewed, MAX_TURN_RAD, point_times, UNTIMED
 from surfel_mapper.sensors.kernels.deskew import count_from_stamp, fill_times, move_points
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.kernels.modes import both
@@ -75,7 +75,7 @@ def test_times_are_read_without_decoding_the_points(dtype, offset):
 
 
 @pytest.mark.parametrize(
-    'dtype', ['>f4', '>f8', '>u4', 'f2', 'g', 'i1', 'u2', 'i8', 'u8', 'm8[ns]']
+    'dtype', ['>f4', '>f8', '>u4', 'f2', 'g', 'i1', 'u2', 'i8', 'u8']
 )
 def test_times_of_any_type_and_byte_order_are_read(dtype):
     found = point_times(sweep(np.array([7, 5, 100], dtype)), unit='ns', reference='stamp')
@@ -104,6 +104,7 @@ def test_invalid_points_do_not_affect_the_times():
     found = point_times(sweep(times, points=points))
     assert abs(found.first_ns - START_NS) < 240
     assert abs(found.last_ns - START_NS - 25 * MS) < 240
+    assert np.flatnonzero(found.offsets == UNTIMED).tolist() == [2, 5]
     nothing = point_times(sweep(times, points=np.zeros((6, 3), np.float32)))
     assert (nothing.first_ns, nothing.last_ns) == (START_NS, START_NS)
 
@@ -119,6 +120,9 @@ def test_invalid_points_do_not_affect_the_times():
         (sweep(np.full(2, 2**63 + 1, np.uint64)), {}, 'deskew.unit auto'),
         (sweep(OFFSETS_MS / 1e3), {'reference': 'epoch'}, 'deskew.reference epoch'),
         (sweep(np.float32(EPOCH_S)), {}, 'float32'),
+        (sweep(np.full(2, 2**64 - 1, np.uint64)), {}, 'times from 9223372036854775807'),
+        (sweep(np.full(2, np.nan)), {}, 'field t: no finite time of 2 valid points'),
+        (sweep(np.array(['a', 'b'])), {}, 'field t: <U1, expected numbers'),
     ],
 )
 def test_implausible_times_are_refused(scan, settings, message):
@@ -128,7 +132,7 @@ def test_implausible_times_are_refused(scan, settings, message):
 
 @both
 @pytest.mark.parametrize('dtype', [np.int64, np.float64])
-def test_times_of_invalid_points_are_those_of_the_first_valid_one(call, dtype):
+def test_times_of_points_without_one_are_those_of_the_first_that_has_one(call, dtype):
     rng = np.random.default_rng(6)
     xyz = rng.normal(size=(3, 40)).astype(np.float32)
     times = rng.integers(-(10**9), 10**9, 40).astype(dtype)
@@ -143,8 +147,9 @@ def test_times_of_invalid_points_are_those_of_the_first_valid_one(call, dtype):
     found = call(fill_times, tuple(xyz), times, filled)
     expected = np.where(invalid, times[np.flatnonzero(~invalid)[0]], times)
     np.testing.assert_array_equal(filled, expected)
-    assert found == (True, expected.min(), expected.max())
-    assert not call(fill_times, tuple(xyz[:, :2]), times[:2], filled[:2])[0]
+    untimed = 2 if dtype == np.float64 else 0
+    assert found == (True, untimed, expected.min(), expected.max())
+    assert call(fill_times, tuple(xyz[:, :2]), times[:2], filled[:2])[:2] == (False, 0)
 
 
 @both
@@ -158,6 +163,19 @@ def test_times_count_from_the_stamp_in_whole_nanoseconds(call, dtype):
     call(count_from_stamp, values, base, limit, unit_ns, 7, found)
     near = [4, -4000] if dtype == np.int64 else [0, -2]
     assert found.tolist() == [7, *(each + 7 for each in near), 24_007, -23_993]
+
+
+def test_points_without_a_time_are_left_out():
+    scan = sweep(np.array([0.0, np.nan, 0.1, np.inf]))
+    still = deskewed(scan.with_times(point_times(scan)), lambda _: np.eye(4)).points
+    assert np.isnan(still).all(axis=1).tolist() == [False, True, False, True]
+    np.testing.assert_array_equal(still[[0, 2]], scan.points[[0, 2]])
+
+
+@pytest.mark.parametrize('name', ['unit', 'reference'])
+def test_unknown_units_and_references_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name}: 'h', expected one of auto, "):
+        point_times(sweep(np.arange(2.0)), **{name: 'h'})
 
 
 def moving(rate_hz, turn_rad_s=(0.3, -0.4, 0.9), speed_m_s=(12.0, 1.0, -0.5)):

@@ -144,3 +144,26 @@ def test_places_outside_of_the_map_are_unknown():
 def test_reaches_below_a_voxel_or_beyond_127_are_refused(max_m):
     with pytest.raises(ConfigError, match=r'esdf.max_m: .*1 to 127 voxels'):
         EuclideanField(BlockMap(TsdfConfig()), max_m=max_m)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_distances_do_not_depend_on_the_order_in_which_blocks_came(seed, rng):
+    distance, weight = scenery(rng), np.zeros(SHAPE)
+    blocks = BlockMap(TsdfConfig(voxel_size_m=VOXEL_M, voxels_per_side=SIDE))
+    places = list(np.ndindex(*np.array(SHAPE) // SIDE))
+    some = np.random.default_rng(seed).permutation(len(places))[: len(places) // 3]
+    for place in (places[number] for number in some):
+        part = tuple(slice(SIDE * p, SIDE * (p + 1)) for p in place)
+        write(blocks, distance[part], np.add(place, FIRST))
+        weight[part] = 1.0
+    field = EuclideanField(blocks, max_m=MAX_M)
+    field.update()
+    np.testing.assert_allclose(sampled(field), expected(distance, weight), atol=1e-6)
+
+
+def test_a_block_far_below_the_one_before_it_is_looked_up_anew():
+    blocks = blocks_of(np.zeros((SIDE, SIDE, SIDE), np.float32), (0, 0, 40))
+    write(blocks, np.full((SIDE, SIDE, SIDE), 0.2, np.float32))
+    field = EuclideanField(blocks, max_m=MAX_M)
+    field.update()
+    np.testing.assert_allclose(field.sample(centers((SIDE, SIDE, SIDE)).reshape(-1, 3)), MAX_M)

@@ -23,36 +23,49 @@ NEVER = np.iinfo(np.int64).max
 @kernel()
 def fill_times(xyz, values, filled):
     """
-    Copy the times of points; an invalid point gets the time of the first valid one.
+    Copy the times of points; others get the time of the first point that has one.
 
     xyz     x, y and z (N,) float32 or float64, m, views into a message or not; invalid in the
             origin, and if not finite
-    values  (N,) of any type, times; that of a valid point is finite
+    values  (N,) of any type, times
     filled  (N,) int64 or float64, out
 
-    Returns whether a point is valid, the smallest and the largest time; if none is valid, nothing
-    is written.
+    Returns whether a valid point has a finite time, the number of valid points that have none, and
+    the smallest and the largest time; if no point has one, nothing is written.
     """
     x, y, z = xyz
-    num, first = len(values), 0
-    while first < num and not is_valid(x[first], y[first], z[first], values[first]):
+    num, first, num_untimed = len(values), 0, 0
+    while first < num:
+        is_there = is_valid(x[first], y[first], z[first])
+        if is_there and is_finite(values[first]):
+            break
+        num_untimed += is_there
         first += 1
     if first == num:
-        return False, first, first
+        return False, num_untimed, first, first
     filled[first] = values[first]
     valid = low = high = filled[first]
+    num_untimed = 0
     for i in range(np.uint64(num)):
+        is_there, is_timed = is_valid(x[i], y[i], z[i]), is_finite(values[i])
+        num_untimed += is_there & (not is_timed)
         filled[i] = values[i]
-        filled[i] = filled[i] if is_valid(x[i], y[i], z[i], values[i]) else valid
+        filled[i] = filled[i] if is_there & is_timed else valid
         low, high = min(low, filled[i]), max(high, filled[i])
-    return True, low, high
+    return True, num_untimed, low, high
 
 
 @part()
-def is_valid(x, y, z, value):
-    """Return whether a point is finite and not in the origin, and its time finite."""
+def is_valid(x, y, z):
+    """Return whether a point is finite and not in the origin."""
     reach = (abs(x) + abs(y)) + abs(z)
-    return (reach > 0.0) & (reach < math.inf) & (abs(value) < math.inf)
+    return (reach > 0.0) & (reach < math.inf)
+
+
+@part()
+def is_finite(value):
+    """Return whether a number is finite."""
+    return abs(value) < math.inf
 
 
 @kernel()

@@ -328,11 +328,11 @@ def transform(tiles, size, most, bits, keys, find, marks, occupied, squared):
 
 @njit(cache=True, nogil=True)
 def follow(tiles, number, width, half, keys, find, cube):
-    """Look up the blocks about a tile; those that the tile before it has too are known."""
+    """Look up the blocks about a tile; those about the tile before it are known if it is below."""
     before, tile = tiles[max(number - 1, 0)], tiles[number]
     step = tile[2] - before[2]
-    is_near = number > 0 and before[0] == tile[0] and before[1] == tile[1]
-    shift = width * width * min(step, width) if is_near else len(cube)
+    is_above = step > 0 and before[0] == tile[0] and before[1] == tile[1]
+    shift = width * width * min(step, width) if is_above else len(cube)
     for place in range(len(cube)):
         if place + shift < len(cube):
             cube[place] = cube[place + shift]
