@@ -4,7 +4,7 @@
 The part of its plane that a patch covers: cells, and cuts of the boundary cells.
 
 A cut is one byte, in 1/255 of the pitch (2/255 for the triangle), rounded down, so that no point
-of the patch lies outside.
+that the patch was fitted to lies outside.
 """
 
 from __future__ import annotations
