@@ -133,6 +133,8 @@ def read(
 
     args.cloud = exact_map(args.cloud)
     is_tiles = args.cloud.is_dir()
+    if not args.cloud.exists():
+        raise FileFormatError(f'{args.cloud}: no such file')
     if not is_tiles and args.cloud.suffix not in (*MAPS, *SUFFIXES):
         raise FileFormatError(
             f'{args.cloud}: expected a cloud ending in {", ".join(SUFFIXES)}, or a map ending in '

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
+import math
 from typing import Any
 
 from surfel_mapper.bags.reader import BagMessage, BagReader
@@ -235,7 +236,7 @@ def tried(
 
 def transforms(poses: list[StampedPose], static: list[StampedPose]) -> TransformBuffer:
     """Return a buffer of all poses but those that mapping would ignore."""
-    buffer = TransformBuffer(ALL_TIME_S, ALL_TIME_S)
+    buffer = TransformBuffer(ALL_TIME_S, ALL_TIME_S, DEFAULTS.pose.max_gap_s or math.inf)
     for pose, is_static in [*((p, True) for p in static), *((p, False) for p in poses)]:
         with suppress(PoseError, ValueError):
             transform = pose_matrix(pose.xyz, pose.q_xyzw)

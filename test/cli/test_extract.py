@@ -98,7 +98,8 @@ def test_a_file_that_is_no_cloud_is_refused_by_name(tmp_path, capsys, name):
 
 
 def test_an_unknown_ending_is_refused_with_the_known_ones(tmp_path, capsys):
-    assert main(['extract', 'notes.md', '--output', str(tmp_path)]) == 1
+    (tmp_path / 'notes.md').touch()
+    assert main(['extract', str(tmp_path / 'notes.md'), '--output', str(tmp_path)]) == 1
     said = capsys.readouterr().err
     assert (
         'a cloud ending in .ply, .pcd, .bin, .las, .laz, or a map ending in .npz, .parquet' in said
@@ -110,3 +111,8 @@ def test_a_voxel_size_of_zero_is_refused(tmp_path, capsys):
     arguments = [str(tmp_path / 'a.ply'), '--output', str(tmp_path / 'out')]
     assert main(['extract', *arguments, '--voxel-size', '0']) == 1
     assert 'voxel_size_m' in capsys.readouterr().err
+
+
+def test_a_file_that_does_not_exist_is_named_so(tmp_path, capsys):
+    assert main(['extract', str(tmp_path / 'nothere'), '--output', str(tmp_path)]) == 1
+    assert f'{tmp_path / "nothere"}: no such file' in capsys.readouterr().err

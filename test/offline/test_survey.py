@@ -101,6 +101,21 @@ def test_clouds_without_a_pose_are_counted(tmp_path):
     assert all('newer than all of' in offer.missing for offer in made)
 
 
+def test_clouds_in_a_gap_of_the_poses_count_as_without(tmp_path):
+    entries = drive(num_scans=40)
+    first_ns, last_ns = START_NS + 5 * PERIOD_NS, START_NS + 35 * PERIOD_NS
+    kept = [
+        row
+        for row in entries
+        if row[1] == CLOUD or row[0] == '/tf_static' or not first_ns < row[2] < last_ns
+    ]
+
+    _, made = surveyed(write_rosbag2(tmp_path / 'a', kept))
+
+    assert {offer.covered for offer in made} == {40 - 29}
+    assert all('in a gap of 3.000 s' in offer.missing for offer in made)
+
+
 def test_a_bag_without_poses_offers_none(tmp_path):
     found, made = surveyed(write_rosbag2(tmp_path / 'a', [r for r in drive() if r[1] == CLOUD]))
 
