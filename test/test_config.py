@@ -15,6 +15,7 @@ from surfel_mapper.config import (
     declarations,
     load_config,
     MapConfig,
+    parse_yaml,
     register_stage,
     setting,
     Stage,
@@ -22,6 +23,7 @@ from surfel_mapper.config import (
     WindowConfig,
 )
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.filters.chain import Chain
 
 DECLARATIONS = {declared.name: declared for declared in declarations()}
 BOUNDED = [declared for declared in declarations() if declared.is_number]
@@ -331,3 +333,40 @@ def test_a_file_that_cannot_be_read_is_refused_by_name(tmp_path, name):
     path = tmp_path / name
     with pytest.raises(ConfigError, match=f'^{path}: cannot be read'):
         load_config(path)
+
+
+@pytest.mark.parametrize(
+    ('text', 'name', 'lines'),
+    [
+        ('map: {min_points: 3}\nwindow: {}\nmap: {}\n', 'map', (1, 3)),
+        ('map:\n  min_points: 3\n  min_points: 4\n', r'map\.min_points', (2, 3)),
+        ('map: {min_points: 3, min_points: 4}\n', r'map\.min_points', (1, 1)),
+        ('map.min_points: 3\nmap:\n  min_points: 4\n', r'map\.min_points', (1, 3)),
+    ],
+)
+def test_a_key_twice_is_refused_with_its_lines(tmp_path, text, name, lines):
+    says = f'{name}: twice, in line {lines[0]} and line {lines[1]}, expected once'
+    with pytest.raises(ConfigError, match=says):
+        load_config(written(tmp_path, text))
+
+
+def test_a_parameter_of_a_filter_twice_is_refused():
+    text = '- RandomSamplingDataPointsFilter:\n    prob: 0.5\n    prob: 0.7\n'
+    with pytest.raises(ConfigError, match=r'\.prob: twice, in line 2 and line 3'):
+        Chain.from_yaml(text)
+
+
+def test_a_key_may_come_again_in_another_item_of_a_list():
+    assert parse_yaml('- {a: 1, b: {a: 2}}\n- a: 3\n') == [{'a': 1, 'b': {'a': 2}}, {'a': 3}]
+
+
+@pytest.mark.parametrize('text', ['5e-1', '+5e-1', '5E-1', '5.e-1', '.5e0', '0.05e1', '0.5'])
+def test_numbers_with_an_exponent_are_numbers(tmp_path, text):
+    config = load_config(written(tmp_path, f'map: {{voxel_size_m: {text}}}\n'))
+
+    assert config.map.voxel_size_m == 0.5
+
+
+@pytest.mark.parametrize('text', ['e1', '1e', '1e2x', '"1e2"', '1e2e3'])
+def test_texts_like_numbers_with_an_exponent_stay_text(text):
+    assert parse_yaml(text) == text.strip('"')

@@ -15,13 +15,14 @@ from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import shutil
+import sqlite3
 import tempfile
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from surfel_mapper.bags._rosbags import jazzy_types, latched_profile, new_writer
-from surfel_mapper.bags.paths import METADATA
+from surfel_mapper.bags.paths import is_storage, METADATA
 from surfel_mapper.errors import BagError
 from surfel_mapper.files.atomic import sync_directory
 from surfel_mapper.messages.pointcloud2 import CloudBytes
@@ -31,6 +32,12 @@ if TYPE_CHECKING:
     from surfel_mapper.bags._rosbags import Connection
 
 STORAGES = ('mcap', 'sqlite3')
+
+OF_A_BAG = (METADATA, 'world.json', 'simulation.json')
+"""Files that a bag to be overwritten may have beside its storage; two are of a simulation."""
+
+JOURNALS = ('-wal', '-shm', '-journal')
+"""Endings of the files that SQLite keeps beside a .db3."""
 
 
 class BagWriter:
@@ -44,7 +51,8 @@ class BagWriter:
     storage : str
         mcap or sqlite3.
     overwrite : bool
-        Whether to replace a bag, or an empty directory, of that name.
+        Whether to replace a bag, or an empty directory, of that name. A directory with other
+        files is never replaced.
 
     Attributes
     ----------
@@ -92,7 +100,7 @@ class BagWriter:
         """Give the bag its name, or remove the incomplete bag after an error."""
         try:
             if kind is not None:
-                with suppress(OSError):  # of a full disk, and the error on its way says more
+                with suppress(OSError, sqlite3.Error):  # a full disk; the first error says more
                     self._writer.abort()
                 return
             with self._refusing():
@@ -275,12 +283,26 @@ class BagWriter:
             raise BagError(f'{self.path}: not a directory, so not a bag to overwrite')
         if not (self.path / METADATA).exists() and any(self.path.iterdir()):
             raise BagError(f'{self.path}: has files but no {METADATA}, so not a bag to overwrite')
+        other = next((file for file in sorted(self.path.iterdir()) if not is_of_bag(file)), None)
+        if other is not None:
+            raise BagError(
+                f'{self.path}: {other.name} in it is no file of a bag, so not overwritten; move '
+                'it, or name another directory'
+            )
 
     @contextmanager
     def _refusing(self) -> Iterator[None]:
         """Turn errors of the system into a BagError that names the bag."""
         try:
             yield
-        except OSError as error:
-            reason = error.strerror or error
+        except (OSError, sqlite3.Error) as error:
+            reason = getattr(error, 'strerror', None) or error
             raise BagError(f'{self.path}: cannot be written: {reason}') from error
+
+
+def is_of_bag(path: Path) -> bool:
+    """Return whether a path in the directory of a bag is a file that belongs to a bag."""
+    name = path.name
+    for ending in JOURNALS:
+        name = name.removesuffix(ending)
+    return path.is_file() and (name in OF_A_BAG or is_storage(path.with_name(name)))

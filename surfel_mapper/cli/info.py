@@ -149,11 +149,14 @@ def chosen(path: Path) -> dict[str, Any]:
 def folder_content(path: Path) -> dict[str, Any]:
     """Return the number, times and columns of scans in files as plain values."""
     from surfel_mapper.config import Config
+    from surfel_mapper.errors import FileFormatError
     from surfel_mapper.offline.request import Request
     from surfel_mapper.offline.scan_folder import ScanFolder
 
     folder = ScanFolder(Request(path=path), Config(), None)
     first = folder.first_scan()
+    if first is None:
+        raise FileFormatError(folder.first_error)
     found = folder.describe()
     return {
         'bag': str(path),
@@ -161,8 +164,9 @@ def folder_content(path: Path) -> dict[str, Any]:
         'scans': len(folder.files),
         'seconds': folder.recorded_s,
         'times_from': found['times_from'],
-        'points': 0 if first is None else len(first),
-        'columns': [] if first is None else sorted(first.columns),
+        'points': len(first),
+        'columns': sorted(first.columns),
+        'damaged': [folder.first_error] if folder.first_error else [],
         'replay': {name: found[name] for name in ('poses_from', 'poses_reason', 'deskewed')},
     }
 
@@ -170,11 +174,13 @@ def folder_content(path: Path) -> dict[str, Any]:
 def folder_report(content: dict[str, Any]) -> str:
     """Return the figures of scans in files as lines of text."""
     columns = ', '.join(content['columns']) or 'none'
+    damaged = ''.join(f'damaged: {error}\n' for error in content['damaged'])
+    read = 'first scan that can be read' if damaged else 'first scan'
     return (
         f'{content["bag"]}: {content["format"]}, {content["scans"]} '
         f'{"scan" if content["scans"] == 1 else "scans"}, '
         f'{content["seconds"]:.1f} s; times: {content["times_from"]}\n'
-        f'  first scan: {content["points"]} points; columns beside x y z: {columns}\n\n'
+        f'  {read}: {content["points"]} points; columns beside x y z: {columns}\n{damaged}\n'
         f'{replay_line(content["replay"])}'
     )
 

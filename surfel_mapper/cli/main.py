@@ -60,6 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The arguments; those of the process without.
 
     """
+    replace_closed_streams()
     arguments, ros_args = without_ros_args(sys.argv[1:] if argv is None else argv)
     args, unknown = parser_of(arguments).parse_known_args(arguments)
     if unknown:
@@ -89,6 +90,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f'surfel-mapper {args.verb}: interrupted', file=sys.stderr)
         return 130
+
+
+def replace_closed_streams() -> None:
+    """
+    Open stdout and stderr to nothing if the caller closed them, as the shell does by ``>&-``.
+
+    Python sets them to None then, and ``print(file=None)`` of errors would go to stdout.
+    """
+    for name in ('stdout', 'stderr'):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, 'w'))  # noqa: SIM115 - until the process ends
 
 
 def refused(verb: str, message: str, code: int = 1) -> int:

@@ -33,7 +33,12 @@ from surfel_mapper.cli._output import printable, show_lines
 from surfel_mapper.cli._progress import progress, stopped_by_interrupt
 from surfel_mapper.errors import MapError
 from surfel_mapper.layers import formats as layer_formats
-from surfel_mapper.offline.outputs import known_formats, MAP_FORMATS, output_directory
+from surfel_mapper.offline.outputs import (
+    check_distinct,
+    known_formats,
+    MAP_FORMATS,
+    output_directory,
+)
 from surfel_mapper.offline.replay import replay, ReplayOptions
 from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import as_text, uncertain_text
@@ -215,6 +220,8 @@ def replay_one(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     )
     request = request_of(args, args.bags[0])
     config = configured(args)
+    others = {'--poses-out': args.poses_out, '--rrd': args.rrd}
+    check_distinct(request.path, args.output, replay_options.formats, others)
     return replay(request, output=args.output, config=config, options=replay_options, **options)
 
 

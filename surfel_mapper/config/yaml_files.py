@@ -9,12 +9,17 @@ count as the nodes that they expand to. Nesting deeper than any setting, which w
 recursion of the parser, is refused too, and numbers of thousands of digits: those of base 60
 (``1:1:1``) take time by the square of their length. Only regular files of at most 1 MiB are read.
 
+A key twice is refused: PyYAML would drop the first in silence. Numbers such as 1e-2, which are
+text to YAML 1.1 and so to PyYAML, are numbers, as they are to the parameter files of ROS.
+
 Alone in its module because chains of filters and bags are read by it too, not only settings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 import re
 from typing import Any
@@ -33,6 +38,9 @@ MAX_NUMBER = 4300
 
 NUMBER = re.compile(r'[-+.0-9]')
 """First character of a number."""
+
+EXPONENT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$')
+"""Number with an exponent; YAML 1.1 demands a point and the sign of the exponent."""
 
 
 def read_yaml(path: str | Path, *, as_text: bool = False, max_nodes: int = MAX_NODES) -> Any:
@@ -54,7 +62,7 @@ def read_yaml(path: str | Path, *, as_text: bool = False, max_nodes: int = MAX_N
         If the file cannot be read.
     ValueError
         If it is not a regular file of at most 1 MiB, not YAML, is nested too deeply, has too many
-        nodes, with those that aliases expand to, or a number of too many digits.
+        nodes, with those that aliases expand to, a number of too many digits, or a key twice.
 
     """
     return parse_yaml(read_small_file(path).decode(), as_text=as_text, max_nodes=max_nodes)
@@ -68,11 +76,12 @@ def parse_yaml(text: str, *, as_text: bool = False, max_nodes: int = MAX_NODES) 
     base = getattr(yaml, 'CBaseLoader', yaml.BaseLoader)
     try:
         events = checked_events(yaml.parse(text, base), max_nodes, as_text=as_text)
+        events = distinct_keys(events)
         if as_text:
             return text_document(events)
         for _ in events:
             pass
-        return yaml.load(text, getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
+        return yaml.load(text, value_loader())
     except yaml.MarkedYAMLError as error:
         # without the line itself: a caller may pass a path whose content is not theirs to read
         raise ValueError(f'{error.problem or error.context}{place(error.problem_mark)}') from error
@@ -82,6 +91,18 @@ def parse_yaml(text: str, *, as_text: bool = False, max_nodes: int = MAX_NODES) 
         raise
     except Exception as error:  # PyYAML's for a tag whose value is none of it: !!bool maybe
         raise ValueError(f'a value that its tag does not allow: {error!r}') from error
+
+
+@cache
+def value_loader() -> Any:
+    """Return the safe loader of PyYAML, with 1e-2 as a number."""
+    import yaml
+
+    class Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
+        pass
+
+    Loader.add_implicit_resolver('tag:yaml.org,2002:float', EXPONENT, list('-+.0123456789'))
+    return Loader
 
 
 def text_document(events: Iterator[Any]) -> Any:
@@ -152,6 +173,59 @@ def checked_events(events: Iterable[Any], max_nodes: int, *, as_text: bool) -> I
         if len(open_nodes) > MAX_DEPTH:
             raise ValueError(f'nested deeper than {MAX_DEPTH}{place(event.start_mark)}')
         yield event
+
+
+@dataclass(slots=True)
+class OpenMapping:
+    """
+    Keys of a mapping while its events are read.
+
+    Attributes
+    ----------
+    prefix : str
+        The keys that lead to it, each followed by a point.
+    lines : dict of str to int
+        Line of each key with its prefix; shared with the mappings inside.
+    key : str, optional
+        The key whose value comes next; None if a key comes next.
+
+    """
+
+    prefix: str = ''
+    lines: dict[str, int] = field(default_factory=dict)
+    key: str | None = None
+
+
+def distinct_keys(events: Iterable[Any]) -> Iterator[Any]:
+    """Yield events; ValueError for a key twice, also once as ``a.b`` and once as b in a."""
+    import yaml
+
+    nodes: list[OpenMapping | None] = []  # None: a list
+    for event in events:
+        if isinstance(event, yaml.CollectionEndEvent):
+            nodes.pop()
+        elif isinstance(event, yaml.NodeEvent):
+            around, inside = nodes[-1] if nodes else None, OpenMapping()
+            if around is not None and around.key is None:
+                around.key = event.value if isinstance(event, yaml.ScalarEvent) else ''
+                if around.key:
+                    note_key(around, event.start_mark)
+            elif around is not None:
+                inside = OpenMapping(f'{around.prefix}{around.key}.', around.lines)
+                around.key = None
+            if isinstance(event, yaml.CollectionStartEvent):
+                nodes.append(inside if isinstance(event, yaml.MappingStartEvent) else None)
+        yield event
+
+
+def note_key(mapping: OpenMapping, mark: Any) -> None:
+    """Note the line of the key of a mapping; ValueError if it has been noted before."""
+    name = f'{mapping.prefix}{mapping.key}'
+    if name in mapping.lines:
+        raise ValueError(
+            f'{name}: twice, in line {mapping.lines[name]} and line {mark.line + 1}, expected once'
+        )
+    mapping.lines[name] = mark.line + 1
 
 
 def place(mark: Any) -> str:

@@ -34,9 +34,19 @@ Columns = dict[str, npt.NDArray[Any]]
 
 
 def scan_files(directory: Path) -> list[Path]:
-    """Return the files of scans in a directory, scan2 before scan10."""
-    files = [file for file in directory.iterdir() if file.suffix in SUFFIXES and file.is_file()]
+    """
+    Return the files of scans in a directory, scan2 before scan10.
+
+    Links that lead nowhere are among them, so that their readers report them as damaged.
+    """
+    found = (file for file in directory.iterdir() if scan_suffix(file) in SUFFIXES)
+    files = [file for file in found if file.is_file() or not file.exists()]
     return sorted(files, key=by_number)
+
+
+def scan_suffix(path: Path) -> str:
+    """Return the ending of a file in lower case: some programs write .PCD."""
+    return path.suffix.lower()
 
 
 def read_scan(path: str | Path) -> tuple[npt.NDArray[Any], Columns]:
@@ -46,7 +56,8 @@ def read_scan(path: str | Path) -> tuple[npt.NDArray[Any], Columns]:
     Parameters
     ----------
     path : str or Path
-        A .ply, .pcd, .las or .laz, a .bin of four or a .pcd.bin of five float32 a point.
+        A .ply, .pcd, .las or .laz, a .bin of four or a .pcd.bin of five float32 a point; the
+        ending in capitals or not.
 
     Raises
     ------
@@ -54,7 +65,7 @@ def read_scan(path: str | Path) -> tuple[npt.NDArray[Any], Columns]:
         If the file cannot be read, is damaged, or has no x, y and z of floating point.
 
     """
-    suffix = Path(path).suffix
+    suffix = scan_suffix(Path(path))
     if suffix == '.bin':
         return read_raw(Path(path))
     if suffix not in SUFFIXES:
@@ -78,7 +89,7 @@ def read_scan(path: str | Path) -> tuple[npt.NDArray[Any], Columns]:
 
 def read_raw(path: Path) -> tuple[npt.NDArray[Any], Columns]:
     """Return points and columns of a file of raw float32."""
-    width = RAW_COLUMNS['.pcd.bin' if path.name.endswith('.pcd.bin') else '.bin']
+    width = RAW_COLUMNS['.pcd.bin' if path.name.lower().endswith('.pcd.bin') else '.bin']
     try:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size

@@ -95,6 +95,8 @@ class Dataset:
         File of the poses.
     read : callable
         Returns points (N, 3) and columns of a file.
+    missing : str
+        Why poses in the folder are not used; empty if it has none.
 
     """
 
@@ -104,6 +106,7 @@ class Dataset:
     trajectory: Trajectory | None = None
     poses_path: Path | None = None
     read: Read = read_scan
+    missing: str = ''
 
     @property
     def format(self) -> str:
@@ -143,8 +146,11 @@ def kitti_odometry(path: Path) -> Dataset | None:
     candidates = (path / 'poses.txt', path.parent.parent / 'poses' / f'{path.name}.txt')
     poses_path = next((each for each in candidates if each.is_file()), None)
     mount = calibration(path / 'calib.txt').get('Tr')
-    if poses_path is None or mount is None:
+    if poses_path is None:
         return Dataset('KITTI odometry', files, stamps_ns)
+    if mount is None:
+        missing = f'{poses_path} is not used: {lacking(path / "calib.txt", "Tr")}'
+        return Dataset('KITTI odometry', files, stamps_ns, missing=missing)
     cameras = taken(poses_path, read_trajectory(poses_path, 'kitti').matrices, files)
     T_cam_velo = rigid(path / 'calib.txt', mount)
     poses = np.linalg.inv(T_cam_velo) @ cameras @ T_cam_velo
@@ -160,12 +166,18 @@ def kitti_raw(path: Path) -> Dataset | None:
         return None
     stamps_ns = taken(times, read_dates(times), files).tolist()
     drive = folder.parent
-    measured = {file.stem: file for file in scans_in(drive / 'oxts' / 'data', '.txt')}
-    oxts = [measured[file.stem] for file in files if file.stem in measured]
+    measured = drive / 'oxts' / 'data'
+    names = {file.name for file in scans_in(measured, '.txt')}
+    if not names:
+        return Dataset('KITTI raw', files, stamps_ns)
+    oxts = [measured / f'{file.stem}.txt' for file in files]
     calibrated = drive.parent / 'calib_imu_to_velo.txt'
     mount = calibration(calibrated)
-    if len(oxts) != len(files) or not {'R', 'T'} <= mount.keys():
-        return Dataset('KITTI raw', files, stamps_ns)
+    absent = [file for file in oxts if file.name not in names]
+    if absent or not {'R', 'T'} <= mount.keys():
+        why = f'no {absent[0].name} in it' if absent else lacking(calibrated, 'R and T')
+        missing = f'{measured} is not used: {why}'
+        return Dataset('KITTI raw', files, stamps_ns, missing=missing)
     R, t = mount['R'], mount['T']
     if len(R) != 9 or len(t) != 3:
         raise FileFormatError(
@@ -174,7 +186,7 @@ def kitti_raw(path: Path) -> Dataset | None:
     T_velo_imu = rigid(calibrated, np.column_stack([R.reshape(3, 3), t]).ravel())
     lidar = np.array(oxts_poses(oxts)) @ np.linalg.inv(T_velo_imu)
     found = trajectory(times, stamps_ns, lidar)
-    return Dataset('KITTI raw', files, stamps_ns, found, drive / 'oxts' / 'data')
+    return Dataset('KITTI raw', files, stamps_ns, found, measured)
 
 
 def nuscenes(path: Path) -> Dataset | None:
@@ -384,6 +396,11 @@ def calibration(path: Path) -> dict[str, Floats]:
             except ValueError:  # the date of the calibration
                 continue
     return found
+
+
+def lacking(path: Path, names: str) -> str:
+    """Return, for a reason, which part of a calibration is missing."""
+    return f'no {names} in {path}' if path.is_file() else f'no {path}'
 
 
 def rigid(path: Path, numbers: npt.ArrayLike) -> Floats:

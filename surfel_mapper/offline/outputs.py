@@ -4,11 +4,13 @@
 The files that a replay writes, each whole or not at all; summary.json last.
 
 So if summary.json is new, all other files are too.
+
+One module: the checks before a replay and the writing after it share the names of the files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -95,10 +97,59 @@ def output_directory(recording: Path, wanted: Path | None) -> Path:
     """
     full = recording.resolve()
     directory = wanted or Path(f'{full.stem if recording.is_file() else full.name}_surfels')
+    check_not_scans(recording, directory)
     nearest = nearest_directory(directory)
     if not os.access(nearest, os.W_OK):
         raise FileFormatError(f'{directory}: no permission to write in {nearest}')
     return directory
+
+
+def check_not_scans(recording: Path, directory: Path) -> None:
+    """Raise FileFormatError if a directory is the folder of scans: map.ply would be one more."""
+    from surfel_mapper.files.scan_files import scan_files
+    from surfel_mapper.offline.scan_folder import is_scans
+
+    is_same = recording.is_dir() and directory.is_dir() and directory.samefile(recording)
+    if is_same and scan_files(recording) and is_scans(recording):
+        raise FileFormatError(
+            f'{directory}: the folder of the scans, where map.ply would be one of them; expected '
+            'another directory'
+        )
+
+
+def check_distinct(
+    recording: Path, wanted: Path | None, formats: Sequence[str], others: Mapping[str, Path | None]
+) -> None:
+    """
+    Raise FileFormatError if two outputs of a replay have the same path.
+
+    Parameters
+    ----------
+    recording : Path
+        The recording, which names the directory if none is asked for.
+    wanted : Path, optional
+        The output directory asked for.
+    formats : sequence of str
+        Formats of the map and of layers.
+    others : mapping of str to Path
+        Files beside the directory, by their options.
+
+    """
+    from surfel_mapper.files.trajectory import TRAJECTORY
+
+    directory = output_directory(recording, wanted)
+    files = known_formats()
+    names = [*(files[name] for name in formats), TRAJECTORY, 'map.png', 'report.html']
+    taken = {os.path.realpath(directory / n): str(directory / n) for n in (*names, 'summary.json')}
+    for option, path in others.items():
+        if path is None:
+            continue
+        full = os.path.realpath(path)
+        if full in taken:
+            raise FileFormatError(
+                f'{option} {path}: this replay writes {taken[full]} too, expected another file'
+            )
+        taken[full] = f'{path} for {option}'
 
 
 def check_writable(path: Path) -> None:

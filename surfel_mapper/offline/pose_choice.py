@@ -159,7 +159,7 @@ def sampled(reader: BagReader) -> Survey:
 
 
 def choose_for_folder(
-    request: Request, config: Config, has_poses: bool, first: Scan | None
+    request: Request, config: Config, has_poses: bool, first: Scan | None, missing: str = ''
 ) -> PoseChoice:
     """
     Choose the source of the poses of a folder of scans.
@@ -174,6 +174,8 @@ def choose_for_folder(
         Whether the folder has poses of its own.
     first : Scan, optional
         The first scan that can be read.
+    missing : str
+        The file for lack of which the poses of the folder are not used, for the reason.
 
     Raises
     ------
@@ -192,7 +194,7 @@ def choose_for_folder(
             f'{wanted}); name a file of poses with --poses, or use --poses-from registration or '
             'identity'
         )
-    reason = '' if wanted else 'the scans come without poses'
+    reason = '' if wanted else missing or 'the scans come without poses'
     return PoseChoice(with_registration(config, [first] if first else []), reason)
 
 

@@ -6,11 +6,11 @@ Scans in files, one file each, through the pipeline: a folder of them, or a sing
 With a file of poses, the scans are in frames.base, whose poses it gives; if
 frames.base_to_sensor is set, they are in a frame called sensor on it. Without poses they are
 registered. The time of a scan is in the name of its file or in a file of times (scan_times.py);
-else scans follow each other at 10 Hz. With as many poses, of other times, the time of scan i is
-that of pose i. Poses without times are those of the scans in their order. There may be fewer, if
-each scan of the part has one, or more, if scans are named by the numbers of their poses. Folders
-of data sets have their own layout, times and poses (datasets.py), a capture of an Ouster lidar has
-all scans in one file (ouster_pcap.py).
+else scans follow each other at 10 Hz, and no pose is looked up by such times. With as many poses,
+of other times, the time of scan i is that of pose i. Poses without times are those of the scans in
+their order. There may be fewer, if each scan of the part has one, or more, if scans are named by
+the numbers of their poses. Folders of data sets have their own layout, times and poses
+(datasets.py), a capture of an Ouster lidar has all scans in one file (ouster_pcap.py).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from typing import Any, TYPE_CHECKING
 from surfel_mapper.bags.paths import is_storage, METADATA
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError, FileFormatError
-from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
+from surfel_mapper.files.scan_files import read_scan, scan_files, scan_suffix, SUFFIXES
 from surfel_mapper.offline import ouster_pcap
-from surfel_mapper.offline.datasets import find_dataset
+from surfel_mapper.offline.datasets import Dataset, find_dataset
 from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.offline.pose_choice import choose_for_folder, is_default, pose_summary
 from surfel_mapper.offline.pose_sources import PosePath
@@ -64,13 +64,17 @@ class ScanFolder:
     Raises
     ------
     BagError
-        If poses cannot be assigned to the scans, or the points are surfels of a map.
+        If poses cannot be assigned to the scans, or the points are surfels of a map; those of
+        later files are refused when they are read.
 
     """
 
     cuts: tuple[str, ...] = ()
     format = 'scans in files'
     """Name of the layout, for info."""
+
+    first_error = ''
+    """Why the first file cannot be read; empty if it can."""
 
     def __init__(self, request: Request, config: Config, poses: PosePath | None) -> None:
         self.path = request.path
@@ -87,13 +91,9 @@ class ScanFolder:
         self.poses = poses
         self.stamps, self.times_from = self._stamps()
         self._rows, rows_reason = self._pose_rows()
+        missing = self.dataset.missing if isinstance(self.dataset, Dataset) else ''
         first = self.first_scan()
-        if first is not None and first.columns.keys() >= SURFEL_COLUMNS:
-            raise BagError(
-                f'{self.path}: surfels of a map, expected scans; merge, extract, evaluate and '
-                'view take them, and map.load begins with map.npz'
-            )
-        choice = choose_for_folder(request, config, poses is not None, first)
+        choice = choose_for_folder(request, config, poses is not None, first, missing)
         self.config, self.pose_reason = choice.config, choice.reason or rows_reason
         self.span: Span = part(
             str(self.path),
@@ -134,14 +134,14 @@ class ScanFolder:
         }
 
     def first_scan(self) -> Scan | None:
-        """Return the first scan that can be read; None if there is none."""
+        """Return the first scan that can be read; None if there is none, see first_error."""
         for number, stamp_ns in enumerate(self.stamps):
             try:
                 return self._read(number, stamp_ns, '')
             except ConfigError:  # a wrong limit concerns all scans
                 raise
-            except (FileFormatError, ValueError):
-                continue
+            except (FileFormatError, ValueError) as error:
+                self.first_error = self.first_error or str(error)
         return None
 
     def replay(
@@ -177,6 +177,11 @@ class ScanFolder:
     def _read(self, number: int, stamp_ns: int, frame: str) -> Scan:
         if self.dataset is None:
             points, columns = read_scan(self.files[number])
+            if columns.keys() >= SURFEL_COLUMNS:
+                raise BagError(
+                    f'{self.files[number]}: surfels of a map, expected scans; merge, extract, '
+                    'evaluate and view take them, and map.load begins with map.npz'
+                )
         else:
             points, columns = self.dataset.scan(number)
         return Scan(points=points, stamp_ns=stamp_ns, frame_id=frame, columns=columns)
@@ -199,11 +204,12 @@ class ScanFolder:
         stamps = None if self.poses is None else self.poses.trajectory.stamp_ns
         if self.poses is None or stamps is None or self.dataset is not None:
             return own, source
-        if 2 * len(set(own).intersection(stamps.tolist())) > len(stamps):
+        has_times = source != ASSUMED
+        if has_times and 2 * len(set(own).intersection(stamps.tolist())) > len(stamps):
             return own, source  # poses of these scans by registration, without those it dropped
         if len(stamps) == len(own):
             return stamps.tolist(), 'poses'
-        if source == ASSUMED:
+        if not has_times:
             raise BagError(
                 f'{self.poses.path}: {len(stamps)} poses for {len(own)} scans in {self.path}, '
                 'expected as many, or times of the scans: in their names (1532402927.647951.pcd), '
@@ -230,7 +236,7 @@ class ScanFolder:
 def is_scans(path: Path) -> bool:
     """Return whether a path is a file of points, or a directory of scans and not of a bag."""
     if path.is_file():
-        return path.suffix in (*SUFFIXES, ouster_pcap.SUFFIX)
+        return path.suffix == ouster_pcap.SUFFIX or scan_suffix(path) in SUFFIXES
     if not path.is_dir() or (path / METADATA).exists():
         return False
     if find_dataset(path) is not None:

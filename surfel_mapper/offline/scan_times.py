@@ -65,7 +65,8 @@ def stem(file: Path) -> str:
     """Return the name of a file without its endings of scans."""
     text = file.name
     for suffix in ('.bin', *SUFFIXES):
-        text = text.removesuffix(suffix)
+        if text.lower().endswith(suffix):
+            text = text[: -len(suffix)]
     return text
 
 

@@ -5,9 +5,11 @@
 import errno
 import os
 from pathlib import Path
+import sqlite3
 
 import numpy as np
 import pytest
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.bags.writer import BagWriter
@@ -182,3 +184,30 @@ def test_a_path_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(BagError, match=r'file/bag: cannot be written'):
         write_some(tmp_path / 'file' / 'bag')
+
+
+def test_a_bag_with_other_files_is_not_overwritten(tmp_path):
+    path = tmp_path / 'bag'
+    write_some(path)
+    for name in ('bag_0.mcap.zstd', 'bag.db3-wal', 'simulation.json', 'world.json'):
+        (path / name).touch()
+    BagWriter(path, overwrite=True)
+    (path / 'thesis.tex').write_text('years of work')
+
+    with pytest.raises(BagError, match=r'thesis\.tex in it is no file of a bag'):
+        BagWriter(path, overwrite=True)
+    (path / 'thesis.tex').unlink()
+    (path / 'more.mcap').mkdir()
+    with pytest.raises(BagError, match=r'more\.mcap in it is no file of a bag'):
+        BagWriter(path, overwrite=True)
+
+
+def test_an_error_of_sqlite_names_the_bag_and_leaves_no_files(tmp_path, monkeypatch):
+    def fail(*_):
+        raise sqlite3.OperationalError('database or disk is full')
+
+    monkeypatch.setattr(Sqlite3Writer, 'write', fail)
+    monkeypatch.setattr(Sqlite3Writer, 'abort', fail)
+    with pytest.raises(BagError, match='bag: cannot be written: database or disk is full'):
+        write_some(tmp_path / 'bag', storage='sqlite3')
+    assert list(tmp_path.iterdir()) == []

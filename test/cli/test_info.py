@@ -78,7 +78,10 @@ def test_a_bag_without_poses_says_so(tmp_path, capsys):
     path = write_rosbag2(tmp_path / 'a', [row for row in drive() if row[1] == CLOUD])
 
     assert main(['info', str(path)]) == 0
-    assert 'no poses; if the clouds are in a fixed frame, use --poses-from identity' in capsys.readouterr().out
+    assert (
+        'no poses; if the clouds are in a fixed frame, use --poses-from identity'
+        in capsys.readouterr().out
+    )
 
 
 def test_a_missing_mounting_is_reported(tmp_path, capsys):
@@ -152,3 +155,17 @@ def test_a_folder_of_scans_says_where_its_times_come_from(names, times, tmp_path
     assert capsys.readouterr().out.splitlines()[0].endswith(f'2 scans, 0.1 s; times: {times}')
     assert main(['info', '--json', str(tmp_path)]) == 0
     assert json.loads(capsys.readouterr().out)['times_from'] == times
+
+
+def test_the_error_of_the_first_scan_is_shown(tmp_path, capsys):
+    (tmp_path / '1.ply').touch()
+    (tmp_path / '2.bin').write_bytes(bytes(17))
+    for path in (tmp_path, tmp_path / '1.ply'):
+        assert main(['info', str(path)]) == 1
+        assert '1.ply: not a PLY file' in capsys.readouterr().err
+
+    np.ones((2, 4), np.float32).tofile(tmp_path / '3.bin')
+    assert main(['info', str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert 'first scan that can be read: 2 points' in printed
+    assert f'damaged: {tmp_path}/1.ply: not a PLY file' in printed

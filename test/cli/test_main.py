@@ -153,3 +153,31 @@ def test_a_closed_pipe_is_no_error(tmp_path):
         os.close(write_end)
 
     assert (done.returncode, done.stderr) == (0, '')
+
+
+@pytest.mark.parametrize('closed', ['>&-', '2>&-', '>&- 2>&-', '<&- >&- 2>&-'])
+@pytest.mark.parametrize('verb', ['replay', 'simulate'])
+def test_closed_streams_change_no_result(tmp_path, verb, closed):
+    code = 'import sys; from surfel_mapper.cli.main import main; sys.exit(main())'
+    output = tmp_path / 'out'
+    if verb == 'replay':
+        bag = write_rosbag2(tmp_path / 'bag', drive())
+        arguments = ['replay', str(bag), '--output', str(output)]
+    else:
+        arguments = ['simulate', 'street', '--scans', '1', '--beams', '8', '--columns', '64']
+        arguments += ['--output', str(output)]
+    command = ['sh', '-c', f'"$@" {closed}', 'sh', sys.executable, '-c', code, *arguments]
+
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+
+    assert (done.returncode, done.stderr) == (0, '')
+    assert (output / ('summary.json' if verb == 'replay' else 'metadata.yaml')).exists()
+
+
+def test_an_error_does_not_go_to_stdout_if_stderr_is_closed(tmp_path):
+    code = 'import sys; from surfel_mapper.cli.main import main; sys.exit(main())'
+    command = ['sh', '-c', '"$@" 2>&-', 'sh', sys.executable, '-c', code, 'info', str(tmp_path)]
+
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+
+    assert (done.returncode, done.stdout) == (1, '')

@@ -287,3 +287,24 @@ def test_a_full_disk_leaves_the_earlier_result_whole(bag, tmp_path):
     found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('[')]
     assert found == [[name, 1, True] for name in ALL.split(',')], done.stderr
     assert done.stderr.count('cannot be written: No space left on device') == len(found)
+
+
+@pytest.mark.parametrize(
+    ('options', 'says'),
+    [
+        (
+            ['--poses-out', 'out/map.ply'],
+            '--poses-out out/map.ply: this replay writes out/map.ply',
+        ),
+        (['--rrd', 'out/../out/map.npz'], 'this replay writes out/map.npz too'),
+        (['--poses-out', 'a', '--rrd', './a'], 'this replay writes a for --poses-out too'),
+    ],
+)
+def test_two_outputs_of_one_path_are_refused(bag, tmp_path, monkeypatch, capsys, options, says):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'out').mkdir()
+
+    assert main(['replay', str(bag), '--output', 'out', *options]) == 1
+
+    assert says in capsys.readouterr().err
+    assert list((tmp_path / 'out').iterdir()) == []

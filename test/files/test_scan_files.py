@@ -50,6 +50,28 @@ def test_files_come_in_the_order_of_their_numbers(tmp_path):
     assert [path.name for path in scan_files(tmp_path)] == ['9.ply', '10.bin', '100.pcd']
 
 
+def test_endings_in_capitals_are_those_of_scans(tmp_path):
+    table = np.column_stack(list(COLUMNS.values())).astype('<f4')
+    table.tofile(tmp_path / '1.BIN')
+    np.column_stack([table, [1, 2, 3, 4]]).astype('<f4').tofile(tmp_path / '2.PCD.BIN')
+    pcd.write_points(tmp_path / '3.Pcd', COLUMNS)
+
+    files = scan_files(tmp_path)
+
+    assert [path.name for path in files] == ['1.BIN', '2.PCD.BIN', '3.Pcd']
+    for file in files:
+        np.testing.assert_array_equal(read_scan(file)[0], POINTS)
+
+
+def test_a_link_that_leads_nowhere_is_a_scan_that_cannot_be_read(tmp_path):
+    (tmp_path / '1.bin').symlink_to(tmp_path / 'none')
+
+    (file,) = scan_files(tmp_path)
+
+    with pytest.raises(FileFormatError, match=r'1\.bin: cannot be read: No such file'):
+        read_scan(file)
+
+
 @pytest.mark.parametrize(
     ('name', 'write', 'says'),
     [

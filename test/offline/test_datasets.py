@@ -94,6 +94,33 @@ def test_scans_of_a_drive_without_their_oxts_are_registered(tmp_path):
     found = find_dataset(path)
 
     assert (found.stamps_ns, found.trajectory) == (stamps_ns, None)
+    measured = path / 'oxts' / 'data'
+    assert found.missing == f'{measured} is not used: no 0000000001.txt in it'
+
+
+@pytest.mark.parametrize(
+    ('make', 'name', 'names'),
+    [
+        (folders.kitti_odometry, 'calib.txt', 'Tr in '),
+        (folders.kitti_raw, 'calib_imu_to_velo.txt', 'R and T in '),
+    ],
+)
+@pytest.mark.parametrize('is_empty', [False, True])
+def test_the_reason_for_registration_names_the_calibration_that_is_missing(
+    tmp_path, make, name, names, is_empty, capsys
+):
+    path, _, _ = make(tmp_path)
+    (file,) = tmp_path.rglob(name)
+    file.unlink()
+    if is_empty:
+        file.touch()
+
+    assert main(['info', str(path)]) == 0
+
+    printed = capsys.readouterr().out
+    assert 'replay takes poses from registration: ' in printed
+    lacks = names if is_empty else ''
+    assert f'is not used: no {lacks}{file}' in printed
 
 
 def test_scans_of_a_data_set_keep_their_times_at_other_poses_without_times(tmp_path):

@@ -130,9 +130,10 @@ def test_a_single_scan_with_times_is_mapped_as_at_rest(tmp_path, capsys):
 def test_surfels_of_a_map_are_not_taken_for_a_scan(tmp_path, capsys, verb):
     folder = write_scans(tmp_path / 'still')
     assert main(['replay', str(folder), '--output', str(tmp_path / 'out')]) == 0
-    for path in (tmp_path / 'out', tmp_path / 'out' / 'map.ply'):
+    file = tmp_path / 'out' / 'map.ply'
+    for path in (file.parent, file):
         assert main([verb, str(path)]) == 1
-        assert f'{path}: surfels of a map, expected scans' in capsys.readouterr().err
+        assert f'{file}: surfels of a map, expected scans' in capsys.readouterr().err
 
 
 def test_scans_with_times_of_their_points_are_deskewed(tmp_path):
@@ -234,3 +235,24 @@ def test_las_and_laz_files_are_scans(tmp_path, capsys):
     (tmp_path / 'bad.laz').write_bytes(b'LASF' + bytes(500))
     assert main(['replay', str(tmp_path / 'bad.laz'), '--output', str(tmp_path / 'out')]) == 1
     assert not Path(tmp_path / 'out').exists()
+
+
+def test_surfels_among_scans_are_refused_when_they_are_read(tmp_path, capsys):
+    folder, arguments = write_scans(tmp_path / 'scans'), ['--poses-from', 'identity']
+    assert main(['replay', str(folder), '--output', str(tmp_path / 'out'), *arguments]) == 0
+    (tmp_path / 'out' / 'map.ply').rename(folder / 'map.ply')
+
+    assert main(['replay', str(folder), '--output', str(tmp_path / 'new'), *arguments]) == 1
+
+    assert f'{folder}/map.ply: surfels of a map, expected scans' in capsys.readouterr().err
+    assert not (tmp_path / 'new').exists()
+
+
+def test_the_folder_of_the_scans_is_refused_as_output(tmp_path, capsys):
+    folder = write_scans(tmp_path / 'scans')
+    before = sorted(folder.iterdir())
+
+    assert main(['replay', str(folder), '--output', str(folder)]) == 1
+
+    assert f'{folder}: the folder of the scans' in capsys.readouterr().err
+    assert sorted(folder.iterdir()) == before

@@ -293,3 +293,25 @@ def test_the_report_states_the_first_number_and_the_trajectory_has_the_times(tmp
 )
 def test_rows_are_those_in_order_or_of_the_numbers_in_names(names, number, rows):
     assert rows_of([Path(f'{name}.pcd') for name in names], number) == rows
+
+
+def test_no_stamp_of_a_pose_is_looked_up_by_an_assumed_time(tmp_path):
+    folder = scan_folder(tmp_path, '.bin', range(6))
+    rows = [f'{0.1 * n} {0.5 * n} 0 {HEIGHT_M} 0 0 0 1' for n in range(6)]
+    poses = write_lines(tmp_path / 'poses.tum', rows)
+    for number in (2, 3):
+        (folder / f'{number}.bin').unlink()
+
+    with pytest.raises(BagError, match=r'6 poses for 4 scans in .*, expected as many, or times'):
+        opened(folder, poses=poses)
+
+
+def test_as_many_poses_belong_to_scans_in_order_also_at_stamps_like_assumed_times(tmp_path):
+    folder = scan_folder(tmp_path, '.bin')
+    rows = [f'{0.1 * n + 0.1:.1f} {0.5 * n} 0 {HEIGHT_M} 0 0 0 1' for n in range(6)]
+    poses = write_lines(tmp_path / 'poses.tum', rows)
+
+    stamps, found = opened(folder, poses=poses)
+
+    assert (stamps, found['times_from']) == ([n * 10**8 for n in range(1, 7)], 'poses')
+    assert mapped(folder, MOUNTED, poses=poses).map.digest() == digest_of(range(6))
