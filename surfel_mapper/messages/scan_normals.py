@@ -107,16 +107,22 @@ def extended_cloud(msg: Any, added: npt.NDArray[np.float32]) -> CloudBytes:
     ----------
     msg : sensor_msgs/PointCloud2
         A message that could be decoded. If it has a field of the same name as a new one, the new
-        one is called ``surfel_`` and its name.
+        one gets the prefix ``surfel_``, repeated until the name differs from all others.
     added : (N, 5) float32
         From surfels_of_points, one row per point.
 
     """
     taken = {field.name for field in msg.fields}
     types = [FLOAT32] * (len(ADDED) - 1) + [UINT32]
-    names = [f'surfel_{name}' if name in taken else name for name in ADDED]
-    fields = [(name, type_, 1) for name, type_ in zip(names, types, strict=True)]
+    fields = [(unused(name, taken), type_, 1) for name, type_ in zip(ADDED, types, strict=True)]
     return replace(append_fields(msg, added.view(np.uint32), fields), is_dense=False)
+
+
+def unused(name: str, taken: set[str]) -> str:
+    """Return a field name with as many prefixes as it takes to be none of those taken."""
+    while name in taken:
+        name = f'surfel_{name}'
+    return name
 
 
 def cloud_of_scan(scan: Scan, added: npt.NDArray[np.float32]) -> CloudBytes:

@@ -320,13 +320,18 @@ def add_cloud(
     decode: Decode = to_scan,
 ) -> None:
     """Decode a cloud or an image and queue it as a scan, with its pose if a file has it."""
+    frame_id, is_mounted = '', message.topic in poses.mounts
     try:
         with mapper.counters.timed('decode'):
-            scan = decode(reader.decode(message), message.topic)
+            decoded = reader.decode(message)
+            frame_id = decoded.header.frame_id
+            scan = decode(decoded, message.topic)
     except (CloudFormatError, BagError) as error:
-        mapper.refuse_clouds('bad_cloud', message.topic, str(error))
+        reason = f'in frame {frame_id!r}, {error}' if frame_id else str(error)
+        frame_id = '' if is_mounted else frame_id
+        mapper.refuse_clouds('bad_cloud', message.topic, reason, frame_id=frame_id)
         return
-    if message.topic in poses.mounts:
+    if is_mounted:
         scan = replace(scan, frame_id=message.topic)
     if poses.path is not None:
         poses.path.add_for(mapper, scan.stamp_ns, number)

@@ -6,11 +6,12 @@ Scans in files, one file each, through the pipeline: a folder of them, or a sing
 With a file of poses, the scans are in frames.base, whose poses it gives; if
 frames.base_to_sensor is set, they are in a frame called sensor on it. Without poses they are
 registered. The time of a scan is in the name of its file or in a file of times (scan_times.py);
-else scans follow each other at 10 Hz, and no pose is looked up by such times. With as many poses,
-of other times, the time of scan i is that of pose i. Poses without times are those of the scans in
-their order. There may be fewer, if each scan of the part has one, or more, if scans are named by
-the numbers of their poses. Folders of data sets have their own layout, times and poses
-(datasets.py), a capture of an Ouster lidar has all scans in one file (ouster_pcap.py).
+else scans follow each other at 10 Hz; by such times poses are looked up only if no number is
+missing among the names. With as many poses, of other times, the time of scan i is that of pose i.
+Poses without times are those of the scans in their order. There may be fewer, if each scan of the
+part has one, or more, if scans are named by the numbers of their poses. Folders of data sets have
+their own layout, times and poses (datasets.py), a capture of an Ouster lidar has all scans in one
+file (ouster_pcap.py).
 """
 
 from __future__ import annotations
@@ -29,7 +30,13 @@ from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.offline.pose_choice import choose_for_folder, is_default, pose_summary
 from surfel_mapper.offline.pose_sources import PosePath
 from surfel_mapper.offline.request import part, Request, Span
-from surfel_mapper.offline.scan_times import numbered, rows_of, times_beside, times_in_names
+from surfel_mapper.offline.scan_times import (
+    is_gapless,
+    numbered,
+    rows_of,
+    times_beside,
+    times_in_names,
+)
 from surfel_mapper.scan import Scan
 
 if TYPE_CHECKING:
@@ -204,12 +211,15 @@ class ScanFolder:
         stamps = None if self.poses is None else self.poses.trajectory.stamp_ns
         if self.poses is None or stamps is None or self.dataset is not None:
             return own, source
-        has_times = source != ASSUMED
-        if has_times and 2 * len(set(own).intersection(stamps.tolist())) > len(stamps):
-            return own, source  # poses of these scans by registration, without those it dropped
+        if source == ASSUMED and len(stamps) == len(own):
+            return stamps.tolist(), 'poses'
+        # a registration of these very scans has their times, but not those that it dropped
+        may_have = source != ASSUMED or is_gapless(self.files)
+        if may_have and 2 * len(set(own).intersection(stamps.tolist())) > len(stamps):
+            return own, source
         if len(stamps) == len(own):
             return stamps.tolist(), 'poses'
-        if not has_times:
+        if source == ASSUMED:
             raise BagError(
                 f'{self.poses.path}: {len(stamps)} poses for {len(own)} scans in {self.path}, '
                 'expected as many, or times of the scans: in their names (1532402927.647951.pcd), '

@@ -122,6 +122,12 @@ def read_stamps(path: Path) -> npt.NDArray[np.int64]:
         return np.concatenate([column_ns(each, 0, unit_of(text)) for each in rows])
 
 
+def is_gapless(files: Sequence[Path]) -> bool:
+    """Return whether the names of files are no numbers, or numbers that follow each other."""
+    names = [stem(file) for file in files]
+    return not all(map(str.isdecimal, names)) or int(names[-1]) - int(names[0]) == len(files) - 1
+
+
 def rows_of(files: Sequence[Path], number: int) -> list[int] | None:
     """
     Return the rows of scans in a table of a number of rows, ascending.

@@ -62,6 +62,7 @@ class ShardMapper(Mapper):
             waiting,
             self._guard.newest_ns,
             self._guard.held_ns,
+            self._guard.ahead_ns,
             self.transforms.held(since_ns),
         ]
         return hashlib.sha256(repr(state).encode()).hexdigest()

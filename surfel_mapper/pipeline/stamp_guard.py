@@ -6,7 +6,9 @@ StampGuard: one message with an odd stamp does not set time back or forward.
 A stamp is odd if it is before the newest of its source by more than ``input.reset_after_s``, or
 ahead of all data by more than MAX_AHEAD_S. The message is held until the next one, of any source,
 agrees with its stamp; then both are used, and time continues from their stamps. Otherwise it is
-dropped. The clock is not read, so that a replay decides as the node did.
+dropped. After a message ahead, any later stamp agrees: time went on. If that one is further than
+MAX_AHEAD_S again, as of a sensor that stops to scan, steps up to twice as long are no longer odd.
+The clock is not read, so that a replay decides as the node did.
 """
 
 from __future__ import annotations
@@ -39,12 +41,14 @@ class StampGuard:
     ----------
     newest_ns : int or None
         The newest stamp accepted since time was set back.
+    ahead_ns : int
+        A stamp further ahead than this is odd.
 
     """
 
     def __init__(self, reset_after_s: float) -> None:
         self._back_ns = round(reset_after_s * 1e9)
-        self._ahead_ns = round(MAX_AHEAD_S * 1e9)
+        self.ahead_ns = round(MAX_AHEAD_S * 1e9)
         self._held: HeldMessage | None = None
         self.newest_ns: int | None = None
 
@@ -79,6 +83,7 @@ class StampGuard:
         is_odd = self._is_odd(stamp_ns, own_ns, other_ns)
         held, self._held = self._held, None
         if held is not None and self._agree(stamp_ns, held.stamp_ns, is_odd):
+            self.ahead_ns = max(round(MAX_AHEAD_S * 1e9), 2 * (stamp_ns - held.stamp_ns))
             self.newest_ns = held.stamp_ns
             held.accept()
             is_odd = False
@@ -98,7 +103,7 @@ class StampGuard:
             held.refuse(self._reason(held.stamp_ns))
 
     def _is_odd(self, stamp_ns: int, own_ns: int | None, other_ns: int | None) -> bool:
-        if self.newest_ns is not None and stamp_ns - self.newest_ns > self._ahead_ns:
+        if self.newest_ns is not None and stamp_ns - self.newest_ns > self.ahead_ns:
             return True
         if own_ns is None or own_ns - stamp_ns <= self._back_ns:
             return False
@@ -106,8 +111,10 @@ class StampGuard:
 
     def _agree(self, stamp_ns: int, held_ns: int, is_odd: bool) -> bool:
         """Return whether a message is about as old as the held one, or follows it if odd too."""
-        longest_ns = self._ahead_ns if is_odd else self._back_ns
-        return -self._back_ns <= stamp_ns - held_ns <= longest_ns
+        step_ns = stamp_ns - held_ns
+        if is_odd and self.newest_ns is not None and held_ns > self.newest_ns:
+            return step_ns >= -self._back_ns
+        return -self._back_ns <= step_ns <= (self.ahead_ns if is_odd else self._back_ns)
 
     def _reason(self, stamp_ns: int) -> str:
         """Return why a message was not used."""

@@ -50,6 +50,12 @@ MAX_PARAMETERS = 500
 """Limit of the parameters, or prefixes of names, in a request: the node has 180, and to refuse
 20,000 unknown ones took 14 s, in which no other request was answered."""
 
+LONGEST_PERIOD_S = 3e8
+"""
+Longest period of a timer, ten years. rclpy counts nanoseconds in 64 bits, which end at 292 years,
+but a rate in Hz may be as low as 1e-300.
+"""
+
 Result = TypeVar('Result')
 
 
@@ -190,7 +196,8 @@ def _refused(request: Any, response: Any, reason: str) -> Any:
 def steady_timer(node: Node, rate_hz: float, callback: Callable[[], None]) -> Timer:
     """Create a timer on the steady clock, which simulated time neither stops nor sets back."""
     steady = Clock(clock_type=ClockType.STEADY_TIME)
-    return node.create_timer(1.0 / rate_hz, callback, clock=steady)
+    period_s = min(1.0 / rate_hz, LONGEST_PERIOD_S)
+    return node.create_timer(period_s, callback, clock=steady)
 
 
 async def result_of(future: Future[Result], executor: Executor) -> Result:

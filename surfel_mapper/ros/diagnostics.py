@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 import resource
 import time
@@ -20,7 +21,9 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from std_msgs.msg import Header
 
 from surfel_mapper.config import Config
@@ -28,6 +31,7 @@ from surfel_mapper.pipeline.reduction import standing_sensor
 from surfel_mapper.ros.base_node import CountedPublisher, steady_timer
 from surfel_mapper.ros.health import ERROR, findings, Interval, OFF_S, OK
 from surfel_mapper.ros.messages import time_message
+from surfel_mapper.ros.publishers import mismatch, publishers_of
 from surfel_mapper.ros.session import Session
 
 LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
@@ -129,9 +133,11 @@ class Totals:
     def since(self, last: Totals, node: Node, session: Session) -> Interval:
         """Return the interval since an earlier count; of several topics, the most silent one."""
         topic, received_s = session.inputs.most_silent
+        num_publishers, unheard = publishers(node, topic)
         return Interval(
             topic=topic,
-            num_publishers=node.count_publishers(topic),
+            num_publishers=num_publishers,
+            unheard=unheard,
             ever_received=self.received > 0,
             received=self.received - last.received,
             silent_s=max(self.time_s - received_s, 0.0),
@@ -156,6 +162,24 @@ class Totals:
                 for topic, number in self.published.items()
             },
         }
+
+
+def publishers(node: Node, topic: str) -> tuple[int, str]:
+    """Return the number of publishers of a subscribed topic, and a mismatch of their QoS."""
+    found = subscription_to(node, topic)
+    if found is None:
+        return node.count_publishers(topic), ''
+    number = len(publishers_of(node, topic, found.msg_type))
+    return number, mismatch(node, topic, found.msg_type, found.qos_profile)
+
+
+def subscription_to(node: Node, topic: str) -> Subscription | None:
+    """Return the newest subscription to a topic, if there is one."""
+    for found in reversed(list(node.subscriptions)):
+        with suppress(InvalidHandle):  # another thread may destroy it
+            if found.topic_name == topic:
+                return found
+    return None
 
 
 def is_oriented(config: Config) -> bool:

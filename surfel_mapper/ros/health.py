@@ -18,8 +18,11 @@ from surfel_mapper.pipeline.drops import REMEDIES
 OK, WARN, ERROR = 0, 1, 2
 """As in diagnostic_msgs/DiagnosticStatus."""
 
-OFF_S = 1e5
-"""Latencies above this (a day) mean that stamps and clock are of different times."""
+OFF_S = 600.0
+"""
+Latencies above this mean that stamps and clock are of different times, s. A scan waits for its
+pose at most ``pose.max_delay_s`` (4 s), and queues are bounded, so a real latency is seconds.
+"""
 
 
 @dataclass(kw_only=True)
@@ -32,7 +35,9 @@ class Interval:
     topic : str
         The topic of the clouds.
     num_publishers : int
-        Number of its publishers.
+        Number of its publishers that send clouds.
+    unheard : str
+        The publisher whose QoS does not match the subscription, and the remedy; empty if none.
     ever_received : bool
         Whether a cloud has ever been received.
     received : int
@@ -54,6 +59,7 @@ class Interval:
 
     topic: str
     num_publishers: int = 1
+    unheard: str = ''
     ever_received: bool = True
     received: int = 0
     silent_s: float = 0.0
@@ -82,17 +88,18 @@ def _input(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int,
     if interval.loss and not interval.received:
         yield ERROR, f'no cloud comes through: {interval.loss}'
     elif not interval.ever_received:
-        remedy = (
+        remedy = interval.unheard or (
             f'publishers: {interval.num_publishers}; see fastdds_shm.xml if clouds are large'
             if interval.num_publishers
             else 'it has no publisher; remap points to the topic of the lidar'
         )
         yield WARN, f'no cloud on {topic} yet: {remedy}'
     elif 0.0 < limits.silence_s < interval.silent_s:
+        cause = interval.unheard or 'is the lidar alive?'
         yield (
             ERROR,
             f'no cloud on {topic} for {interval.silent_s:.1f} s '
-            f'(publishers: {interval.num_publishers}); is the lidar alive?',
+            f'(publishers: {interval.num_publishers}); {cause}',
         )
 
 

@@ -18,11 +18,12 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from surfel_mapper.config import Config
-from surfel_mapper.errors import CloudFormatError, DependencyError, PoseError
+from surfel_mapper.errors import CloudFormatError, ConfigError, DependencyError, PoseError
 from surfel_mapper.messages.compressed_image import is_packed
 from surfel_mapper.messages.images import (
     camera_info_topic,
@@ -86,6 +87,8 @@ class Inputs:
 
     Raises
     ------
+    ConfigError
+        If a setting names an invalid topic, or two of ``input.topics`` are the same.
     DependencyError
         If ``pose.source`` is tf and tf2_msgs is not installed.
 
@@ -100,8 +103,11 @@ class Inputs:
     ) -> None:
         if config.pose.source == TF:
             transform_message()
-        names = config.input.topics or (DEFAULT_TOPICS[config.input.kind],)
-        self.cloud_topics: list[str] = [node.resolve_topic_name(name) for name in names]
+        self.cloud_topics = cloud_topics(node, config)
+        self._image_topics = {
+            kind: resolved(node, f'layers.tsdf.{kind}_topic', name)
+            for kind, name in config.image_topics.items()
+        }
         self.lost = dict.fromkeys(self.cloud_topics, 0)
         self._received_s = dict.fromkeys(self.cloud_topics, time.monotonic())
         self._largest_bytes = dict.fromkeys(self.cloud_topics, 0)
@@ -138,8 +144,8 @@ class Inputs:
             warm_up()
         for topic in self.cloud_topics:
             self._subscribe_clouds(topic)
-        for kind, name in self._config.image_topics.items():
-            self._subscribe_images(kind, self._node.resolve_topic_name(name))
+        for kind, topic in self._image_topics.items():
+            self._subscribe_images(kind, topic)
         self._subscriptions.start()
 
     def unsubscribe(self) -> None:
@@ -275,6 +281,25 @@ class Inputs:
         """Take the number that a subscription has lost; those of earlier ones are ``before``."""
         self.lost[topic] = before + number
         self._node.get_logger().warning(self.loss(), throttle_duration_sec=10.0)
+
+
+def cloud_topics(node: BaseNode, config: Config) -> list[str]:
+    """Return the full names of the topics of clouds or depth images; raise if two are the same."""
+    given = config.input.topics
+    names = given or (DEFAULT_TOPICS[config.input.kind],)
+    topics = [resolved(node, 'input.topics', name) for name in names]
+    if len(set(topics)) < len(topics):  # the configuration compares them as they are written
+        raise ConfigError(f'input.topics: {given} are {topics}, expected names that differ')
+    return topics
+
+
+def resolved(node: BaseNode, setting: str, name: str) -> str:
+    """Return the full name of a topic, or raise ConfigError if a setting gives an invalid one."""
+    try:
+        return str(node.resolve_topic_name(name))
+    except rclpy_implementation.RCLError as error:
+        reason = str(error).partition(', at /')[0]  # without the line of the source of rcl
+        raise ConfigError(f'{setting}: {name!r} is no name of a topic: {reason}') from error
 
 
 def image_message(topic: str) -> Any:

@@ -20,6 +20,7 @@ import threading
 from typing import Any, NamedTuple, TypeVar
 
 from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.messages.cdr import frame_name
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
@@ -47,6 +48,14 @@ class QueuedCloud(NamedTuple):
     msg: Any
     topic: str
     decode: Callable[[Any, str], Scan]
+
+    @property
+    def frame_id(self) -> str:
+        """The frame by which a drop is counted; empty, so the topic instead, if it is invalid."""
+        try:
+            return frame_name(self.msg.header.frame_id)
+        except CloudFormatError:
+            return ''
 
 
 class LostCloud(NamedTuple):
@@ -184,9 +193,8 @@ class MappingThread:
                 oldest = next(item for item in self._work if isinstance(item, QueuedCloud))
                 self._work.remove(oldest)
                 self._num_clouds -= 1
-                frame_id = oldest.msg.header.frame_id
-                reason = f'in frame {frame_id!r}, {TOO_FAST}'
-                self._lost[LostCloud('overload', oldest.topic, reason, frame_id)] += 1
+                reason = f'in frame {oldest.frame_id!r}, {TOO_FAST}'
+                self._lost[LostCloud('overload', oldest.topic, reason, oldest.frame_id)] += 1
             self._changed.notify()
 
     @property
@@ -286,7 +294,7 @@ class MappingThread:
 
     def _add(self, cloud: QueuedCloud) -> None:
         """Decode a cloud and pass it to the mapper; invalid ones are counted."""
-        frame_id = cloud.msg.header.frame_id
+        frame_id = cloud.frame_id
         if self.paused:
             reason = 'mapping is paused; call ~/pause with false to continue'
             self._mapper.refuse_clouds('paused', cloud.topic, reason, frame_id=frame_id)

@@ -10,7 +10,7 @@ clock, so the rates hold while simulated time stands still or jumps.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from functools import partial
 from typing import Any
@@ -49,6 +49,8 @@ from surfel_mapper.scan import Scan
 CHANGES = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """Holds 5 s at 20 Hz, so that a client that mirrors the map may lag for a while."""
 
+OBSOLETE = -1
+"""Version of a published map that has to be replaced; the map counts from 0."""
 
 NO_VOXELS = np.empty((0, 3), np.int32)
 
@@ -74,6 +76,7 @@ class Outputs:
         self._mapper = mapper
         self._thread = thread
         self._changes = ChangeTracker(mapper)
+        self._removals = ChangeTracker(mapper)  # of ~/removed while publish.changed is false
         self._ages = Ages()
         self._origin = OriginOutput(node, mapper)
         self._alignment = AlignmentOutputs(node, mapper)
@@ -124,32 +127,36 @@ class Outputs:
 
         Needed whenever the map or its settings have changed otherwise than by a scan.
         """
-        self._published.clear()
+        self._published = dict.fromkeys(self._published, OBSOLETE)
         with self._mapper.guarded('publishing of the origin'):
             self._origin.publish(self._stamp_ns)
         self._layers.expire()
-        if not self._has_clients():
-            self._changes.reset()
-        elif self._mapper.derives:
-            with self._changes.undone_on_error():
-                self._publish_change(self._changes.collect())
+        if self._mapper.derives:
+            self._publish_changes(ChangeTracker.collect)
+        if not self._timers:
+            self.publish_latest()
+
+    def publish_latest(self) -> None:
+        """
+        Publish the map for late subscribers if it has changed; called in the mapping thread.
+
+        Needed while no timer runs. Markers and coarser maps that were never published are left
+        out, as nothing obsolete is kept of them.
+        """
+        if not self._mapper.derives:
+            return
+        for _, publisher, publish in self._periodic(self._mapper.config):
+            was_published = publisher in self._published
+            if self._is_due(publisher) or (was_published and self._is_new(publisher)):
+                with self._mapper.guarded('publishing of surfels'):
+                    publish()
 
     def start_timers(self, config: Config) -> None:
         """Publish at the rates of these settings; called in the executor's thread."""
         self.stop_timers()
-        rates = config.publish
-        published: list[tuple[float, Any, Callable[[], object]]] = [
-            (rates.normals_rate_hz, self._normals, self._publish_normals),
-            (rates.markers_rate_hz, self._markers, self._publish_markers),
-            *(
-                (rates.normals_rate_hz, publisher, partial(self._publish_level, level, publisher))
-                for level, publisher in enumerate(self._levels, 1)
-            ),
-        ]
-        for rate_hz, publisher, publish in published:
-            if rate_hz:
-                callback = self._poster(publisher, publish)
-                self._timers.append(steady_timer(self._node, rate_hz, callback))
+        for rate_hz, publisher, publish in self._periodic(config):
+            callback = self._poster(publisher, publish)
+            self._timers.append(steady_timer(self._node, rate_hz, callback))
         self._layers.start_timers(config)
 
     def stop_timers(self) -> None:
@@ -163,13 +170,31 @@ class Outputs:
         """End the threads that publish, before their publishers are destroyed."""
         self._layers.close()
 
+    def _periodic(self, config: Config) -> Iterator[tuple[float, Any, Callable[[], object]]]:
+        """Yield rate in Hz, publisher and method of each topic that has a rate above 0."""
+        rates = config.publish
+        if rates.normals_rate_hz:
+            yield rates.normals_rate_hz, self._normals, self._publish_normals
+            for level, publisher in enumerate(self._levels, 1):
+                publish = partial(self._publish_level, level, publisher)
+                yield rates.normals_rate_hz, publisher, publish
+        if rates.markers_rate_hz:
+            yield rates.markers_rate_hz, self._markers, self._publish_markers
+
+    def _is_new(self, publisher: Any) -> bool:
+        """Return whether the map has changed since a topic was published."""
+        return self._published.get(publisher) != self._mapper.map.version
+
+    def _is_due(self, publisher: Any) -> bool:
+        """Return whether the map has changed and is read; ~/normals is kept for all."""
+        is_read = publisher is self._normals or publisher.get_subscription_count()
+        return bool(self._is_new(publisher) and is_read)
+
     def _poster(self, publisher: Any, publish: Callable[[], object]) -> Callable[[], None]:
         """Return a timer callback that posts ``publish`` if the map has changed and is read."""
-        is_latched_for_all = publisher is self._normals
 
         def post() -> None:
-            is_new = self._published.get(publisher) != self._mapper.map.version
-            if is_new and (is_latched_for_all or publisher.get_subscription_count()):
+            if self._is_due(publisher):
                 self._thread.post(publish)
 
         return post
@@ -187,20 +212,28 @@ class Outputs:
     # The methods below run in the mapping thread.
 
     def _publish_surfels(self, update: Update) -> None:
-        if self._has_clients():
-            with self._changes.undone_on_error():
-                self._publish_change(self._changes.after_scan(update))
-        else:
-            self._changes.reset()
+        self._publish_changes(lambda tracker: tracker.after_scan(update))
         if self._scan_normals.get_subscription_count():
             self._publish_scan_normals(update)
 
-    def _has_clients(self) -> bool:
+    def _publish_changes(self, find: Callable[[ChangeTracker], MapChange]) -> None:
+        """
+        Publish the changes that ``find`` returns of a tracker, if they are subscribed to.
+
+        While ``publish.changed`` is false, its tracker stays behind: ~/changed gets all changes
+        since as soon as it is published again. ~/removed has a tracker of its own meanwhile.
+        """
         wants_changed = self._mapper.config.publish.changed
-        return bool(
-            (wants_changed and self._changed.get_subscription_count())
-            or self._removed.get_subscription_count()
-        )
+        is_removed_read = self._removed.get_subscription_count() > 0
+        is_read = is_removed_read or self._changed.get_subscription_count() > 0
+        if not is_read:
+            self._changes.reset()
+        if wants_changed or not is_removed_read:
+            self._removals.reset()
+        if is_removed_read or (is_read and wants_changed):
+            tracker = self._changes if wants_changed else self._removals
+            with tracker.undone_on_error():
+                self._publish_change(find(tracker))
 
     def _publish_change(self, change: MapChange) -> None:
         mapper = self._mapper

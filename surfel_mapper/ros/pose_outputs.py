@@ -34,8 +34,9 @@ import numpy.typing as npt
 from rclpy.node import Node
 from std_msgs.msg import Header
 
-from surfel_mapper.errors import DependencyError
+from surfel_mapper.errors import CloudFormatError, DependencyError
 from surfel_mapper.geometry import q_xyzw, Transform
+from surfel_mapper.messages.cdr import frame_name
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.map_origin import has_own_frame
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
@@ -262,7 +263,12 @@ class RegistrationOutputs:
         """Continue registration from a given pose; called in the mapping thread."""
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
         xyz, xyzw = (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
-        if self._mapper.start_from(msg.header.frame_id, xyz, xyzw):
+        try:
+            frame_id = frame_name(msg.header.frame_id)
+        except CloudFormatError as error:
+            self._thread.refuse_pose(f'initial pose ignored: {error}')
+            return
+        if self._mapper.start_from(frame_id, xyz, xyzw):
             self._log.info(f'continues from the initial pose ({p.x:.2f}, {p.y:.2f}, {p.z:.2f})')
 
 

@@ -30,6 +30,7 @@ from surfel_mapper.errors import (
     PoseError,
     SurfelMapperError,
 )
+from surfel_mapper.messages.cdr import frame_name
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.drops import described
 from surfel_mapper.pipeline.regions import Ball, Box, MAX_CORNERS, Prism, Region
@@ -254,6 +255,8 @@ def prism(msg: Any, mapper: Mapper) -> Prism:
 
     Raises
     ------
+    CloudFormatError
+        If the frame_id is longer than that of any frame.
     PoseError
         If the frame_id is empty, or there is no transform to the fixed frame at the stamp.
     ValueError
@@ -262,10 +265,11 @@ def prism(msg: Any, mapper: Mapper) -> Prism:
     """
     if len(msg.polygon.points) > MAX_CORNERS:
         raise ValueError(f'{len(msg.polygon.points)} corners, expected at most {MAX_CORNERS}')
-    if not msg.header.frame_id:
+    frame_id = frame_name(msg.header.frame_id)
+    if not frame_id:
         raise PoseError('its frame_id is empty')
     stamp_ns = msg.header.stamp.sec * 10**9 + msg.header.stamp.nanosec
-    T_map_frame = mapper.T_map_of(msg.header.frame_id, stamp_ns)
+    T_map_frame = mapper.T_map_of(frame_id, stamp_ns)
     corners = np.array([(p.x, p.y, p.z) for p in msg.polygon.points]).reshape(-1, 3)
     moved = corners @ T_map_frame[:3, :3].T + T_map_frame[:3, 3]
     return Prism(tuple((float(x), float(y)) for x, y, _ in moved))

@@ -116,13 +116,13 @@ class Session:
             self._compiler.start()
 
     def deactivate(self) -> None:
-        """Unsubscribe, map the messages received so far, and stop publishing."""
+        """Unsubscribe, map the messages received so far, publish the map, and stop publishing."""
         self.inputs.unsubscribe()
         with self._changing:
             self._is_active = False
             self.outputs.stop_timers()
         with suppress(CancelledError):  # the thread has failed; its error is in the task queue
-            self.thread.call(lambda: None).result()
+            self.thread.call(self.outputs.publish_latest).result()
 
     def reconfigure(self, config: Config) -> None:
         """Apply new settings from the next scan on."""

@@ -42,10 +42,14 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.ros.base_node import BaseNode
+from surfel_mapper.ros.publishers import is_overridden, mismatch, override, publishers_of
 from surfel_mapper.ros.turns import take_turns
 
 OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
 """Policies that a user can set for a subscription in ``qos_overrides``, beside reliability."""
+
+POLICIES = ('history', 'depth', 'durability', 'reliability')
+"""Their names in parameters."""
 
 LAST_S = 1.0
 """Longest time to take the remaining messages at the end, if more keep arriving."""
@@ -99,6 +103,8 @@ class TopicReader:
         Until then, by time.monotonic, the graph is checked for publishers of other QoS.
     lost : int
         Messages that the middleware has reported as lost.
+    mismatch : str
+        The publisher that cannot be heard, as the log has it.
 
     """
 
@@ -116,6 +122,7 @@ class TopicReader:
     reliability: ReliabilityPolicy = RELIABLE
     follow_until_s: float = -math.inf
     lost: int = 0
+    mismatch: str = ''
 
     def subscriptions(self) -> list[Subscription]:
         """Return the open subscriptions, oldest first."""
@@ -184,7 +191,6 @@ class SubscriptionExecutor:
 
         """
         topic = self._node.resolve_topic_name(name)
-        override = f'qos_overrides.{topic}.subscription.reliability'
         reader = TopicReader(
             message=message,
             name=name,
@@ -193,7 +199,7 @@ class SubscriptionExecutor:
             qos=copy.copy(qos),
             on_lost=on_lost,
             raw=raw,
-            follows=override not in self._node._parameter_overrides,
+            follows=not is_overridden(self._node, topic, 'reliability'),
         )
         if reader.follows:
             reader.qos.reliability = self._offered(reader, default=qos.reliability)
@@ -211,7 +217,10 @@ class SubscriptionExecutor:
         }
 
     def publishers(self, topic: str) -> list[TopicEndpointInfo]:
-        """Return the publishers of a topic, given by its full name."""
+        """Return the publishers of a topic, by its full name; if it is read, those of its type."""
+        for reader in (*self._eager, *self._others):
+            if reader.topic == topic:
+                return publishers_of(self._node, topic, reader.message)
         return list(self._node.get_publishers_info_by_topic(topic))
 
     def start(self) -> None:
@@ -242,7 +251,7 @@ class SubscriptionExecutor:
         events = SubscriptionEventCallbacks(
             message_lost=reader.on_message_lost,
             matched=reader.on_publishers_changed,
-            incompatible_qos=reader.on_publishers_changed if reader.follows else None,
+            incompatible_qos=reader.on_publishers_changed,
         )
         qos = copy.copy(reader.qos)  # rclpy enters the overrides in the profile given
         try:
@@ -257,7 +266,13 @@ class SubscriptionExecutor:
                 raw=reader.raw,
             )
         except (ParameterException, InvalidQosOverridesError, RuntimeError) as error:
-            raise ConfigError(f'qos_overrides.{reader.topic}.subscription: {error}') from error
+            names = [
+                override(reader.topic, policy)
+                for policy in POLICIES
+                if is_overridden(self._node, reader.topic, policy)
+            ]
+            causes = ', '.join(names) or f'no subscription to {reader.topic}'
+            raise ConfigError(f'{causes}: {error}') from error
         reader.reliability = ReliabilityPolicy(qos.reliability)
         reader.on_publishers_changed(None)  # one may have come since the graph was looked at
 
@@ -277,7 +292,8 @@ class SubscriptionExecutor:
 
     def _offered(self, reader: TopicReader, *, default: ReliabilityPolicy) -> ReliabilityPolicy:
         """Return the best reliability that all publishers of a topic offer."""
-        offered = {found.qos_profile.reliability for found in self.publishers(reader.topic)}
+        publishers = publishers_of(self._node, reader.topic, reader.message)
+        offered = {found.qos_profile.reliability for found in publishers}
         if not offered:
             return default
         return BEST_EFFORT if BEST_EFFORT in offered else RELIABLE
@@ -289,10 +305,13 @@ class SubscriptionExecutor:
             if reader.retiring is not None:
                 self._finish_switch(reader, now_s)
                 continue
-            if not reader.follows or now_s > reader.follow_until_s:
+            if now_s > reader.follow_until_s:
                 continue
-            reliability = self._offered(reader, default=reader.qos.reliability)
+            reliability = reader.qos.reliability
+            if reader.follows:
+                reliability = self._offered(reader, default=reliability)
             if reliability is reader.qos.reliability:
+                self._report_mismatch(reader)
                 continue
             reader.qos.reliability = reliability
             previous = reader.subscription
@@ -301,6 +320,15 @@ class SubscriptionExecutor:
             self._node.get_logger().info(
                 f'{reader.topic} is now read {name_of(reliability)}, as its publishers offer'
             )
+
+    def _report_mismatch(self, reader: TopicReader) -> None:
+        """Warn once of a publisher that cannot be heard."""
+        assert reader.subscription is not None
+        qos = reader.subscription.qos_profile
+        text = mismatch(self._node, reader.topic, reader.message, qos)
+        if text and text != reader.mismatch:
+            self._node.get_logger().warning(f'{reader.topic}: {text}')
+        reader.mismatch = text
 
     def _finish_switch(self, reader: TopicReader, now_s: float) -> None:
         """Destroy the earlier subscription once the new one is connected to all publishers."""
@@ -311,6 +339,7 @@ class SubscriptionExecutor:
         while self._take(reader):
             pass
         self._retire(reader)
+        self._report_mismatch(reader)
 
     def _run(self) -> None:
         try:

@@ -123,6 +123,23 @@ def test_fields_with_the_names_of_appended_ones_stay():
     assert {'normal_y', 'normal_z', 'num_points'} <= set(found.columns)
 
 
+def test_appended_fields_differ_from_those_that_have_their_prefix_already():
+    message = cloud(
+        step=35, named=('normal_x', 'surfel_normal_x', 'surfel_planarity', 'planarity')
+    )
+    scan = to_scan(message)
+    found = scan_with_normals(scan, POSE, mapped(scan), MIN_POINTS)
+    names = [field.name for field in found.fields]
+    assert len(set(names)) == len(names)
+    assert names[-5:] == [
+        'surfel_surfel_normal_x',
+        'normal_y',
+        'normal_z',
+        'surfel_surfel_planarity',
+        'num_points',
+    ]
+
+
 def test_points_that_were_not_inserted_get_surfels_too():
     message = cloud()
     scan = to_scan(message)

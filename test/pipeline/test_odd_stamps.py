@@ -77,6 +77,25 @@ def test_after_a_long_pause_no_message_is_lost():
     assert mapper.counters.resets == 0
 
 
+@pytest.mark.parametrize('steps_s', [[70] * 6, [70, 95, 64, 120, 61, 90], [10, 300, 20, 30]])
+def test_every_scan_of_a_sensor_that_stops_to_scan_is_mapped(steps_s):
+    mapper = mapper_with(pose__source='identity')
+    stamps_s = [100.0, *(100.0 + sum(steps_s[: k + 1]) for k in range(len(steps_s)))]
+    updates = insert(mapper, *(scan_at(stamp_s) for stamp_s in stamps_s))
+    assert [update.stamp_ns / 1e9 for update in updates] == stamps_s
+    assert mapper.counters.dropped == {}
+    assert mapper.counters.resets == 0
+
+
+def test_a_scan_after_a_step_far_longer_than_those_before_it_is_held():
+    mapper = mapper_with(pose__source='identity')
+    insert(mapper, *(scan_at(stamp_s) for stamp_s in (100.0, 170.0, 240.0)))
+    assert insert(mapper, scan_at(YEAR_2033_S)) == []
+    assert len(insert(mapper, scan_at(310.0), scan_at(380.0))) == 2
+    assert mapper.counters.dropped == {'odd_stamp': 1}
+    assert mapper.counters.resets == 0
+
+
 def test_a_sensor_with_another_clock_does_not_clear_the_map():
     mapper = mapper_with()
     for k in range(20):

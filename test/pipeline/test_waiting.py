@@ -154,6 +154,36 @@ def test_scans_that_wait_when_time_is_set_back_are_counted_as_cleared():
     assert_counts_add_up(mapper, waiting=2)
 
 
+@pytest.mark.parametrize('more_follows', [False, True])
+def test_scans_with_their_poses_are_mapped_before_time_is_set_back(more_follows):
+    mapper = mapper_with(pose__source='identity', map__threads=2, map__min_points=1)
+    stamps_s = [100.0, 100.1, 100.2, 100.3, 1.0, 1.1, 1.2]
+    updates = []
+    for stamp_s in stamps_s:
+        mapper.add_scan(scan_at(stamp_s))
+        updates += mapper.insert_ready(more_follows=more_follows)
+    updates += mapper.insert_ready()
+    assert [update.stamp_ns / 1e9 for update in updates] == stamps_s
+    assert mapper.counters.resets == 1
+    assert len(mapper.window) == 3
+    later = mapper_with(pose__source='identity')
+    insert(later, *(scan_at(stamp_s) for stamp_s in stamps_s[4:]))
+    assert mapper.map.digest() == later.map.digest()
+    assert_counts_add_up(mapper)
+
+
+def test_clearing_right_after_time_was_set_back_drops_the_scans_of_before():
+    mapper = mapper_with(pose__source='identity', map__threads=2)
+    for stamp_s in (100.0, 100.1, 100.2, 1.0):
+        mapper.add_scan(scan_at(stamp_s))
+        list(mapper.insert_ready(more_follows=True))
+    mapper.add_scan(scan_at(1.1))
+    mapper.clear()
+    assert list(mapper.insert_ready()) == []
+    assert len(mapper.window) == 0
+    assert_counts_add_up(mapper)
+
+
 def test_after_time_is_set_back_a_scan_never_gets_a_pose_of_before():
     mapper = mapper_with(pose__max_wait_s=1.0)
     for stamp_s in range(10):

@@ -155,8 +155,8 @@ def test_a_graph_that_cannot_be_read_does_not_end_the_thread_of_subscriptions(pe
     ends, words = [], []
     executor = SubscriptionExecutor(peer.node, ends.append)
     executor.subscribe(String, '/words', words.append, QoSProfile(depth=10))
-    read = executor.publishers
-    executor.publishers = lambda topic: fail() if not failures else read(topic)
+    read = peer.node.get_publishers_info_by_topic
+    peer.node.get_publishers_info_by_topic = lambda topic: fail() if not failures else read(topic)
     executor.start()
     publisher = peer.node.create_publisher(String, '/words', 10)
     peer.spin_until(lambda: failures and publisher.get_subscription_count())

@@ -40,6 +40,15 @@ def test_no_cloud_yet_is_a_warning_with_a_remedy(num_publishers, remedy):
     assert remedy in text
 
 
+def test_a_publisher_that_cannot_be_heard_is_named_instead_of_another_remedy():
+    unheard = '/lidar publishes volatile, but qos_overrides./points is transient_local'
+    for before in (False, True):
+        ((_, text),) = found(ever_received=before, silent_s=9.0, unheard=unheard)
+        assert unheard in text
+        assert 'fastdds_shm' not in text
+        assert 'alive' not in text
+
+
 def test_silence_is_an_error_beyond_its_limit_only():
     assert found(silent_s=2.0) == []
     ((level, text),) = found(silent_s=2.1)
@@ -74,6 +83,11 @@ def test_a_pause_is_a_warning_and_its_drops_are_ignored():
 def test_latency_is_a_warning_or_an_error_beyond_its_limits(latency_s, level):
     said = found(latency_s=latency_s)
     assert [severity for severity, _ in said] == ([] if level is None else [level])
+
+
+@pytest.mark.parametrize('off_s', [3 * 3600.0, -3 * 3600.0, 900.0])
+def test_a_latency_of_minutes_means_another_clock(off_s):
+    assert found(latency_s=off_s) == []
 
 
 def test_a_layer_that_is_switched_off_is_a_warning_with_its_error():

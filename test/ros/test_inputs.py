@@ -21,6 +21,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 
 from surfel_mapper import Mapper
 from surfel_mapper.config import Config
+from surfel_mapper.errors import ConfigError
 from surfel_mapper.messages.images import CameraImage, depth_scan
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import poses_in
@@ -222,6 +223,34 @@ def inputs_of(config, publishers=()):
     )
     thread = SimpleNamespace(put_cloud=lambda *_: None, refuse_cloud=lambda *_: None)
     return Inputs(node, config, thread, on_failure=None)
+
+
+@pytest.mark.parametrize(
+    ('settings', 'message'),
+    [
+        ({'input.topics': ['bad topic']}, "^input.topics: 'bad topic' is no name of a topic: .*"),
+        ({'input.topics': ['/a', '{nope}/y']}, "^input.topics: '{nope}/y' .*unknown substitution"),
+        ({'input.topics': ['points', '/points']}, r"'/points'\], expected names that differ"),
+        ({'input.topics': ['~/a', '/peer/a']}, r"'/peer/a'\], expected names that differ"),
+        (
+            {'layers.tsdf.color_topic': 'a b', 'layers.tsdf.color': True},
+            "^layers.tsdf.color_topic: 'a b' is no name of a topic: .* characters",
+        ),
+    ],
+)
+def test_invalid_and_repeated_topics_are_refused_by_name(guarded_peer, settings, message):
+    settings = {'input.kind': 'depth', 'layers.tsdf.enabled': True, **SETTINGS, **settings}
+    with pytest.raises(ConfigError, match=message) as refused:
+        Inputs(guarded_peer.node, Config.from_mapping(settings), None, on_failure=None)
+    assert '.c:' not in str(refused.value)
+
+
+def test_a_node_ends_with_a_message_if_a_topic_is_invalid(start):
+    node = start('node', *arguments(**{'input.topics': '["bad topic"]'}))
+
+    assert node.wait() == 1
+    assert "input.topics: 'bad topic' is no name of a topic" in node.output
+    assert 'Traceback' not in node.output
 
 
 def test_the_most_silent_of_several_lidars_is_found():

@@ -15,12 +15,15 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from builtin_interfaces.msg import Time
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.srv import LoadMap
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import MarkerArray
 
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.files.map_state import load_map
+from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.checkpoints import checkpoint_paths
 from surfel_mapper.pipeline.reduction import WarmUpSteps
@@ -320,6 +323,33 @@ def test_a_late_subscriber_gets_the_map_of_an_inactive_node(start, peer):
     late = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
     peer.spin_until(lambda: late)
     assert late[0] == early[-1]
+
+
+def test_late_subscribers_get_the_present_map_of_an_inactive_node(start, peer, tmp_path):
+    """No timer publishes then, so the map as it was at some time before had been kept."""
+    seldom = {'publish.normals_rate_hz': 1e-3, 'publish.markers_rate_hz': 1e-3}
+    start('node', *arguments(**seldom, **{'output.directory': tmp_path / 'maps'}))
+    peer.advertise('/odom', '/points')
+    markers = peer.collect(MarkerArray, f'{NODE}/markers', LATCHED)
+    messages = drive(2)
+    send(peer, messages)
+    number = len(mapped(messages)[1].map.surfels(5))
+
+    def check(expected):
+        late = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
+        peer.spin_until(lambda: late)
+        assert [len(to_scan(message)) for message in late] == [expected]
+
+    assert transit(peer, 'deactivate')
+    check(number)
+    peer.spin_until(lambda: len(markers) == 1)
+    assert peer.call('save_map').success
+    assert peer.call('clear').success
+    check(0)
+    peer.spin_until(lambda: len(markers) == 2)
+    answer = peer.call('load_map', LoadMap, LoadMap.Request())
+    assert answer.result == LoadMap.Response.RESULT_SUCCESS
+    check(number)
 
 
 def test_a_node_that_is_killed_continues_from_its_checkpoint(start, peer, tmp_path):

@@ -100,6 +100,37 @@ def test_a_full_queue_drops_and_counts_the_oldest_clouds(bench):
     assert bench.mapper.counters.dropped_by_frame == {'lidar': {'overload': 3}}
 
 
+@pytest.mark.parametrize('frame_id', ['/lidar', 'lidar'])
+def test_all_drops_of_a_sensor_count_under_one_frame(bench, frame_id):
+    def message(number, point_step=12):
+        found = cloud(START_NS + number, room(seed=1, num=9), frame_id=frame_id)
+        found.point_step = point_step
+        return found
+
+    bench.thread.put_cloud(message(0, point_step=11), '/points')
+    bench.thread.call(lambda: setattr(bench.thread, 'paused', True)).result(TIMEOUT_S)
+    bench.put_cloud(1, message(1))
+    bench.thread.call(lambda: setattr(bench.thread, 'paused', False)).result(TIMEOUT_S)
+    bench.hold()
+    for number in range(MAX_CLOUDS + 1):
+        bench.put_cloud(number, message(number))
+    bench.release()
+    bench.thread.stop()
+    bench.mapper.finish()
+
+    (dropped,) = bench.mapper.counters.dropped_by_frame.items()
+    assert dropped[0] == 'lidar'
+    assert {'paused', 'overload', 'bad_cloud'} < set(dropped[1])
+
+
+def test_drops_of_a_frame_with_an_invalid_name_count_under_the_topic(bench):
+    bench.thread.paused = True
+    bench.put_cloud(START_NS, cloud(START_NS, room(seed=1, num=9), frame_id='x' * 10**4))
+    bench.thread.stop()
+
+    assert bench.mapper.counters.dropped_by_frame == {'/points': {'paused': 1}}
+
+
 def test_a_full_queue_drops_and_counts_the_oldest_poses(bench):
     bench.hold()
     pose = StampedPose('odom', 'base_link', START_NS, (0.0, 0.0, 0.0), UNTURNED)

@@ -13,11 +13,13 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from std_msgs.msg import String
+from std_msgs.msg import Int32, String
 
+from surfel_mapper.errors import ConfigError
 from surfel_mapper.ros.base_node import BaseNode
 from surfel_mapper.ros.context import PROFILE
-from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
+from surfel_mapper.ros.diagnostics import publishers
+from surfel_mapper.ros.subscription_executor import FOLLOW_S, SubscriptionExecutor
 from test.ros.live import Peer, reliably, START_NS
 from test.ros.ordinary import node_on_defaults, NUMBER, publish
 
@@ -183,6 +185,75 @@ def test_a_reliability_set_by_the_user_stays(domain, chosen):
         bench.executor.stop()
         peer.close()
     assert bench.failures == []
+
+
+@pytest.fixture
+def other_peer(domain):
+    """Return a second participant: Fast DDS refuses two types of a topic in one."""
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+def test_publishers_of_another_type_do_not_decide_the_reliability(bench, other_peer):
+    node = bench.peer.node
+    other = other_peer.node.create_publisher(Int32, bench.topic, BEST_EFFORT)
+    bench.peer.spin_until(lambda: node.count_publishers('/followed'))
+    bench.subscribe()
+    bench.peer.spin_for(0.5)
+    assert bench.executor.reliabilities() == {'/followed': 'reliable'}
+    assert bench.executor.publishers('/followed') == []
+    assert publishers(node, '/followed') == (0, '')
+    bench.check_connected(bench.advertise(RELIABLE), 'reliable beside another type')
+    other_peer.node.destroy_publisher(other)
+    bench.peer.spin_for(0.5)
+    assert publishers(node, '/followed') == (1, '')
+    assert bench.executor.reliabilities() == {'/followed': 'reliable'}
+
+
+@pytest.mark.parametrize(
+    ('policy', 'chosen', 'offered'),
+    [
+        ('reliability', 'reliable', 'best_effort'),
+        ('durability', 'transient_local', 'volatile'),
+    ],
+)
+def test_an_override_that_keeps_messages_away_is_named(domain, capfd, policy, chosen, offered):
+    name = f'qos_overrides./chosen.subscription.{policy}'
+    peer = Peer(['--ros-args', '-p', f'{name}:={chosen}'], BaseNode)
+    bench = Bench(peer, 'chosen')
+    said = f'publishes {offered}, but {name} is {chosen}, so that its messages do not arrive'
+    try:
+        bench.subscribe()
+        bench.advertise(BEST_EFFORT)
+        peer.spin_until(lambda: said in publishers(peer.node, '/chosen')[1])
+        peer.spin_for(FOLLOW_S + 0.5)
+    finally:
+        bench.executor.stop()
+        peer.close()
+    assert bench.failures == []
+    assert capfd.readouterr().err.count(f'/chosen: /peer {said}') == 1
+
+
+@pytest.mark.parametrize('overridden', [False, True])
+def test_an_error_at_subscribing_names_the_overrides_only_if_there_are_any(
+    domain, monkeypatch, overridden
+):
+    arguments = ['--ros-args', *reliably('/chosen')] if overridden else []
+    peer = Peer(arguments, BaseNode)
+    bench = Bench(peer, 'chosen')
+
+    def fail(*args, **kwargs):
+        raise RuntimeError('no memory')
+
+    monkeypatch.setattr(peer.node, 'create_subscription', fail)
+    try:
+        with pytest.raises(ConfigError, match='no memory') as caught:
+            bench.subscribe()
+    finally:
+        peer.close()
+    assert ('qos_overrides./chosen.subscription.reliability' in str(caught.value)) == overridden
+    assert '/chosen' in str(caught.value)
 
 
 def test_the_depth_set_by_the_user_stays_with_every_new_subscription(domain):

@@ -112,7 +112,10 @@ def test_registration_on_a_frozen_map_starts_from_an_initial_pose(start, peer, t
     node.wait_for_output('cells meet a surfel')
 
     message = PoseWithCovarianceStamped()
-    message.header.frame_id = 'odom'
+    message.header.frame_id = 'x' * 10**4
+    peer.publish('/initialpose', message)
+    node.wait_for_output('initial pose ignored: frame ')
+    message.header.frame_id = '/odom'  # the slash of ROS 1 is no part of the name
     p, q = message.pose.pose.position, message.pose.pose.orientation
     p.x, p.y, p.z = (pose_at(0)[:3, 3] + [0.4, -0.3, 0.0]).tolist()
     q.x, q.y, q.z, q.w = q_xyzw(pose_at(0)).tolist()

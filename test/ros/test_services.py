@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 from surfel_mapper.config import Config
-from surfel_mapper.errors import PoseError
+from surfel_mapper.errors import CloudFormatError, PoseError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball, Box, Prism
 from surfel_mapper.ros.mapping_thread import MappingThread
@@ -146,6 +146,8 @@ def test_clear_polygon_accepts_any_known_frame(peer, node):
     ('corner', 'frame_id', 'error', 'reason'),
     [
         ((0.0, 0.0), '', PoseError, 'frame_id is empty'),
+        ((0.0, 0.0), '/', PoseError, 'frame_id is empty'),
+        ((0.0, 0.0), 'x' * 10**4, CloudFormatError, 'of 10000 characters'),
         ((0.0, 0.0), 'elsewhere', PoseError, 'elsewhere'),
         ((float('nan'), 0.0), 'odom', ValueError, 'finite numbers'),
     ],
@@ -153,6 +155,11 @@ def test_clear_polygon_accepts_any_known_frame(peer, node):
 def test_an_invalid_polygon_is_refused(corner, frame_id, error, reason):
     with pytest.raises(error, match=reason):
         prism(polygon([corner, (1.0, 0.0), (1.0, 1.0)], frame_id), Mapper(Config()))
+
+
+def test_the_slash_of_ros_1_is_no_part_of_the_frame_of_a_polygon():
+    mapper = Mapper(Config())
+    assert prism(polygon(SQUARE, '/odom'), mapper) == prism(polygon(SQUARE, 'odom'), mapper)
 
 
 def test_a_loaded_map_continues_where_it_was_saved(peer, node, tmp_path):

@@ -74,9 +74,7 @@ def test_times_are_read_without_decoding_the_points(dtype, offset):
     assert (found.first_ns, found.last_ns) == (START_NS + 3, START_NS + 5)
 
 
-@pytest.mark.parametrize(
-    'dtype', ['>f4', '>f8', '>u4', 'f2', 'g', 'i1', 'u2', 'i8', 'u8']
-)
+@pytest.mark.parametrize('dtype', ['>f4', '>f8', '>u4', 'f2', 'g', 'i1', 'u2', 'i8', 'u8'])
 def test_times_of_any_type_and_byte_order_are_read(dtype):
     found = point_times(sweep(np.array([7, 5, 100], dtype)), unit='ns', reference='stamp')
     assert found.offsets.tolist() == [7, 5, 100]
