@@ -265,6 +265,8 @@ def map_middle(
     if mapper.passes_over:  # no message was recorded since
         start = ShardStart.of(mapper)
     if shard.stop_ns is None:
+        mapper.end_scans()
+        mapped += [stamped_pose(update) for update in mapper.insert_ready()]
         mapper.finish()
     return start, mapped
 

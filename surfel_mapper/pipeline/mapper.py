@@ -291,7 +291,8 @@ class Mapper:
             self._inserter.images.ended = True
 
     def end_scans(self) -> None:
-        """Stop waiting for a scan after the first, which tells its velocity: no more come."""
+        """Stop waiting for further scans and for poses: no more come."""
+        self._queue.ended = True
         if self.registered is not None:
             self.registered.scans_ended = True
 

@@ -48,6 +48,8 @@ class ScanQueue:
     ----------
     posed : deque of (Scan, (4, 4) float64)
         The next scans to map, and their T_fixed_sensor.
+    ended : bool
+        No poses come any more: a scan without one is dropped at once, for those behind it.
 
     """
 
@@ -61,6 +63,7 @@ class ScanQueue:
         self._scans: deque[Scan] = deque()
         self.posed: deque[PosedScan] = deque()
         self._newest_ns: dict[str, int] = {}
+        self.ended = False
 
     @property
     def newest_ns(self) -> int | None:
@@ -87,6 +90,7 @@ class ScanQueue:
 
     def push(self, scan: Scan) -> None:
         """Add a scan, unless its stamp is not newer than the last of its frame."""
+        self.ended = False
         last_ns = self._newest_ns.pop(scan.frame_id, None)
         if last_ns is not None and scan.stamp_ns <= last_ns:
             behind_s = (last_ns - scan.stamp_ns) / 1e9
@@ -137,9 +141,10 @@ class ScanQueue:
             try:
                 pose = self._poses.of(scan, self._scans[1] if len(self._scans) > 1 else None)
             except PoseNotYetError as error:
-                if waited_s <= longest_wait_s(error, config):
+                if not self.ended and waited_s <= longest_wait_s(error, config):
                     return None
-                reason = f'no pose within {waited_s:.3f} s: {error}'
+                within = 'until the end of the input' if self.ended else f'within {waited_s:.3f} s'
+                reason = f'no pose {within}: {error}'
             except PoseError as error:
                 reason = str(error)
             else:

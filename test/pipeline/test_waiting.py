@@ -107,6 +107,19 @@ def test_at_the_end_of_the_input_waiting_scans_are_dropped():
     assert dropped(mapper) == {'no_pose': 2}
 
 
+def test_at_the_end_of_the_input_scans_behind_a_gap_of_the_poses_are_mapped():
+    mapper = mapper_with(pose__max_wait_s=100.0, pose__max_gap_s=0.5)
+    for stamp_s in (0.9, 1.1, 2.9, 3.1):
+        add_pose(mapper, stamp_s)
+    updates = insert(mapper, scan_at(1.0), scan_at(2.0), scan_at(3.0))
+    assert [update.stamp_ns for update in updates] == [S]
+    mapper.end_scans()
+    assert [update.stamp_ns for update in mapper.insert_ready()] == [3 * S]
+    assert dropped(mapper) == {'no_pose': 1}
+    mapper.finish()
+    assert_counts_add_up(mapper)
+
+
 # Time
 
 
