@@ -192,7 +192,7 @@ def check_formats(formats: Sequence[str], output: Path) -> None:
 
 class ScanTrajectory:
     """
-    Stamp and pose of every mapped scan.
+    Stamp and pose of every mapped scan, since the map was cleared if time was set back.
 
     Attributes
     ----------
@@ -207,9 +207,14 @@ class ScanTrajectory:
         self.stamps_ns: list[int] = []
         self.poses: list[npt.NDArray[np.float64]] = []
         self._T_sensor_body: list[npt.NDArray[np.float64]] = []
+        self._cleared_at = self._map.cleared_at
 
     def add(self, update: Update) -> None:
         """Append the pose of a mapped scan."""
+        if self._map.cleared_at != self._cleared_at:
+            self._cleared_at = self._map.cleared_at
+            for kept in (self.stamps_ns, self.poses, self._T_sensor_body):
+                kept.clear()
         self.stamps_ns.append(update.stamp_ns)
         self.poses.append(update.T_map_sensor)
         if update.T_fixed_body is not None:

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from surfel_mapper import Config, replay
+from surfel_mapper import Config, Mapper, replay, Scan
 from surfel_mapper.cli.main import main
 from surfel_mapper.errors import (
     AlignmentError,
@@ -21,6 +21,7 @@ from surfel_mapper.errors import (
 from surfel_mapper.files import parquet
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.trajectory import read_trajectory
+from surfel_mapper.offline.outputs import ScanTrajectory
 from surfel_mapper.offline.replay import ReplayOptions, started_mapper
 from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import as_text
@@ -243,3 +244,17 @@ def test_the_stages_are_parts_of_the_wall_time(bag, tmp_path):
     assert abs(sum(parts) - total) <= 0.05 * len(printed)  # of rounding
     times = summary['milliseconds']['total']
     assert mapping.startswith(f'mapping {times["median"]:.1f} ms, p99 {times["p99"]:.1f}   ')
+
+
+def test_the_trajectory_is_that_of_the_map_if_time_was_set_back():
+    mapper = Mapper(Config.from_mapping({'pose.source': 'identity'}))
+    trajectory = ScanTrajectory(mapper)
+    for stamp_s in (100, 101, 50, 51):
+        points = np.full((5, 3), float(stamp_s), np.float32)
+        mapper.add_scan(Scan(points=points, stamp_ns=stamp_s * 10**9, frame_id='lidar'))
+        for update in mapper.insert_ready(more_follows=True):
+            trajectory.add(update)
+    for update in mapper.insert_ready():
+        trajectory.add(update)
+    assert trajectory.stamps_ns == [50 * 10**9, 51 * 10**9]
+    assert (len(trajectory.poses), mapper.map.num_points) == (2, 10)
