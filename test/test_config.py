@@ -23,7 +23,6 @@ from surfel_mapper.config import (
     WindowConfig,
 )
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.filters.chain import Chain
 
 DECLARATIONS = {declared.name: declared for declared in declarations()}
 BOUNDED = [declared for declared in declarations() if declared.is_number]
@@ -348,12 +347,6 @@ def test_a_key_twice_is_refused_with_its_lines(tmp_path, text, name, lines):
     says = f'{name}: twice, in line {lines[0]} and line {lines[1]}, expected once'
     with pytest.raises(ConfigError, match=says):
         load_config(written(tmp_path, text))
-
-
-def test_a_parameter_of_a_filter_twice_is_refused():
-    text = '- RandomSamplingDataPointsFilter:\n    prob: 0.5\n    prob: 0.7\n'
-    with pytest.raises(ConfigError, match=r'\.prob: twice, in line 2 and line 3'):
-        Chain.from_yaml(text)
 
 
 def test_a_key_may_come_again_in_another_item_of_a_list():

@@ -62,7 +62,8 @@ def read_yaml(path: str | Path, *, as_text: bool = False, max_nodes: int = MAX_N
         If the file cannot be read.
     ValueError
         If it is not a regular file of at most 1 MiB, not YAML, is nested too deeply, has too many
-        nodes, with those that aliases expand to, a number of too many digits, or a key twice.
+        nodes, with those that aliases expand to, a number of too many digits, or a key twice
+        (but as text, where the last counts).
 
     """
     return parse_yaml(read_small_file(path).decode(), as_text=as_text, max_nodes=max_nodes)
@@ -76,12 +77,11 @@ def parse_yaml(text: str, *, as_text: bool = False, max_nodes: int = MAX_NODES) 
     base = getattr(yaml, 'CBaseLoader', yaml.BaseLoader)
     try:
         events = checked_events(yaml.parse(text, base), max_nodes, as_text=as_text)
-        events = distinct_keys(events)
         if as_text:
-            return text_document(events)
-        for _ in events:
+            return text_document(events)  # of chains, where the last of two keys counts
+        for _ in distinct_keys(events):
             pass
-        return yaml.load(text, value_loader())
+        return yaml.load(text, value_loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)))
     except yaml.MarkedYAMLError as error:
         # without the line itself: a caller may pass a path whose content is not theirs to read
         raise ValueError(f'{error.problem or error.context}{place(error.problem_mark)}') from error
@@ -94,11 +94,10 @@ def parse_yaml(text: str, *, as_text: bool = False, max_nodes: int = MAX_NODES) 
 
 
 @cache
-def value_loader() -> Any:
-    """Return the safe loader of PyYAML, with 1e-2 as a number."""
-    import yaml
+def value_loader(safe: Any) -> Any:
+    """Return a safe loader of PyYAML, with 1e-2 as a number."""
 
-    class Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
+    class Loader(safe):  # type: ignore[misc]
         pass
 
     Loader.add_implicit_resolver('tag:yaml.org,2002:float', EXPONENT, list('-+.0123456789'))
