@@ -66,12 +66,6 @@ def nanoseconds(text: str, where: str, unit: str = '') -> int:
     return stamp_ns
 
 
-def seconds(stamp_ns: int) -> str:
-    """Return a time in seconds with all nine digits."""
-    whole, rest = divmod(abs(stamp_ns), 10**9)
-    return f'{"-" if stamp_ns < 0 else ""}{whole}.{rest:09d}'
-
-
 def read_times(path: str | Path) -> npt.NDArray[np.int64]:
     """Return the times in a file of one number of seconds a line, (T,) int64 ns, in its order."""
     budget = Budget.of_file(path, FileFormatError)

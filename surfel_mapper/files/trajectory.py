@@ -26,9 +26,10 @@ from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.pose_rows import matrix_rows, quaternion_rows, warn_of_skew
-from surfel_mapper.files.stamps import column_ns, read_times, seconds, UNITS_NS
+from surfel_mapper.files.stamps import column_ns, read_times, UNITS_NS
 from surfel_mapper.files.text_lines import read_lines, table_rows, TextLines
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw, quaternions
+from surfel_mapper.poses.pose_track import seconds
 
 FORMATS = ('tum', 'kitti', 'csv')
 
