@@ -15,7 +15,7 @@ error in its byte count (Fast DDS 2.14) delays repetitions by up to half a secon
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -23,6 +23,9 @@ import itertools
 import os
 import sys
 import threading
+from typing import TypeVar
+
+Part = TypeVar('Part')
 
 PARTS = 4
 """Number of parts per thread into which rows are divided; an idle thread takes the next part."""
@@ -84,24 +87,27 @@ def split(num_rows: int, parts: int) -> list[slice]:
 
 
 def share(work: Callable[[slice], object], num_rows: int, threads: int) -> None:
+    """Do the work on all rows, in parts of nearly equal length; see ``share_parts``."""
+    parts = PARTS * threads if threads > 1 else 1
+    share_parts(work, split(num_rows, parts), threads)
+
+
+def share_parts(work: Callable[[Part], object], parts: Iterable[Part], threads: int) -> None:
     """
-    Do the work on all rows, with the help of idle threads of the pool.
+    Do the work on all parts, with the help of idle threads of the pool.
 
     The calling thread takes parts until none is left, so it never waits for a thread that is busy
     with other work, only for parts that another thread has begun, also if a part fails. Of several
     errors its own is raised, or that of the first helper.
     """
     helpers = pool(threads)
-    if helpers is None:
-        work(slice(0, num_rows))
-        return
-    parts = iter(split(num_rows, PARTS * threads))  # shared; Python's lock protects it
+    left = iter(parts)  # shared; Python's lock protects it
 
     def take_parts() -> None:
-        for part in parts:
+        for part in left:
             work(part)
 
-    helping = [helpers.submit(take_parts) for _ in range(threads - 1)]
+    helping = [helpers.submit(take_parts) for _ in range(threads - 1)] if helpers else []
     try:
         take_parts()
     finally:

@@ -17,9 +17,15 @@ An entry is one int64: the hash in the upper 32 bits and row + 1 in the lower, 0
 Splitting and removing need only the hash, never the rows; a look-up that finds an equal hash
 confirms it by the key in the row, which the caller is about to use.
 
+A table of several threads has stripes: the keys whose hashes have the same highest bits. Segments,
+rows and counts of one stripe are its own, so that two threads may change different stripes at the
+same time. Stripes are given rows and segments in groups that they fill alone: with single ones a
+thread waits for cache lines that the other has written, and two threads add 1.5 times as fast as
+one instead of 1.8 times.
+
 The kernels take the table as one tuple: directory (2^depth,) int32, the segment of each prefix of
 the hash; buckets (S * 512,) int64, the entries; held (S,) int32, rows in each segment; local_depth
-(S,) int8, number of hash bits that all rows of a segment share. Its depth is in the map's state.
+(S,) int8, number of hash bits that all rows of a segment share. Its depth is in the state.
 
 Source: Fagin et al. 1979, Extendible hashing; deletion after algorithm R of Knuth, vol. 3, 6.4.
 """
@@ -40,17 +46,28 @@ BUCKET = WORDS
 FULLEST = SEGMENT * 3 // 4
 """Maximum number of rows in a segment; see is_full."""
 
-# Entries of the state of a map, an int64 array that kernels write.
-FREE_ROW = 0
-"""First row of the chain of free rows, -1 if the chain is empty."""
-ROWS_USED = 1
-"""Number of rows ever used; later rows are untouched."""
-VOXELS = 2
-SEGMENTS = 3
-DEPTH = 4
+# Entries of the state of a table, an int64 array that kernels write.
+DEPTH = 0
 """The directory has 2^DEPTH entries."""
-POINTS = 5
-STATE = 6
+STRIPING = 1
+"""The table has 2^STRIPING stripes."""
+LINE = 16
+"""Words of the state between a stripe and the next: a thread writes two cache lines of its own."""
+# Those of the first stripe; LINE words later follow those of the second.
+FREE_ROW = LINE
+"""First row of the chain of free rows, -1 if the chain is empty."""
+NEXT_ROW = LINE + 1
+"""The row that is used next if the chain is empty, of rows that were never used, ..."""
+END_ROW = LINE + 2
+"""... and the one after the last of these."""
+NEXT_SEGMENT = LINE + 3
+"""The segment that is used next, of segments that were never used, ..."""
+END_SEGMENT = LINE + 4
+"""... and the one after the last of these."""
+VOXELS = LINE + 5
+POINTS = LINE + 6
+STATE = 2 * LINE
+"""Length of the state of a table of one stripe."""
 
 LOW = np.int64(0xFFFFFFFF)
 
@@ -62,6 +79,12 @@ def hash_key(key):
     mixed ^= mixed >> np.uint64(32)
     mixed *= np.uint64(0xD6E8FEB86659FD93)
     return np.int64(mixed >> np.uint64(32))
+
+
+@njit(cache=True, nogil=True, inline='always')
+def stripe_of(hashed, stripe_bits):
+    """Return the stripe of a hash, of 2^stripe_bits ones."""
+    return hashed >> (32 - stripe_bits)
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -222,10 +245,11 @@ def split_segment(hashed, table, state):
     depth = state[DEPTH]
     old = np.int64(directory[hashed >> (32 - depth)])
     bits = np.int64(local_depth[old])
-    new = state[SEGMENTS]
-    if bits == depth or new == len(held):
+    own = stripe_of(hashed, state[STRIPING]) * LINE
+    new = state[NEXT_SEGMENT + own]
+    if bits == depth or new == state[END_SEGMENT + own]:
         return False
-    state[SEGMENTS] = new + 1
+    state[NEXT_SEGMENT + own] = new + 1
     local_depth[old] = local_depth[new] = bits + 1
     entries = np.empty(SEGMENT, np.int64)
     for place in range(SEGMENT):

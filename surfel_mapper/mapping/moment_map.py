@@ -62,13 +62,20 @@ class MomentMap:
         The lattice unit is ``voxel_size_m / 2^(16 + level)``.
     origin_m : (3,) float, m
         Place of the origin of the map in an outer frame.
+    threads : int
+        Number of threads that share the work.
 
     Errors are those of SurfelMap.
 
     """
 
     def __init__(
-        self, voxel_size_m: float, columns: tuple[str, ...], level: int, origin_m: npt.ArrayLike
+        self,
+        voxel_size_m: float,
+        columns: tuple[str, ...],
+        level: int,
+        origin_m: npt.ArrayLike,
+        threads: int,
     ) -> None:
         if as_whole('level', level) not in range(MAX_LEVEL + 1):
             raise ValueError(f'level: {level}, expected 0 to {MAX_LEVEL}')
@@ -78,10 +85,11 @@ class MomentMap:
         self.version = 0
         self.columns = columns
         self._channel_names = channel_names(columns)
+        self._threads = threads
         self._reset()
 
     def _reset(self) -> None:
-        self._table = VoxelTable(len(self._channel_names))
+        self._table = VoxelTable(len(self._channel_names), self._threads)
         self._changes = ChangeLog(self.version)
         self.cleared_at = self.version
 
@@ -133,7 +141,11 @@ class MomentMap:
         if moments.num_reduced is None:
             check_possible(moments)
         self.version += 1
-        rows = self._table.add(moments, self.version)
+        try:
+            rows = self._table.add(moments, self.version)
+        except BaseException:
+            self._changes.forget(self.version)
+            raise
         self._changes.add(self.version, rows, self._table.num_voxels)
         object.__setattr__(moments, 'rows', rows)
 
@@ -167,14 +179,19 @@ class MomentMap:
         if moments.num_reduced is None:
             check_possible(moments)
         least = as_whole('min_points', min_points)
-        missing, rows, fallen = self._table.remove(moments, self.version + 1, least)
+        self.version += 1
+        try:
+            missing, rows, fallen = self._table.remove(moments, self.version, least)
+        except BaseException:
+            self._changes.forget(self.version)
+            raise
         if missing >= 0:
+            self._changes.forget(self.version)
             index = moments.voxel_index[missing].tolist()
             raise NotInMapError(
                 f'voxel {index} does not hold the {moments.count[missing]} points to be '
                 'removed; were these moments added to this map, and only removed once?'
             )
-        self.version += 1
         self._changes.add(self.version, rows, self._table.num_voxels)
         return fallen
 

@@ -32,12 +32,13 @@ from surfel_mapper.mapping.kernels.reduction import (
     BEYOND,
     NOT_FINITE,
     pack_moments,
+    places_by_stripe,
     reduce_points,
     sum_channels,
     TOO_FAR,
     TOO_NEAR,
 )
-from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.moments import LEAST_SHARED, ScanMoments, STRIPE_BITS
 
 ENTRIES = 4
 """Table entries for each voxel: real lidars change the voxel with almost every point, and a table
@@ -54,6 +55,9 @@ CAUSES = {
 
 IDENTITY, UNKNOWN = np.eye(4), np.full(3, np.nan)
 """Pose of points that are in the map frame, and place of an unknown sensor."""
+
+IN_ORDER = np.empty(0, np.int32)
+"""Places of voxels that stay in the order of their first points."""
 
 NO_LIMITS = np.array([0.0, np.inf])
 """Squared limits of the range by default."""
@@ -103,11 +107,16 @@ class Reducer:
         Edge of a voxel.
     columns : tuple of str
         Columns of the points to sum in addition.
+    by_stripe : bool
+        Whether voxels are put in the order of their stripes, which threads then share.
 
     """
 
-    def __init__(self, voxel_size_m: float, columns: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, voxel_size_m: float, columns: tuple[str, ...] = (), *, by_stripe: bool = False
+    ) -> None:
         self.voxel_size_m = voxel_size_m
+        self._by_stripe = by_stripe
         self._columns = columns
         self._idle = [Scratch()]
 
@@ -160,7 +169,9 @@ class Reducer:
             sums = np.empty((len(moments), values.shape[1]), np.int64)
             sum_channels(points.T, *quantisation, moments.key, scratch.table, values, sums)
             scratch.table.fill(-1)
+            stripes = moments.stripes
             moments = replace(moments, channel_names=channel_names(self._columns), channels=sums)
+            object.__setattr__(moments, 'stripes', stripes)
         self._idle.append(scratch)
         num_reduced = len(points) - sum(moments.left_out.values())
         object.__setattr__(moments, 'num_reduced', num_reduced)
@@ -189,7 +200,14 @@ class Reducer:
                 left_out={cause: left_out[row] for cause, row in CAUSES.items() if left_out[row]},
             )
             keys, sums = scratch.keys[2 : num + 2], scratch.sums[1 : num + 1]
-            largest = pack_moments(keys, sums, origin, self.voxel_size_m, moments.arrays)
+            places = IN_ORDER
+            if self._by_stripe and num >= LEAST_SHARED:
+                places = np.empty(num, np.int32)
+                bounds = np.zeros((1 << STRIPE_BITS) + 1, np.int64)
+                places_by_stripe(keys, STRIPE_BITS, places, bounds)
+                object.__setattr__(moments, 'stripes', bounds)
+            size_m, arrays = self.voxel_size_m, moments.arrays
+            largest = pack_moments(keys, sums, places, origin, size_m, arrays)
             if largest <= FULL:
                 return moments
             part = max(FULL, num_points * FULL // (2 * largest))  # half full on average

@@ -9,7 +9,7 @@ written, so the slab may double.
 
 HashTable: the arrays of kernels/hashing.py. Kernels stop when there is no room; the caller makes
 room and calls again. The table grows by segments, each of which splits separately, so that no step
-is long.
+is long. Rows and segments are given to the stripes of a table in groups.
 """
 
 from __future__ import annotations
@@ -112,6 +112,13 @@ def _anonymous(num_bytes: int) -> mmap.mmap:
     return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
 
 
+SEGMENTS = 16
+"""Segments that a stripe is given at once: how full they are, lies in a cache line of its own."""
+
+ROWS = 8192
+"""Rows that a stripe is given at once, so that those of two stripes share no cache line."""
+
+
 class HashTable:
     """
     Hash table from key to row of a slab.
@@ -120,23 +127,32 @@ class HashTable:
     ----------
     max_depth : int
         The directory has at most 2^max_depth entries.
+    stripe_bits : int
+        There are 2^stripe_bits stripes; see kernels/hashing.py.
 
     Attributes
     ----------
-    state : (STATE,) int64
+    state : (S,) int64
         The scalars that kernels write; see kernels/hashing.py.
 
     """
 
-    def __init__(self, max_depth: int) -> None:
+    def __init__(self, max_depth: int, stripe_bits: int = 0) -> None:
         self._max_depth = max_depth
-        self._buckets = Slab(1, hashing.SEGMENT)
-        self._directory: npt.NDArray[np.int32] = np.zeros(1, np.int32)
-        self._held: npt.NDArray[np.int32] = np.zeros(1, np.int32)
-        self._local_depth: npt.NDArray[np.int8] = np.zeros(1, np.int8)
-        self.state = np.zeros(hashing.STATE, np.int64)
-        self.state[hashing.FREE_ROW] = -1
-        self.state[hashing.SEGMENTS] = 1
+        stripes = 1 << stripe_bits  # each has a segment at the start
+        num_segments = stripes * SEGMENTS
+        first = np.arange(0, num_segments, SEGMENTS, np.int32)
+        self._buckets = Slab(num_segments, hashing.SEGMENT)
+        self._directory: npt.NDArray[np.int32] = first
+        self._held: npt.NDArray[np.int32] = np.zeros(num_segments, np.int32)
+        self._local_depth: npt.NDArray[np.int8] = np.full(num_segments, stripe_bits, np.int8)
+        self._rows_given, self._segments_given = 0, num_segments
+        self.state = np.zeros((1 + stripes) * hashing.LINE, np.int64)
+        self.state[hashing.DEPTH] = self.state[hashing.STRIPING] = stripe_bits
+        for stripe, segment in enumerate(first.tolist()):
+            self._set(hashing.FREE_ROW, stripe, -1)
+            self._set(hashing.NEXT_SEGMENT, stripe, segment + 1)
+            self._set(hashing.END_SEGMENT, stripe, segment + SEGMENTS)
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
@@ -144,25 +160,64 @@ class HashTable:
         buckets = self._buckets.array.reshape(-1)
         return self._directory, buckets, self._held, self._local_depth
 
+    def of_stripes(self, entry: int) -> list[int]:
+        """Return an entry of the state for each stripe."""
+        found: list[int] = self.state[entry :: hashing.LINE].tolist()
+        return found
+
+    def _set(self, entry: int, stripe: int, value: int) -> None:
+        self.state[entry + stripe * hashing.LINE] = value
+
     @property
     def num_keys(self) -> int:
         """Number of keys in the table."""
-        return int(self.state[hashing.VOXELS])
+        return sum(self.of_stripes(hashing.VOXELS))
 
     @property
     def rows_used(self) -> int:
-        """Number of rows of the slab ever used; later rows are untouched."""
-        return int(self.state[hashing.ROWS_USED])
+        """Number of rows of the slab from which on none was ever used."""
+        return max(self.of_stripes(hashing.NEXT_ROW))
+
+    @property
+    def num_rows_used(self) -> int:
+        """Number of rows of the slab ever used."""
+        return self._rows_given - self._num_left(hashing.NEXT_ROW, hashing.END_ROW)
 
     @property
     def nbytes(self) -> int:
         """Bytes in use."""
-        buckets = int(self.state[hashing.SEGMENTS]) * hashing.SEGMENT * 8
+        num_left = self._num_left(hashing.NEXT_SEGMENT, hashing.END_SEGMENT)
+        buckets = (self._segments_given - num_left) * hashing.SEGMENT * 8
         return buckets + self._directory.nbytes + self._held.nbytes
 
-    def lacks_row(self, num_rows: int) -> bool:
-        """Return whether a slab of num_rows rows has no free row for a new key."""
-        return bool(self.state[hashing.FREE_ROW] < 0 and self.rows_used == num_rows)
+    def _num_left(self, following: int, end: int) -> int:
+        """Return how many rows or segments the stripes were given and have not used."""
+        return sum(self.of_stripes(end)) - sum(self.of_stripes(following))
+
+    def _without(self, following: int, end: int) -> list[int]:
+        """Return the stripes that have used all rows or segments that they were given."""
+        lefts = zip(self.of_stripes(following), self.of_stripes(end), strict=True)
+        return [stripe for stripe, (first, last) in enumerate(lefts) if first == last]
+
+    def _short_of_rows(self) -> list[int]:
+        """Return the stripes that have no row for a new key."""
+        free = self.of_stripes(hashing.FREE_ROW)
+        used_up = self._without(hashing.NEXT_ROW, hashing.END_ROW)
+        return [stripe for stripe in used_up if free[stripe] < 0]
+
+    def lacks_row(self) -> bool:
+        """Return whether a stripe has no row for a new key."""
+        return bool(self._short_of_rows())
+
+    def give_rows(self, num_rows: int) -> slice:
+        """Give rows of a slab of num_rows to the stripes that have none; return those, if any."""
+        before = self._rows_given
+        for stripe in self._short_of_rows():
+            end = min(self._rows_given + ROWS, num_rows)
+            self._set(hashing.NEXT_ROW, stripe, self._rows_given)
+            self._set(hashing.END_ROW, stripe, end)
+            self._rows_given = end
+        return slice(before, self._rows_given)
 
     def grow(self) -> None:
         """
@@ -175,13 +230,23 @@ class HashTable:
 
         """
         num_segments = len(self._held)
-        if self.state[hashing.SEGMENTS] == num_segments:
+        used_up = self._without(hashing.NEXT_SEGMENT, hashing.END_SEGMENT)
+        if not used_up:
+            self._double_directory()
+        elif self._segments_given == num_segments:
             self._buckets.grow(2 * num_segments)
             held = np.append(self._held, np.zeros_like(self._held))
             local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
             self._held, self._local_depth = held, local_depth  # both or none: of one length
-        elif (depth := int(self.state[hashing.DEPTH])) < self._max_depth:
-            directory = np.repeat(self._directory, 2)
-            self.state[hashing.DEPTH], self._directory = depth + 1, directory
         else:
+            end = self._segments_given + SEGMENTS
+            self._set(hashing.NEXT_SEGMENT, used_up[0], self._segments_given)
+            self._set(hashing.END_SEGMENT, used_up[0], end)
+            self._segments_given = end
+
+    def _double_directory(self) -> None:
+        depth = int(self.state[hashing.DEPTH])
+        if depth == self._max_depth:
             raise MapLimitError(f'{self.num_keys} keys: the hash table is full')
+        directory = np.repeat(self._directory, 2)
+        self.state[hashing.DEPTH], self._directory = depth + 1, directory

@@ -118,11 +118,10 @@ class SurfelMap(MomentMap):
             raise ValueError(f'voxel_size_m: {voxel_size_m}, expected positive and finite')
         if as_whole('threads', threads) < 1:
             raise ValueError(f'threads: {threads}, expected 1 or more')
-        super().__init__(float(voxel_size_m), columns, level, origin_m)
+        super().__init__(float(voxel_size_m), columns, level, origin_m, threads)
         self._reported = self.version
-        self._threads = threads
         self._warned_of_units = False
-        self._reducer = Reducer(self.voxel_size_m, columns)
+        self._reducer = Reducer(self.voxel_size_m, columns, by_stripe=threads > 1)
 
     def add(
         self,
@@ -357,11 +356,8 @@ class SurfelMap(MomentMap):
 
     def copy(self) -> SurfelMap:
         """Return an independent copy."""
-        other = SurfelMap(
-            self.voxel_size_m, columns=self.columns, level=self.level, origin_m=self.origin_m
-        )
-        other.insert(self.moments())
-        return other
+        settings = {'columns': self.columns, 'level': self.level, 'threads': self._threads}
+        return _rebuilt(self.voxel_size_m, settings, self.origin_m, self.moments())
 
     @classmethod
     def load(cls, path: str | Path) -> SurfelMap:

@@ -5,7 +5,8 @@ VoxelTable: the memory of a map, a row of integers for each voxel, found by hash
 
 Owns the arrays that the kernels work on and enlarges them when a kernel has no room. Rows and
 buckets grow without being copied and a full segment of the hash table splits separately, so that
-no scan waits while the whole map is rehashed.
+no scan waits while the whole map is rehashed. Divides a scan into parts that threads change at the
+same time.
 
 ChangeLog: the rows that the latest versions changed. Without it, asking for changes would look at
 the stamp of every row. It holds at most a quarter of the rows: beyond that, reading all stamps in
@@ -18,8 +19,9 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from itertools import takewhile
-from typing import Any
+from collections.abc import Callable
+from itertools import pairwise, takewhile
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -37,15 +39,24 @@ from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
     find_rows,
     remove_moments,
+    restore_moments,
 )
-from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.moments import ScanMoments, STRIPE_BITS
 from surfel_mapper.mapping.storage import HashTable, Slab
+from surfel_mapper.threads import share_parts
 
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries, enough for 6e9 voxels."""
 
 UNDO_BYTES = 64
 """Memory that undoing takes, bytes a voxel: it is allocated before, and freed for it."""
+
+Part = tuple[int, int, int]
+"""The first voxel of a part of a scan, the one after its last, and a stripe that counts for it."""
+
+NO_PART = 0, 0, 0
+
+Result = TypeVar('Result')
 
 LEAST = 1 << 18
 """Minimum capacity of the change log, rows; 1 MiB."""
@@ -59,6 +70,8 @@ class VoxelTable:
     ----------
     num_channels : int
         Number of channels that are summed beside the moments, in rows of their own.
+    threads : int
+        Number of threads that share the work.
 
     Attributes
     ----------
@@ -67,30 +80,31 @@ class VoxelTable:
 
     """
 
-    def __init__(self, num_channels: int = 0) -> None:
+    def __init__(self, num_channels: int = 0, threads: int = 1) -> None:
         self.rows = Slab(1024, layout.ROW)
         self._stamps = Slab(1024, 1, np.uint32)
         self._version = 0
         self._channels = Slab(1024, num_channels) if num_channels else None
-        self._hash = HashTable(MAX_DEPTH)
+        self._hash = HashTable(MAX_DEPTH, STRIPE_BITS if threads > 1 else 0)
+        self._threads = threads
         self._state = self._hash.state
 
     @property
     def num_voxels(self) -> int:
         """Number of voxels that hold at least one point."""
-        return int(self._state[hashing.VOXELS])
+        return self._hash.num_keys
 
     @property
     def num_points(self) -> int:
         """Number of points of all voxels."""
-        return int(self._state[hashing.POINTS])
+        return sum(self._hash.of_stripes(hashing.POINTS))
 
     @property
     def nbytes(self) -> int:
         """Bytes in use for voxels and their hash table."""
         slabs = (self.rows, self._stamps, self._channels)
         row_bytes = sum(slab.row_bytes for slab in slabs if slab)
-        return self._hash.rows_used * row_bytes + self._hash.nbytes
+        return self._hash.num_rows_used * row_bytes + self._hash.nbytes
 
     def add(self, moments: ScanMoments, version: int) -> npt.NDArray[np.int32]:
         """
@@ -146,21 +160,19 @@ class VoxelTable:
             rows = self.find(moments.key)
         else:
             rows = np.array(moments.rows, np.int32)  # hints, confirmed by the kernel
-        fallen: npt.NDArray[np.int32] = np.empty((len(moments), 3), np.int32)
-        undo_bytes = moments.nbytes + len(moments) * UNDO_BYTES if self._channels else 0
-        reserve = np.empty(undo_bytes, np.uint8)
-        num_points = self.num_points
+        before = self._hash.of_stripes(hashing.POINTS)
+        if self._channels or moments.stripes is not None:  # compiles it, while there is memory
+            self._restore(moments, version, rows, NO_PART)
         try:
-            missing, num_fallen = self._subtract(moments, version, rows, min_points, fallen)
-            fallen = fallen[:num_fallen]
-            if self._channels and missing < 0:
+            missing, fallen = self._subtract(moments, version, rows, min_points)
+            if missing >= 0:
+                self._undo_subtract(moments, version, rows, before)
+            elif self._channels:
                 self._channels.array[rows.astype(np.intp)] -= moments.channels
         except BaseException:
-            del reserve
-            if self.num_points < num_points:
-                self._undo_subtract(moments, version)
+            self._undo_subtract(moments, version, rows, before)
             raise
-        return int(missing), rows, fallen
+        return missing, rows, fallen
 
     def checked(self, rows: npt.ArrayLike) -> npt.NDArray[np.int32]:
         """Return rows (K,) as the kernels take them; IndexError if the table does not have one."""
@@ -233,44 +245,120 @@ class VoxelTable:
         num = rows_held(self.rows.array, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
+    def _parts(self, moments: ScanMoments) -> list[Part]:
+        """Return the parts of the voxels that threads may change at the same time."""
+        if self._threads == 1 or moments.stripes is None:
+            return [(0, len(moments), 0)]
+        return [(*ends, stripe) for stripe, ends in enumerate(pairwise(moments.stripes.tolist()))]
+
     def _add(self, moments: ScanMoments, version: int, found: npt.NDArray[np.int32]) -> None:
         """Add moments without channels; write the row of each voxel to found once it is added."""
-        arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)
+        arrays, view_is_sum, stamp = moments.arrays, moments.view_is_sum, stamp_of(version)
         self._version = version
-        done = 0
-        while done < num:
-            done = add_moments(
-                arrays,
-                view_is_sum,
-                self.rows.array,
-                self._stamps.array.reshape(-1),
-                self._hash.arrays,
-                self._state,
-                stamp_of(version),
-                done,
-                found,
+        left = self._parts(moments)
+
+        def add(part: Part) -> int:
+            rows, stamps = self.rows.array, self._stamps.array.reshape(-1)
+            table, state = self._hash.arrays, self._state
+            done: int = add_moments(
+                arrays, view_is_sum, rows, stamps, table, state, stamp, part, found
             )
-            if done < num:
+            return done
+
+        while left:
+            done = self._each(add, left)
+            rest = [(end, *part[1:]) for part, end in zip(left, done, strict=True)]
+            left = [part for part in rest if part[0] < part[1]]
+            if left:
                 self._make_room()
 
     def _undo_add(self, moments: ScanMoments, version: int, found: npt.NDArray[np.int32]) -> None:
         """Subtract the moments that an incomplete ``add`` added; channels are added last."""
-        num = bisect_left(found, True, key=lambda row: row < 0)
-        if num:
-            fallen = np.empty((num, 3), np.int32)
-            self._subtract(moments.select(slice(num)), version, found[:num], 1, fallen)
+        for start, stop, _ in self._parts(moments):
+            end = bisect_left(found, True, start, stop, key=lambda row: row < 0)
+            if end > start:
+                added = slice(start, end)
+                self._subtract(moments.select(added), version, found[added], 1)
 
     def _subtract(
         self,
         moments: ScanMoments,
         version: int,
-        rows: npt.NDArray[np.int32],
+        found: npt.NDArray[np.int32],
         min_points: int,
-        fallen: npt.NDArray[np.int32],
-    ) -> tuple[int, int]:
-        """Subtract moments without channels; see remove_moments."""
+    ) -> tuple[int, npt.NDArray[np.int32]]:
+        """
+        Subtract moments without channels; see remove_moments.
+
+        Of several parts those that have all their voxels are subtracted even if another has not.
+        """
+        arrays, view_is_sum, stamp = moments.arrays, moments.view_is_sum, stamp_of(version)
         self._version = version
-        missing, num_fallen = remove_moments(
+        parts = self._parts(moments)
+        least = max(min_points, 1)
+        fallen: npt.NDArray[np.int32] = np.empty((len(moments), 3), np.int32)
+
+        def subtract(part: Part) -> tuple[int, int]:
+            rows, stamps = self.rows.array, self._stamps.array.reshape(-1)
+            table, state = self._hash.arrays, self._state
+            ends: tuple[int, int] = remove_moments(
+                arrays, view_is_sum, rows, stamps, table, state, stamp, part, found, least, fallen
+            )
+            return ends
+
+        ends = self._each(subtract, parts)
+        if len(parts) == 1:
+            return ends[0][0], fallen[: ends[0][1]]
+        missing = [voxel for voxel, _ in ends if voxel >= 0]
+        fell = [fallen[part[0] :][:num] for part, (_, num) in zip(parts, ends, strict=True)]
+        return missing[0] if missing else -1, np.concatenate(fell)
+
+    def _each(self, work: Callable[[Part], Result], parts: list[Part]) -> list[Result]:
+        """Do the work on each part, with the help of idle threads; return the results."""
+        if len(parts) == 1:
+            return [work(parts[0])]
+        results: dict[int, Result] = {}
+
+        def do(number: int) -> None:
+            results[number] = work(parts[number])
+
+        share_parts(do, range(len(parts)), self._threads)
+        return [results[number] for number in range(len(parts))]
+
+    def _undo_subtract(
+        self,
+        moments: ScanMoments,
+        version: int,
+        found: npt.NDArray[np.int32],
+        before: list[int],
+    ) -> None:
+        """
+        Add the moments that an incomplete ``remove`` subtracted; channels are subtracted last.
+
+        Parameters
+        ----------
+        moments, version
+            As for ``remove``.
+        found : (K,) int32
+            Rows of the voxels.
+        before : list of int
+            Number of points that each stripe had counted before.
+
+        """
+        now = self._hash.of_stripes(hashing.POINTS)
+        for part in self._parts(moments):
+            if now[part[2]] < before[part[2]]:
+                self._restore(moments, version, found, part)
+
+    def _restore(
+        self,
+        moments: ScanMoments,
+        version: int,
+        found: npt.NDArray[np.int32],
+        part: Part,
+    ) -> None:
+        """Add the moments of a part again that was subtracted, without channels."""
+        restore_moments(
             moments.arrays,
             moments.view_is_sum,
             self.rows.array,
@@ -278,32 +366,23 @@ class VoxelTable:
             self._hash.arrays,
             self._state,
             stamp_of(version),
-            rows,
-            max(min_points, 1),
-            fallen,
+            part,
+            found,
         )
-        return missing, num_fallen
-
-    def _undo_subtract(self, moments: ScanMoments, version: int) -> None:
-        """
-        Add the moments that an incomplete ``remove`` subtracted; channels are subtracted last.
-
-        The row that was emptied last is taken first: in reverse order each voxel gets its own row,
-        which has its channels.
-        """
-        reverse = moments.select(np.arange(len(moments))[::-1])
-        self._add(reverse, version, np.empty(len(moments), np.int32))
 
     def _make_room(self) -> None:
-        """Enlarge the array that had no room for a new voxel."""
+        """Give rows to the stripes, or enlarge the array that had no room for a new voxel."""
+        if not self._hash.lacks_row():
+            self._hash.grow()
+            return
         num_rows = len(self.rows.array)
-        if self._hash.lacks_row(num_rows):
+        given = self._hash.give_rows(num_rows)
+        self._stamps.array[given] = layout.EMPTIED
+        if given.start == given.stop:
             self._stamps.grow(2 * num_rows)
             if self._channels:
                 self._channels.grow(2 * num_rows)
             self.rows.grow(2 * num_rows)  # last: the rows tell how many there are
-        else:
-            self._hash.grow()
 
 
 class ChangeLog:
@@ -331,6 +410,15 @@ class ChangeLog:
         while self._num_rows > max(LEAST, num_voxels // 4):
             self._start, forgotten = self._entries.popleft()
             self._num_rows -= len(forgotten)
+
+    def forget(self, version: int) -> None:
+        """
+        Forget all versions up to one that failed and was undone.
+
+        Undoing stamps the rows anew, so that those of earlier versions cannot be told apart.
+        """
+        self._entries.clear()
+        self._num_rows, self._start = 0, version
 
     def since(
         self, version: int, table: VoxelTable, min_points: int

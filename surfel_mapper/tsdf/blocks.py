@@ -565,7 +565,9 @@ class BlockMap(BlockArrays):
 
     def _make_room(self) -> None:
         """Enlarge the rows or the hash table, whichever is full."""
-        if self._hash.lacks_row(len(self.head)):
-            self._grow()
-        else:
+        if not self._hash.lacks_row():
             self._hash.grow()
+            return
+        given = self._hash.give_rows(len(self.head))
+        if given.start == given.stop:
+            self._grow()

@@ -29,11 +29,13 @@ import traceback
 import numpy as np
 import pytest
 
+from surfel_mapper import threads as threads_module
 from surfel_mapper.errors import FileFormatError, MapLimitError, SurfelMapperError
 from surfel_mapper.files import atomic
 from surfel_mapper.files.map_state import load_map, save_map
 from surfel_mapper.kernels import hashing
-from surfel_mapper.mapping.storage import HashTable
+from surfel_mapper.mapping import reducer
+from surfel_mapper.mapping.storage import HashTable, SEGMENTS
 from surfel_mapper.offline.replay import replay
 from test.bags import recorded
 from test.fuzz.writers import made_columns, map_of, Steps, WRITERS, Written
@@ -121,6 +123,10 @@ def remove(surfel_map, moments, path):
     surfel_map.remove(KEPT[surfel_map.num_voxels])
 
 
+def remove_in_parts(surfel_map, moments, path):
+    surfel_map.remove(moments)
+
+
 def load(surfel_map, moments, path):
     loaded, _ = load_map(path)
     assert loaded.digest() == surfel_map.digest()
@@ -138,15 +144,24 @@ def reduce(surfel_map, moments, path):
 
 
 @pytest.mark.parametrize('columns', [(), ('intensity', 'rgb')], ids=['plain', 'columns'])
-@pytest.mark.parametrize('operation', [insert, remove, load, read, reduce])
+@pytest.mark.parametrize('threads', [1, 2])
+@pytest.mark.parametrize('operation', [insert, remove, remove_in_parts, load, read, reduce])
 def test_an_allocation_that_fails_leaves_the_map_before_or_after(
-    testcapi, tmp_path, operation, columns
+    testcapi, tmp_path, monkeypatch, operation, threads, columns
 ):
-    surfel_map, other, path = map_of(1, columns), map_of(4, columns), tmp_path / 'a.npz'
+    if threads == 2 and operation not in (insert, remove_in_parts):
+        pytest.skip('one thread does the work')
+    monkeypatch.setattr(reducer, 'LEAST_SHARED', 2)
+    monkeypatch.setattr(threads_module, 'pool', lambda _: None)  # a fork has no other thread
+    surfel_map, other = map_of(1, columns, threads), map_of(4, columns)
+    path = tmp_path / 'a.npz'
     surfel_map.merge(other)
     save_map(path, surfel_map)
     points = np.random.default_rng(3).uniform(-9.0, 9.0, (500, 3))
     moments = surfel_map.reduce(points, columns=made_columns(points))
+    assert (moments.stripes is not None) == (threads == 2)
+    if operation is remove_in_parts:
+        surfel_map.insert(moments)
     KEPT[surfel_map.num_voxels] = other.moments()
     after = surfel_map.copy()
     operation(after, moments, path)
@@ -232,7 +247,8 @@ def test_a_hash_table_that_cannot_grow_keeps_arrays_that_fit_together(testcapi):
         failures = 0
         for number in range(200):
             table = HashTable(max_depth=24)
-            for _ in range(2):  # the first time the segments grow, then the directory
+            for used in (1, SEGMENTS):  # the first time the directory grows, then the segments
+                table.state[hashing.NEXT_SEGMENT] = used
                 testcapi.set_nomemory(number, number + 1)
                 try:
                     table.grow()

@@ -84,8 +84,8 @@ class StepFile:
         return getattr(self._file, name)
 
 
-def map_of(seed, columns=()):
-    surfel_map = SurfelMap(0.5, columns=columns)
+def map_of(seed, columns=(), threads=1):
+    surfel_map = SurfelMap(0.5, columns=columns, threads=threads)
     points = np.random.default_rng(seed).uniform(-2.0, 2.0, (50, 3))
     surfel_map.add(points, columns=made_columns(points))
     return surfel_map

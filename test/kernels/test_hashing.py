@@ -13,14 +13,15 @@ import pytest
 from surfel_mapper.kernels.hashing import (
     BUCKET,
     DEPTH,
+    END_SEGMENT,
     find_row,
     FULLEST,
     hash_key,
     insert_row,
     is_full,
+    NEXT_SEGMENT,
     remove_row,
     SEGMENT,
-    SEGMENTS,
     split_segment,
     STATE,
 )
@@ -39,7 +40,7 @@ class Owner:
         self.held = np.zeros(num_segments, np.int32)
         self.local_depth = np.zeros(num_segments, np.int8)
         self.state = np.zeros(STATE, np.int64)
-        self.state[SEGMENTS] = 1
+        self.state[NEXT_SEGMENT], self.state[END_SEGMENT] = 1, num_segments
         self.expected = {}
 
     @property
@@ -53,7 +54,7 @@ class Owner:
         hashed = self.call(hash_key, np.int64(key))
         while self.call(is_full, hashed, self.directory, self.held, self.state[DEPTH]):
             if not self.call(split_segment, hashed, self.table, self.state):
-                assert self.state[SEGMENTS] < len(self.held), 'the test has too few segments'
+                assert self.state[NEXT_SEGMENT] < len(self.held), 'the test has too few segments'
                 self.directory = np.repeat(self.directory, 2)
                 self.state[DEPTH] += 1
         self.rows[row, KEY] = key
@@ -67,7 +68,7 @@ class Owner:
 
     def check(self):
         """Check the invariants of the table: a search reaches every entry."""
-        depth, num_segments = int(self.state[DEPTH]), int(self.state[SEGMENTS])
+        depth, num_segments = int(self.state[DEPTH]), int(self.state[NEXT_SEGMENT])
         assert len(self.directory) == 2**depth
         buckets = self.buckets.reshape(-1, SEGMENT)
         assert not buckets[num_segments:].any()
@@ -150,7 +151,7 @@ def test_neighbouring_voxels_fill_the_table_evenly():
     keys = ((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]).tolist()
     for row, key in enumerate(keys):
         owner.insert(key, row)
-    num_segments = int(owner.state[SEGMENTS])
+    num_segments = int(owner.state[NEXT_SEGMENT])
     assert len(keys) / (num_segments * SEGMENT) > 0.4  # even halves: from 1/4 to 3/4 full
     assert owner.state[DEPTH] <= np.log2(num_segments) + 2
 
@@ -170,7 +171,7 @@ def test_a_segment_does_not_split_without_room(call):
     owner.state[DEPTH] += 1
     assert call(split_segment, hashed, owner.table, owner.state)
     owner.check()
-    assert owner.state[SEGMENTS] == 2
+    assert owner.state[NEXT_SEGMENT] == 2
     assert not call(split_segment, hashed, owner.table, owner.state)  # no third segment
 
 

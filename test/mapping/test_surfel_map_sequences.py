@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import NotInMapError
+from surfel_mapper.mapping import reducer
 from surfel_mapper.mapping import voxel_table as module
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.reference import add_moments, as_twin, digest, scan_moments
@@ -49,16 +50,18 @@ class MapBesideTwin(RuleBasedStateMachine):
         size_m=st.sampled_from([0.5, 0.2, 1.0 / 3.0]),
         offset_m=st.sampled_from([0.0, 1e4, -1e5]),
         logged=st.sampled_from([0, 3, 10, 2**18]),
+        threads=st.sampled_from([1, 2]),
     )
-    def make(self, size_m, offset_m, logged):
-        self.saved, module.LEAST = module.LEAST, logged
-        self.map, self.twin = SurfelMap(size_m), {}
+    def make(self, size_m, offset_m, logged, threads):
+        self.saved = module.LEAST, reducer.LEAST_SHARED
+        module.LEAST, reducer.LEAST_SHARED = logged, 2
+        self.map, self.twin = SurfelMap(size_m, threads=threads), {}
         self.size_m, self.offset_m = size_m, offset_m
         self.live, self.gone, self.touched, self.reported = [], [], {}, 0
 
     def teardown(self):
         if hasattr(self, 'saved'):
-            module.LEAST = self.saved
+            module.LEAST, reducer.LEAST_SHARED = self.saved
             self.check_against_the_live_scans_alone()
 
     def place(self, fractions, dtype=np.float64):

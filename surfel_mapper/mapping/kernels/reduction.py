@@ -25,6 +25,7 @@ from surfel_mapper.kernels.grouping import (
     home,
     number_runs,
 )
+from surfel_mapper.kernels.hashing import hash_key, stripe_of
 from surfel_mapper.kernels.lanes import (
     load_sums,
     masked_sum,
@@ -151,53 +152,84 @@ def reason(x, y, z, range_sq):
     return TOO_FAR if distance_sq > range_sq[1] else BEYOND
 
 
+@kernel()
+def places_by_stripe(keys, stripe_bits, places, bounds):
+    """
+    Find the places of the voxels of a scan by stripe, those of one in the order of the scan.
+
+    keys    (K,) int64
+    places  (K,) int32, out
+    bounds  (2^stripe_bits + 1,) int64, zeros, out: the first place of each stripe, and K
+    """
+    num = U(len(keys))
+    ends = np.zeros(len(bounds), np.int64)
+    for voxel in range(num):
+        stripe = stripe_of(hash_key(keys[voxel]), stripe_bits)
+        places[voxel] = stripe
+        ends[U(stripe + 1)] += 1
+    for stripe in range(1, len(bounds)):
+        ends[stripe] += ends[stripe - 1]
+        bounds[stripe] = ends[stripe]
+    for voxel in range(num):
+        stripe = U(places[voxel])
+        places[voxel] = ends[stripe]
+        ends[stripe] += 1
+
+
 @kernel(error_model='numpy')
-def pack_moments(keys, sums, origin, voxel_size, moments):
+def pack_moments(keys, sums, places, origin, voxel_size, moments):
     """
     Write the moments of a scan; return the largest count.
 
     keys        (K,) int64, as reduce_points leaves them
     sums        (K, WORDS) int64
+    places      (K,) int32, where the voxels are written; (0,): in their order
     origin      (3,) float64, the sensor in the map frame, m; nan if unknown
     voxel_size  float64, m
     moments     key (K,) int64, count (K,) int32, total (K, 3) int32, product (K, 6) int64,
                 view (K, 3) int16, out
     """
     key, count, total, product, view = moments
-    key[:] = keys
-    look_back(keys, origin, voxel_size, view)
-    return unpack_sums(sums, count, total, product)
+    if len(places):
+        for row in range(U(len(places))):
+            key[U(places[row])] = keys[row]
+    else:
+        key[:] = keys
+    look_back(key, origin, voxel_size, view)
+    return unpack_sums(sums, places, count, total, product)
 
 
 @part()
-def unpack_sums(sums, count, total, product):
+def unpack_sums(sums, places, count, total, product):
     """
     Unpack the sums of a scan, about the centres of the voxels; return the largest count.
 
     sums     (K, WORDS) int64, as reduce_points leaves them
+    places   (K,) int32, where they are written; (0,): in their order
     count    (K,) int32, out
     total    (K, 3) int32, out
     product  (K, 6) int64, out
     """
     largest = np.int64(0)
-    for row in range(len(sums)):
+    for row in range(U(len(sums))):
+        at = U(places[row]) if len(places) else row
         num = sums[row, 0] >> COUNT_BITS
         half = HALF * num
         x = sums[row, 0] & ((1 << COUNT_BITS) - 1)
         y = sums[row, 1] & ((1 << HIGH_BITS) - 1)
         z = (sums[row, 1] >> HIGH_BITS) & ((1 << HIGH_BITS) - 1)
         largest = max(largest, num)
-        count[row] = num
-        total[row, 0] = x - half
-        total[row, 1] = y - half
-        total[row, 2] = z - half
+        count[at] = num
+        total[at, 0] = x - half
+        total[at, 1] = y - half
+        total[at, 2] = z - half
         # (x - h)(y - h) = xy - h (x + y - h), summed
-        product[row, 0] = sums[row, 2] - HALF * (x + x - half)
-        product[row, 1] = sums[row, 3] - HALF * (x + y - half)
-        product[row, 2] = sums[row, 4] - HALF * (x + z - half)
-        product[row, 3] = sums[row, 5] - HALF * (y + y - half)
-        product[row, 4] = sums[row, 6] - HALF * (y + z - half)
-        product[row, 5] = sums[row, 7] - HALF * (z + z - half)
+        product[at, 0] = sums[row, 2] - HALF * (x + x - half)
+        product[at, 1] = sums[row, 3] - HALF * (x + y - half)
+        product[at, 2] = sums[row, 4] - HALF * (x + z - half)
+        product[at, 3] = sums[row, 5] - HALF * (y + y - half)
+        product[at, 4] = sums[row, 6] - HALF * (y + z - half)
+        product[at, 5] = sums[row, 7] - HALF * (z + z - half)
     return largest
 
 

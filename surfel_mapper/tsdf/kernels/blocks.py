@@ -12,13 +12,14 @@ import numpy as np
 
 from surfel_mapper.kernels.hashing import (
     DEPTH,
+    END_ROW,
     find_row,
     FREE_ROW,
     hash_key,
     insert_row,
     makes_room,
+    NEXT_ROW,
     remove_row,
-    ROWS_USED,
     VOXELS,
 )
 from surfel_mapper.kernels.layout import KEY
@@ -81,9 +82,9 @@ def place_blocks(keys, head, table, state, limit, start, rows):
             row = state[FREE_ROW]
             if row >= 0:
                 state[FREE_ROW] = head[row, KEY]
-            elif state[ROWS_USED] < len(head):
-                row = state[ROWS_USED]
-                state[ROWS_USED] = row + 1
+            elif state[NEXT_ROW] < state[END_ROW]:
+                row = state[NEXT_ROW]
+                state[NEXT_ROW] = row + 1
             else:
                 return place
             head[row, KEY] = key

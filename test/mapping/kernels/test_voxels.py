@@ -15,6 +15,7 @@ from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
     find_rows,
     remove_moments,
+    restore_moments,
 )
 from surfel_mapper.mapping.moments import pack_keys, unpack_keys
 from test import reference
@@ -40,7 +41,8 @@ class Memory:
         )
         self.state = np.zeros(hashing.STATE, np.int64)
         self.state[hashing.FREE_ROW] = -1
-        self.state[hashing.SEGMENTS] = 1
+        self.state[hashing.END_ROW] = num_rows
+        self.state[hashing.NEXT_SEGMENT], self.state[hashing.END_SEGMENT] = 1, segments
 
     def add(self, moments, version, start=0, weight=1):
         """Return the number of rows done, and the changed rows."""
@@ -48,7 +50,7 @@ class Memory:
         done = self.call(
             add_moments,
             *(moments, weight, self.rows, self.stamps, self.table, self.state),
-            *(2 * version, start, changed),
+            *(2 * version, (start, len(moments[0]), 0), changed),
         )
         return done, changed[start:done].tolist()
 
@@ -64,7 +66,7 @@ class Memory:
         missing, num = self.call(
             remove_moments,
             *(moments, weight, self.rows, self.stamps, self.table, self.state),
-            *(2 * version, found, min_points, fallen),
+            *(2 * version, (0, len(moments[0]), 0), found, min_points, fallen),
         )
         if missing < 0:
             empty = [unpacked(row)[0] == 0 for row in self.rows[found]]
@@ -72,6 +74,14 @@ class Memory:
                 self.stamps[found], 2 * version + EMPTIED * np.array(empty)
             )
         return missing, list(map(tuple, fallen[:num].tolist()))
+
+    def restore(self, moments, version, found):
+        """Undo a removal."""
+        self.call(
+            restore_moments,
+            *(moments, 1, self.rows, self.stamps, self.table, self.state),
+            *(2 * version, (0, len(moments[0]), 0), found),
+        )
 
     def content(self):
         """Return the content of the table as a dict."""
@@ -154,6 +164,7 @@ def test_adding_stops_without_room_and_resumes(call):
     assert done == len(twin) - 40
     memory.rows = np.concatenate([memory.rows, np.full((40, ROW), -5)])
     memory.stamps = np.concatenate([memory.stamps, np.full(40, 5, np.uint32)])
+    memory.state[hashing.END_ROW] += 40
     done, changed = memory.add(moments, 2, start=done)
 
     reference.add_moments(expected, twin)
@@ -169,7 +180,7 @@ def test_adding_stops_if_a_segment_cannot_split(call):
     memory = Memory(call, 1000)
     done, _ = memory.add(arrays_of(twin), 1)
     assert done == hashing.FULLEST
-    assert memory.state[hashing.ROWS_USED] == hashing.FULLEST
+    assert memory.state[hashing.NEXT_ROW] == hashing.FULLEST
     directory, *rest = memory.table
     memory.table = (np.repeat(directory, 2), *rest)
     memory.state[hashing.DEPTH] += 1
@@ -182,11 +193,11 @@ def test_adding_stops_if_a_segment_cannot_split(call):
 def test_rows_of_voxels_that_left_are_the_first_to_be_used(call):
     memory, first, second = Memory(call, 400), some_moments(2), some_moments(3, num_points=30)
     memory.add(arrays_of(first), 1)
-    used = memory.state[hashing.ROWS_USED]
+    used = memory.state[hashing.NEXT_ROW]
     memory.remove(arrays_of(first), 2)
     assert all(unpacked(row)[0] == 0 for row in memory.rows[:used])
     _, changed = memory.add(arrays_of(second), 3)
-    assert memory.state[hashing.ROWS_USED] == used
+    assert memory.state[hashing.NEXT_ROW] == used
     assert max(changed) < used
     assert memory.content() == second
 
@@ -208,6 +219,25 @@ def test_a_failed_removal_names_the_voxel_and_changes_nothing(call, column):
     np.testing.assert_array_equal(memory.rows, rows)
     np.testing.assert_array_equal(memory.stamps, stamps)
     np.testing.assert_array_equal(memory.state, state)
+
+
+@both
+def test_a_removal_is_undone_in_the_same_rows(call):
+    memory, twin, other = Memory(call, 400), some_moments(4), some_moments(5)
+    memory.add(arrays_of(twin), 1)
+    memory.add(arrays_of({v: other[v] for v in list(other)[::2]}), 2)
+    memory.remove(arrays_of({v: other[v] for v in list(other)[::4]}), 3)  # leaves free rows
+    content, rows, state = memory.content(), memory.rows.copy(), memory.state.copy()
+    found = memory.find(arrays_of(twin)[0])
+    assert memory.remove(arrays_of(twin), 4, hints=found)[0] == -1
+    assert memory.content() != content
+    memory.restore(arrays_of(twin), 5, found)
+    assert memory.content() == content
+    np.testing.assert_array_equal(memory.state, state)
+    np.testing.assert_array_equal(memory.stamps[found], 10)
+    np.testing.assert_array_equal(memory.find(arrays_of(twin)[0]), found)
+    held = memory.find(arrays_of(content)[0])
+    np.testing.assert_array_equal(memory.rows[held], rows[held])
 
 
 @both
