@@ -16,7 +16,7 @@ error in its byte count (Fast DDS 2.14) delays repetitions by up to half a secon
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache
 import itertools
@@ -101,17 +101,32 @@ def share_parts(work: Callable[[Part], object], parts: Iterable[Part], threads: 
     errors its own is raised, or that of the first helper.
     """
     helpers = pool(threads)
+    helping: list[Future[None]] = []
     left = iter(parts)  # shared; Python's lock protects it
 
     def take_parts() -> None:
         for part in left:
             work(part)
 
-    helping = [helpers.submit(take_parts) for _ in range(threads - 1)] if helpers else []
     try:
+        if helpers is not None:
+            helping.extend(helpers.submit(take_parts) for _ in range(threads - 1))
         take_parts()
     finally:
         begun = [helper for helper in helping if not helper.cancel()]
-        wait(begun)
+        wait_for(begun)
     for helper in begun:
         helper.result()
+
+
+def wait_for(begun: list[Future[None]]) -> None:
+    """Wait for work of other threads, also if Ctrl-C interrupts it: callers undo what was done."""
+    interrupt = None
+    while True:
+        try:
+            wait(begun)
+            break
+        except KeyboardInterrupt as error:
+            interrupt = error
+    if interrupt is not None:
+        raise interrupt

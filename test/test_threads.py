@@ -8,9 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 import itertools
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from surfel_mapper.threads import (
     pool,
     real_time_threads,
     share,
+    share_parts,
     split,
     yield_to_others,
 )
@@ -50,6 +53,24 @@ def test_the_result_does_not_depend_on_the_number_of_threads(threads):
         for left, right in zip(*changed, strict=True):
             np.testing.assert_array_equal(left, right)
     assert several == one
+
+
+def test_parts_that_others_have_begun_are_done_before_an_interrupt_is_raised():
+    begun, done = threading.Event(), []
+
+    def work(part):
+        if threading.current_thread() is threading.main_thread():
+            begun.wait(30.0)
+            return
+        begun.set()
+        time.sleep(0.2)  # the main thread waits for this part by now
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        time.sleep(0.2)
+        done.append(part)
+
+    with pytest.raises(KeyboardInterrupt):
+        share_parts(work, range(2), threads=2)
+    assert len(done) == 1
 
 
 def test_every_row_is_in_one_part():

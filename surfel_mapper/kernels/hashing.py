@@ -231,12 +231,13 @@ def take_back(bucket, buckets):
 
 
 @part()
-def split_segment(hashed, table, state):
+def split_segment(hashed, table, state, entries):
     """
     Split the segment of a hash by the next bit of the hashes; return whether there was room.
 
-    hashed  int64, any hash of the segment
-    state   (STATE,) int64
+    hashed   int64, any hash of the segment
+    state    (STATE,) int64
+    entries  (SEGMENT,) int64, overwritten
 
     Without room for another segment, or if the directory would have to double, nothing changes
     and the result is False.
@@ -251,7 +252,6 @@ def split_segment(hashed, table, state):
         return False
     state[NEXT_SEGMENT + own] = new + 1
     local_depth[old] = local_depth[new] = bits + 1
-    entries = np.empty(SEGMENT, np.int64)
     for place in range(SEGMENT):
         entries[place] = buckets[old * SEGMENT + place]
         buckets[old * SEGMENT + place] = buckets[new * SEGMENT + place] = 0
@@ -269,11 +269,11 @@ def split_segment(hashed, table, state):
 
 
 @part()
-def makes_room(hashed, table, state):
+def makes_room(hashed, table, state, entries):
     """Split the segment of a hash until it has room for a row; return False if it cannot split."""
     directory, _, held, _ = table
     depth = state[DEPTH]
     while is_full(hashed, directory, held, depth):
-        if not split_segment(hashed, table, state):
+        if not split_segment(hashed, table, state, entries):
             return False
     return True

@@ -134,6 +134,8 @@ class HashTable:
     ----------
     state : (S,) int64
         The scalars that kernels write; see kernels/hashing.py.
+    rows_given : int
+        Number of rows of the slab that the stripes were given; later ones are untouched.
 
     """
 
@@ -146,13 +148,12 @@ class HashTable:
         self._directory: npt.NDArray[np.int32] = first
         self._held: npt.NDArray[np.int32] = np.zeros(num_segments, np.int32)
         self._local_depth: npt.NDArray[np.int8] = np.full(num_segments, stripe_bits, np.int8)
-        self._rows_given, self._segments_given = 0, num_segments
+        self.rows_given, self._segments_given = 0, num_segments
         self.state = np.zeros((1 + stripes) * hashing.LINE, np.int64)
         self.state[hashing.DEPTH] = self.state[hashing.STRIPING] = stripe_bits
         for stripe, segment in enumerate(first.tolist()):
-            self._set(hashing.FREE_ROW, stripe, -1)
-            self._set(hashing.NEXT_SEGMENT, stripe, segment + 1)
-            self._set(hashing.END_SEGMENT, stripe, segment + SEGMENTS)
+            self.state[hashing.FREE_ROW + stripe * hashing.LINE] = -1
+            self._give(hashing.NEXT_SEGMENT, stripe, segment + 1, segment + SEGMENTS)
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
@@ -165,8 +166,10 @@ class HashTable:
         found: list[int] = self.state[entry :: hashing.LINE].tolist()
         return found
 
-    def _set(self, entry: int, stripe: int, value: int) -> None:
-        self.state[entry + stripe * hashing.LINE] = value
+    def _give(self, entry: int, stripe: int, first: int, end: int) -> None:
+        """Give rows or segments to a stripe, in one step: Ctrl-C may come between two."""
+        at = entry + stripe * hashing.LINE
+        self.state[at : at + 2] = first, end
 
     @property
     def num_keys(self) -> int:
@@ -181,7 +184,7 @@ class HashTable:
     @property
     def num_rows_used(self) -> int:
         """Number of rows of the slab ever used."""
-        return self._rows_given - self._num_left(hashing.NEXT_ROW, hashing.END_ROW)
+        return self.rows_given - self._num_left(hashing.NEXT_ROW, hashing.END_ROW)
 
     @property
     def nbytes(self) -> int:
@@ -209,15 +212,14 @@ class HashTable:
         """Return whether a stripe has no row for a new key."""
         return bool(self._short_of_rows())
 
-    def give_rows(self, num_rows: int) -> slice:
-        """Give rows of a slab of num_rows to the stripes that have none; return those, if any."""
-        before = self._rows_given
+    def give_rows(self, num_rows: int) -> bool:
+        """Give rows of a slab of num_rows to the stripes without any; False if all are given."""
+        before = self.rows_given
         for stripe in self._short_of_rows():
-            end = min(self._rows_given + ROWS, num_rows)
-            self._set(hashing.NEXT_ROW, stripe, self._rows_given)
-            self._set(hashing.END_ROW, stripe, end)
-            self._rows_given = end
-        return slice(before, self._rows_given)
+            first, end = self.rows_given, min(self.rows_given + ROWS, num_rows)
+            self.rows_given = end  # first: rows may be lost, but not given twice
+            self._give(hashing.NEXT_ROW, stripe, first, end)
+        return self.rows_given > before
 
     def grow(self) -> None:
         """
@@ -239,10 +241,9 @@ class HashTable:
             local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
             self._held, self._local_depth = held, local_depth  # both or none: of one length
         else:
-            end = self._segments_given + SEGMENTS
-            self._set(hashing.NEXT_SEGMENT, used_up[0], self._segments_given)
-            self._set(hashing.END_SEGMENT, used_up[0], end)
-            self._segments_given = end
+            first = self._segments_given
+            self._segments_given = first + SEGMENTS
+            self._give(hashing.NEXT_SEGMENT, used_up[0], first, first + SEGMENTS)
 
     def _double_directory(self) -> None:
         depth = int(self.state[hashing.DEPTH])

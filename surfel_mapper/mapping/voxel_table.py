@@ -42,7 +42,7 @@ from surfel_mapper.mapping.kernels.voxels import (
     restore_moments,
 )
 from surfel_mapper.mapping.moments import ScanMoments, STRIPE_BITS
-from surfel_mapper.mapping.storage import HashTable, Slab
+from surfel_mapper.mapping.storage import HashTable, ROWS, Slab
 from surfel_mapper.threads import share_parts
 
 MAX_DEPTH = 24
@@ -87,6 +87,7 @@ class VoxelTable:
         self._channels = Slab(1024, num_channels) if num_channels else None
         self._hash = HashTable(MAX_DEPTH, STRIPE_BITS if threads > 1 else 0)
         self._threads = threads
+        self._undoable: set[tuple[np.dtype[Any], ...]] = set()
         self._state = self._hash.state
 
     @property
@@ -161,8 +162,10 @@ class VoxelTable:
         else:
             rows = np.array(moments.rows, np.int32)  # hints, confirmed by the kernel
         before = self._hash.of_stripes(hashing.POINTS)
-        if self._channels or moments.stripes is not None:  # compiles it, while there is memory
+        kind = moments.count.dtype, moments.total.dtype, moments.view.dtype
+        if kind not in self._undoable:  # compile it while there is memory
             self._restore(moments, version, rows, NO_PART)
+            self._undoable.add(kind)
         try:
             missing, fallen = self._subtract(moments, version, rows, min_points)
             if missing >= 0:
@@ -376,9 +379,9 @@ class VoxelTable:
             self._hash.grow()
             return
         num_rows = len(self.rows.array)
-        given = self._hash.give_rows(num_rows)
-        self._stamps.array[given] = layout.EMPTIED
-        if given.start == given.stop:
+        first = self._hash.rows_given
+        self._stamps.array[first : first + (ROWS << STRIPE_BITS)] = layout.EMPTIED
+        if not self._hash.give_rows(num_rows):
             self._stamps.grow(2 * num_rows)
             if self._channels:
                 self._channels.grow(2 * num_rows)

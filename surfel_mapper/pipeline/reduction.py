@@ -24,7 +24,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
 from surfel_mapper.kernels.lanes import FULL
 from surfel_mapper.mapping.channels import CHANNELS, summed_columns
-from surfel_mapper.mapping.moments import point_keys, ScanMoments
+from surfel_mapper.mapping.moments import LEAST_SHARED, point_keys, ScanMoments
 from surfel_mapper.mapping.reducer import within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
@@ -257,9 +257,13 @@ def warm_up_steps(config: Config) -> WarmUpSteps:
 
 
 def compile_adding(config: Config, dtype: npt.DTypeLike) -> SurfelMap:
-    """Compile reducing and adding points of a type; return the map of one."""
-    surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
-    surfel_map.add(np.zeros((1, 3), dtype), columns={n: np.zeros(1) for n in CHANNELS})
+    """Compile reducing and adding points of a type, by the threads set; return the map of some."""
+    settings, threads = config.map, config.map.threads or 1
+    surfel_map = SurfelMap(settings.voxel_size_m, columns=settings.columns, threads=threads)
+    num = 1 if threads == 1 else LEAST_SHARED  # in voxels of their own
+    points = np.zeros((num, 3), dtype)
+    points[:, 0] = settings.voxel_size_m * np.arange(num)
+    surfel_map.add(points, columns={n: np.zeros(num) for n in CHANNELS})
     return surfel_map
 
 

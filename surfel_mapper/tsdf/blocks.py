@@ -567,7 +567,5 @@ class BlockMap(BlockArrays):
         """Enlarge the rows or the hash table, whichever is full."""
         if not self._hash.lacks_row():
             self._hash.grow()
-            return
-        given = self._hash.give_rows(len(self.head))
-        if given.start == given.stop:
+        elif not self._hash.give_rows(len(self.head)):
             self._grow()

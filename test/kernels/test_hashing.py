@@ -41,6 +41,7 @@ class Owner:
         self.local_depth = np.zeros(num_segments, np.int8)
         self.state = np.zeros(STATE, np.int64)
         self.state[NEXT_SEGMENT], self.state[END_SEGMENT] = 1, num_segments
+        self.entries = np.empty(SEGMENT, np.int64)
         self.expected = {}
 
     @property
@@ -53,7 +54,7 @@ class Owner:
     def insert(self, key, row):
         hashed = self.call(hash_key, np.int64(key))
         while self.call(is_full, hashed, self.directory, self.held, self.state[DEPTH]):
-            if not self.call(split_segment, hashed, self.table, self.state):
+            if not self.call(split_segment, hashed, self.table, self.state, self.entries):
                 assert self.state[NEXT_SEGMENT] < len(self.held), 'the test has too few segments'
                 self.directory = np.repeat(self.directory, 2)
                 self.state[DEPTH] += 1
@@ -164,15 +165,19 @@ def test_a_segment_does_not_split_without_room(call):
         owner.insert(key, row)
     before = [array.copy() for array in (*owner.table, owner.state)]
     hashed = hash_key(np.int64(keys[0]))
-    assert not call(split_segment, hashed, owner.table, owner.state)  # the directory is full
+    assert not call(
+        split_segment, hashed, owner.table, owner.state, owner.entries
+    )  # the directory is full
     for array, copy in zip((*owner.table, owner.state), before, strict=True):
         assert (array == copy).all()
     owner.directory = np.repeat(owner.directory, 2)
     owner.state[DEPTH] += 1
-    assert call(split_segment, hashed, owner.table, owner.state)
+    assert call(split_segment, hashed, owner.table, owner.state, owner.entries)
     owner.check()
     assert owner.state[NEXT_SEGMENT] == 2
-    assert not call(split_segment, hashed, owner.table, owner.state)  # no third segment
+    assert not call(
+        split_segment, hashed, owner.table, owner.state, owner.entries
+    )  # no third segment
 
 
 @both

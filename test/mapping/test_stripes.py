@@ -93,6 +93,20 @@ def test_a_window_is_the_same_with_any_number_of_threads(threads):
     assert not len(several.surfels())
 
 
+def test_rows_that_were_never_used_are_in_no_result():
+    surfel_map = SurfelMap(0.4, threads=2)
+    first = surfel_map.add(points_at(0))
+    second = surfel_map.add(points_at(1, num=3))
+    surfel_map.remove(first)
+    held = set(surfel_map.find(surfel_map.keys()).tolist())
+    assert len(held) == 3
+    assert set(surfel_map.rows_changed(-1).tolist()) == {*first.rows.tolist(), *held}
+    assert sorted(surfel_map.moments().key) == sorted(second.key)
+    assert surfel_map.num_surfels() == len(surfel_map.surfels()) == 3
+    index = second.voxel_index
+    assert len(surfel_map.coarsen(0, within=(index.min(axis=0), index.max(axis=0)))) == 3
+
+
 def test_rows_of_voxels_that_left_are_used_again():
     surfel_map = SurfelMap(0.4, threads=2)
     sizes, held = [], []

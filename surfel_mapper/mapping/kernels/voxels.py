@@ -45,6 +45,7 @@ from surfel_mapper.kernels.hashing import (
     NEXT_ROW,
     POINTS,
     remove_entry,
+    SEGMENT,
     stripe_of,
     STRIPING,
     VOXELS,
@@ -167,6 +168,7 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, part, f
     flat = rows.ravel()
     depth, stripe_bits = state[DEPTH], state[STRIPING]
     hashes, likely = np.zeros(RING, np.int64), np.empty(RING, np.int64)
+    entries = np.empty(SEGMENT, np.int64)  # here: what fails later would leave the counts wrong
     num_points, num_new, done = np.int64(0), 0, stop
     for place in range(start - HASHED if start < stop else stop, stop):
         look_ahead(place, stop - 1, keys, flat, directory, buckets, depth, hashes, likely)
@@ -178,7 +180,7 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, part, f
             row = find_row(key, rows, table, depth)
         if row < 0:
             full = is_full(hashed, directory, held, depth)
-            if not full or makes_room(hashed, table, state):
+            if not full or makes_room(hashed, table, state, entries):
                 row = take_row(flat, state, stripe_of(hashed, stripe_bits))
             if row < 0:
                 done = place
@@ -268,7 +270,7 @@ def remove_moments(
             prefetch_row(flat, np.int64(found[place + U(AHEAD)]))
         key, n = keys[place], np.int64(count[place])
         row = np.int64(found[place])
-        if not (0 <= row < len(stamps) and is_voxel(flat, first_word(row), key)):
+        if not (0 <= row < len(rows) and is_voxel(flat, first_word(row), key)):
             row = find_row(key, rows, table, depth)
             found[place] = row
         at = first_word(max(row, 0))

@@ -20,6 +20,7 @@ from surfel_mapper.kernels.hashing import (
     makes_room,
     NEXT_ROW,
     remove_row,
+    SEGMENT,
     VOXELS,
 )
 from surfel_mapper.kernels.layout import KEY
@@ -72,12 +73,13 @@ def place_blocks(keys, head, table, state, limit, start, rows):
     make room and continue from there.
     """
     depth = state[DEPTH]
+    entries = np.empty(SEGMENT, np.int64)
     for place in range(start, len(keys)):
         key = keys[place]
         row = find_row(key, head, table, depth)
         if row < 0 and state[VOXELS] < limit:
             hashed = hash_key(key)
-            if not makes_room(hashed, table, state):
+            if not makes_room(hashed, table, state, entries):
                 return place
             row = state[FREE_ROW]
             if row >= 0:

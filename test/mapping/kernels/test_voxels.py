@@ -252,6 +252,8 @@ def test_wrong_hints_of_rows_are_replaced_by_a_look_up(call):
     hints[1::4] = 399  # never used
     hints[2::4] = memory.state[hashing.FREE_ROW]  # emptied
     hints[3::8] = hints[7]  # another voxel's
+    memory.stamps = np.concatenate([memory.stamps, memory.stamps])  # as if rows could not grow
+    hints[5::9] = len(memory.rows) + 50
     assert memory.remove(arrays_of(twin), 4, hints=hints)[0] == -1
     reference.add_moments(expected, twin, -1)
     assert memory.content() == expected
