@@ -55,6 +55,15 @@ def test_the_result_does_not_depend_on_the_number_of_threads(threads):
     assert several == one
 
 
+@pytest.fixture
+def interrupts():
+    """Let SIGINT interrupt, also in a process that a shell started in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures('interrupts')
 def test_parts_that_others_have_begun_are_done_before_an_interrupt_is_raised():
     begun, done = threading.Event(), []
 

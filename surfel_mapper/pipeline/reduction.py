@@ -263,7 +263,8 @@ def compile_adding(config: Config, dtype: npt.DTypeLike) -> SurfelMap:
     num = 1 if threads == 1 else LEAST_SHARED  # in voxels of their own
     points = np.zeros((num, 3), dtype)
     points[:, 0] = settings.voxel_size_m * np.arange(num)
-    surfel_map.add(points, columns={n: np.zeros(num) for n in CHANNELS})
+    columns = {name: np.zeros(num) for name in CHANNELS}
+    surfel_map.insert(surfel_map.reduce(points, columns=columns))  # add might warn of their unit
     return surfel_map
 
 

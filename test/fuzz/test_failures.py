@@ -364,7 +364,8 @@ def test_each_allocation_of_a_replay_up_to_its_map_leaves_a_whole_map_or_none(tm
     counts = json.loads(done.stdout)
     print(f'replay up to its map: {counts}', done.stderr)
     assert counts['failed'] > 5
-    assert len(counts['crashed']) + len(counts['hung']) <= MOST_CRASHES * counts['failed']
+    most = max(1, MOST_CRASHES * counts['failed'])  # one in a sample: libraries crash too
+    assert len(counts['crashed']) + len(counts['hung']) <= most
 
 
 def first_and_stride(shares):
