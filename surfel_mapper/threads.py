@@ -120,7 +120,7 @@ def share_parts(work: Callable[[Part], object], parts: Iterable[Part], threads: 
 
 
 def wait_for(begun: list[Future[None]]) -> None:
-    """Wait for work of other threads, also if Ctrl-C interrupts it: callers undo what was done."""
+    """Wait until other threads have ended, even after Ctrl-C: callers then undo the work."""
     interrupt = None
     while True:
         try:

@@ -113,7 +113,7 @@ def _anonymous(num_bytes: int) -> mmap.mmap:
 
 
 SEGMENTS = 16
-"""Segments that a stripe is given at once: how full they are, lies in a cache line of its own."""
+"""Segments that a stripe is given at once: their numbers of rows fill a cache line."""
 
 ROWS = 8192
 """Rows that a stripe is given at once, so that those of two stripes share no cache line."""

@@ -54,7 +54,8 @@ UNDO_BYTES = 64
 Part = tuple[int, int, int]
 """The first voxel of a part of a scan, the one after its last, and a stripe that counts for it."""
 
-NO_PART = 0, 0, 0
+NO_PART: Part = 0, 0, 0
+"""A part without voxels."""
 
 Result = TypeVar('Result')
 

@@ -183,7 +183,7 @@ def pack_moments(keys, sums, places, origin, voxel_size, moments):
 
     keys        (K,) int64, as reduce_points leaves them
     sums        (K, WORDS) int64
-    places      (K,) int32, where the voxels are written; (0,): in their order
+    places      (K,) int32, the row of the outputs for each; (0,): their order stays
     origin      (3,) float64, the sensor in the map frame, m; nan if unknown
     voxel_size  float64, m
     moments     key (K,) int64, count (K,) int32, total (K, 3) int32, product (K, 6) int64,
@@ -205,7 +205,7 @@ def unpack_sums(sums, places, count, total, product):
     Unpack the sums of a scan, about the centres of the voxels; return the largest count.
 
     sums     (K, WORDS) int64, as reduce_points leaves them
-    places   (K,) int32, where they are written; (0,): in their order
+    places   (K,) int32, the row of the outputs for each; (0,): their order stays
     count    (K,) int32, out
     total    (K, 3) int32, out
     product  (K, 6) int64, out
