@@ -24,8 +24,8 @@ PACKAGE = ROOT / 'surfel_mapper'
 
 LEVELS = (
     {'errors'},
-    {'arguments', 'budget'},
-    {'config', 'counters', 'geometry', 'kernels', 'memory', 'scan', 'threads'},
+    {'arguments', 'budget', 'kernels'},
+    {'config', 'counters', 'geometry', 'memory', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},
     {'files', 'messages'},

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ import pytest
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.threads import (
     BACKGROUND_NICE,
+    Helpers,
     pool,
     real_time_threads,
     share,
@@ -139,6 +141,96 @@ def test_an_error_of_the_calling_thread_is_raised_before_those_of_helpers():
 
     with pytest.raises(KeyboardInterrupt):
         share(work, 100, 2)
+
+
+def test_results_and_errors_of_jobs_are_returned_to_who_asks():
+    helpers = Helpers(2)
+    jobs = [helpers.submit(divmod, number, 7) for number in range(200)]
+    failed = helpers.submit(divmod, 1, 0)
+    assert [job.result() for job in jobs] == [divmod(number, 7) for number in range(200)]
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            failed.result()
+
+
+def test_threads_that_fell_asleep_do_the_next_job():
+    helpers = Helpers(2)
+    for _ in range(3):
+        assert helpers.submit(threading.get_ident).result() != threading.get_ident()
+        time.sleep(0.05)  # they stay awake for a third of a millisecond
+
+
+def test_waiting_for_a_long_job_takes_no_processor_time():
+    used_s = time.thread_time()
+    job = Helpers(1).submit(time.sleep, 0.3)
+    job.result()
+    assert job.done()
+    assert time.thread_time() - used_s < 0.15
+
+
+def test_a_result_is_not_waited_for_longer_than_asked():
+    may_end = threading.Event()
+    job = Helpers(1).submit(may_end.wait, 30.0)
+    with pytest.raises(TimeoutError):
+        job.result(timeout=0.01)
+    may_end.set()
+    assert job.result() is True
+
+
+def test_cancelled_jobs_are_not_done():
+    helpers, may_end, done = Helpers(1), threading.Event(), []
+    first = helpers.submit(may_end.wait, 30.0)
+    second, third = (helpers.submit(done.append, number) for number in (2, 3))
+    assert second.cancel()
+    may_end.set()
+    third.result()
+    assert done == [3]
+    assert first.result()
+
+
+def test_jobs_keep_neither_arguments_nor_results_once_they_are_done():
+    class Scan:
+        pass
+
+    helpers, scan = Helpers(1), Scan()
+    alive = weakref.ref(scan)
+    assert helpers.submit(id, scan).result()
+    failed = helpers.submit(divmod, scan, 1)
+    with pytest.raises(TypeError):
+        failed.result()
+    del scan, failed
+    helpers.submit(int).result()  # the thread has forgotten the one before
+    assert alive() is None
+
+
+def test_a_thread_that_cannot_start_is_an_error_and_may_start_later(monkeypatch):
+    def fail(thread):
+        raise RuntimeError("can't start new thread")
+
+    helpers = Helpers(1)
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, 'start', fail)
+        with pytest.raises(RuntimeError, match='new thread'):
+            helpers.submit(int)
+    assert helpers.submit(int).result() == 0
+
+
+AT_THE_END = """
+import time
+from surfel_mapper.threads import pool
+def work(number):
+    time.sleep(0.05)
+    print(number, flush=True)
+for number in range(4):
+    pool(2).submit(work, number)
+"""
+
+
+def test_jobs_that_are_left_are_done_before_the_process_ends():
+    run = [sys.executable, '-c', AT_THE_END]
+    done = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=60, check=True)
+    assert done.stdout.split() == ['0', '1', '2', '3']
+    assert done.stderr == ''
 
 
 def test_no_thread_at_all_is_refused():

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from surfel_mapper.arguments import as_array, made_array
 from surfel_mapper.errors import DependencyError
 from surfel_mapper.mapping.kernels.surfels import derive_surfels
-from surfel_mapper.threads import share
+from surfel_mapper.threads import together
 
 
 class OneSurfel(NamedTuple):
@@ -281,10 +281,11 @@ def derive(
         voxel_index=np.empty((num, 3), np.int32),
     )
 
-    def derive_part(part: slice) -> None:
-        outputs = tuple(values[part] for values in surfels.arrays)
-        derive_surfels(rows, chosen[part], voxel_size_m, bits, outputs)
+    claims = np.zeros(1, np.int64)
+
+    def derive() -> None:
+        derive_surfels(rows, chosen, voxel_size_m, bits, surfels.arrays, claims)
 
     if num:  # else the kernel need not be compiled yet
-        share(derive_part, num, threads if num >= FEW else 1)
+        together(derive, threads if num >= FEW else 1)
     return surfels

@@ -19,9 +19,8 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable
-from itertools import pairwise, takewhile
-from typing import Any, TypeVar
+from itertools import takewhile
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +42,7 @@ from surfel_mapper.mapping.kernels.voxels import (
 )
 from surfel_mapper.mapping.moments import ScanMoments, STRIPE_BITS
 from surfel_mapper.mapping.storage import HashTable, ROWS, Slab
-from surfel_mapper.threads import share_parts
+from surfel_mapper.threads import together
 
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries, enough for 6e9 voxels."""
@@ -56,8 +55,6 @@ Part = tuple[int, int, int]
 
 NO_PART: Part = 0, 0, 0
 """A part without voxels."""
-
-Result = TypeVar('Result')
 
 LEAST = 1 << 18
 """Minimum capacity of the change log, rows; 1 MiB."""
@@ -249,36 +246,45 @@ class VoxelTable:
         num = rows_held(self.rows.array, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
-    def _parts(self, moments: ScanMoments) -> list[Part]:
-        """Return the parts of the voxels that threads may change at the same time."""
+    def _parts(self, moments: ScanMoments) -> npt.NDArray[np.int64]:
+        """Return the parts of the voxels that threads may change at the same time, (P, 3)."""
         if self._threads == 1 or moments.stripes is None:
-            return [(0, len(moments), 0)]
-        return [(*ends, stripe) for stripe, ends in enumerate(pairwise(moments.stripes.tolist()))]
+            return np.array([[0, len(moments), 0]])
+        bounds = moments.stripes
+        return np.stack([bounds[:-1], bounds[1:], np.arange(len(bounds) - 1)], axis=1)
 
     def _add(self, moments: ScanMoments, version: int, found: npt.NDArray[np.int32]) -> None:
         """Add moments without channels; write the row of each voxel to found once it is added."""
-        arrays, view_is_sum, stamp = moments.arrays, moments.view_is_sum, stamp_of(version)
         self._version = version
-        left = self._parts(moments)
-
-        def add(part: Part) -> int:
-            rows, stamps = self.rows.array, self._stamps.array.reshape(-1)
-            table, state = self._hash.arrays, self._state
-            done: int = add_moments(
-                arrays, view_is_sum, rows, stamps, table, state, stamp, part, found
-            )
-            return done
-
-        while left:
-            done = self._each(add, left)
-            rest = [(end, *part[1:]) for part, end in zip(left, done, strict=True)]
-            left = [part for part in rest if part[0] < part[1]]
-            if left:
+        parts = self._parts(moments)
+        while len(parts):
+            self._add_parts(moments, version, parts, found)
+            parts = parts[parts[:, 0] < parts[:, 1]]
+            if len(parts):
                 self._make_room()
+
+    def _add_parts(
+        self,
+        moments: ScanMoments,
+        version: int,
+        parts: npt.NDArray[np.int64],
+        found: npt.NDArray[np.int32],
+    ) -> None:
+        """Add parts of moments as far as there is room; see add_moments."""
+        rows, stamps = self.rows.array, self._stamps.array.reshape(-1)
+        table, claims = self._hash.arrays, np.zeros(1, np.int64)
+
+        def add() -> None:
+            add_moments(
+                *(moments.arrays, moments.view_is_sum, rows, stamps, table, self._state),
+                *(stamp_of(version), parts, claims, found),
+            )
+
+        together(add, self._threads if len(parts) > 1 else 1)
 
     def _undo_add(self, moments: ScanMoments, version: int, found: npt.NDArray[np.int32]) -> None:
         """Subtract the moments that an incomplete ``add`` added; channels are added last."""
-        for start, stop, _ in self._parts(moments):
+        for start, stop, _ in self._parts(moments).tolist():
             end = bisect_left(found, True, start, stop, key=lambda row: row < 0)
             if end > start:
                 added = slice(start, end)
@@ -296,38 +302,24 @@ class VoxelTable:
 
         Of several parts those that have all their voxels are subtracted even if another has not.
         """
-        arrays, view_is_sum, stamp = moments.arrays, moments.view_is_sum, stamp_of(version)
         self._version = version
-        parts = self._parts(moments)
-        least = max(min_points, 1)
+        rows, stamps, parts = self.rows.array, self._stamps.array.reshape(-1), self._parts(moments)
+        table, claims = self._hash.arrays, np.zeros(1, np.int64)
         fallen: npt.NDArray[np.int32] = np.empty((len(moments), 3), np.int32)
+        ends = np.zeros((len(parts), 2), np.int64)
 
-        def subtract(part: Part) -> tuple[int, int]:
-            rows, stamps = self.rows.array, self._stamps.array.reshape(-1)
-            table, state = self._hash.arrays, self._state
-            ends: tuple[int, int] = remove_moments(
-                arrays, view_is_sum, rows, stamps, table, state, stamp, part, found, least, fallen
+        def subtract() -> None:
+            remove_moments(
+                *(moments.arrays, moments.view_is_sum, rows, stamps, table, self._state),
+                *(stamp_of(version), parts, claims, found, max(min_points, 1), fallen, ends),
             )
-            return ends
 
-        ends = self._each(subtract, parts)
+        together(subtract, self._threads if len(parts) > 1 else 1)
         if len(parts) == 1:
-            return ends[0][0], fallen[: ends[0][1]]
-        missing = [voxel for voxel, _ in ends if voxel >= 0]
-        fell = [fallen[part[0] :][:num] for part, (_, num) in zip(parts, ends, strict=True)]
+            return int(ends[0, 0]), fallen[: ends[0, 1]]
+        missing = [voxel for voxel in ends[:, 0].tolist() if voxel >= 0]
+        fell = [fallen[first:][:num] for first, num in zip(parts[:, 0], ends[:, 1], strict=True)]
         return missing[0] if missing else -1, np.concatenate(fell)
-
-    def _each(self, work: Callable[[Part], Result], parts: list[Part]) -> list[Result]:
-        """Do the work on each part, with the help of idle threads; return the results."""
-        if len(parts) == 1:
-            return [work(parts[0])]
-        results: dict[int, Result] = {}
-
-        def do(number: int) -> None:
-            results[number] = work(parts[number])
-
-        share_parts(do, range(len(parts)), self._threads)
-        return [results[number] for number in range(len(parts))]
 
     def _undo_subtract(
         self,
@@ -350,9 +342,9 @@ class VoxelTable:
 
         """
         now = self._hash.of_stripes(hashing.POINTS)
-        for part in self._parts(moments):
-            if now[part[2]] < before[part[2]]:
-                self._restore(moments, version, found, part)
+        for start, stop, stripe in self._parts(moments).tolist():
+            if now[stripe] < before[stripe]:
+                self._restore(moments, version, found, (start, stop, stripe))
 
     def _restore(
         self,

@@ -17,6 +17,7 @@ from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.layout import KEY, PRODUCT
 from surfel_mapper.kernels.prefetch import LINE_BYTES, prefetch_to_write
 from surfel_mapper.kernels.quantisation import unpack
+from surfel_mapper.kernels.sharing import claim
 from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work
 from surfel_mapper.mapping.kernels.rows import (
     count_of,
@@ -29,6 +30,9 @@ from surfel_mapper.mapping.kernels.rows import (
 
 CHUNK = 128
 """Voxels processed at once: their moments stay in the first-level cache."""
+
+PIECE = 16 * CHUNK
+"""Voxels that a thread claims at once."""
 
 AHEAD = 16
 """Number of rows between the prefetch of a row and its use."""
@@ -52,9 +56,9 @@ MOMENTS = 13
 
 
 @kernel(error_model='numpy')
-def derive_surfels(rows, chosen, voxel_size, bits, outputs):
+def derive_surfels(rows, chosen, voxel_size, bits, outputs, claims):
     """
-    Derive the surfels of some rows of the slab.
+    Derive the surfels of some rows of the slab, in pieces that threads claim.
 
     rows        (R, 12) int64
     chosen      (K,) int32 or int64, rows to derive; each holds at least one point
@@ -62,6 +66,7 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     bits        a voxel is 2^bits lattice units wide
     outputs     position (K, 3) float64 m, normal (K, 3), planarity (K,), curvature (K,),
                 eigenvalues (K, 3) m^2, num_points (K,) int64, voxel_index (K, 3) int32
+    claims      (1,) int64, pieces that were claimed
 
     A single point or identical points: eigenvalues 0; normal, planarity and curvature nan.
     """
@@ -73,22 +78,25 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     vectors = position.ravel(), normal.ravel(), eigenvalues.ravel()
     written = vectors, (planarity, curvature), num_points, voxel_index.ravel()
-    for start in range(0, len(chosen), CHUNK):
-        num = min(CHUNK, len(chosen) - start)
-        end = start + num
-        most = gather(rows, chosen, start, num, keys, moments, written)
-        write_index(keys, moments, num, num_points[start:end], voxel_index[start:end])
-        center(moments, num, mean, scatter)
-        if most >= many:
-            center_exactly(rows, chosen, start, num, scatter)
-        place(mean, num, voxel_size, bits, voxel_index[start:end], position[start:end])
-        decompose_chunk(scatter, 0, num, work, values, normals)
-        derive_shape(values, num, moments, voxel_size / (1 << bits), shape)
-        turn(normals, num, moments, shape)
-        planarity[start:end] = shape[0, :num]
-        curvature[start:end] = shape[1, :num]
-        write_vectors(normals, num, normal[start:end])
-        write_vectors(values, num, eigenvalues[start:end])
+    first = claim(claims) * PIECE
+    while first < len(chosen):
+        for start in range(first, min(first + PIECE, len(chosen)), CHUNK):
+            num = min(CHUNK, len(chosen) - start)
+            end = start + num
+            most = gather(rows, chosen, start, num, keys, moments, written)
+            write_index(keys, moments, num, num_points[start:end], voxel_index[start:end])
+            center(moments, num, mean, scatter)
+            if most >= many:
+                center_exactly(rows, chosen, start, num, scatter)
+            place(mean, num, voxel_size, bits, voxel_index[start:end], position[start:end])
+            decompose_chunk(scatter, 0, num, work, values, normals)
+            derive_shape(values, num, moments, voxel_size / (1 << bits), shape)
+            turn(normals, num, moments, shape)
+            planarity[start:end] = shape[0, :num]
+            curvature[start:end] = shape[1, :num]
+            write_vectors(normals, num, normal[start:end])
+            write_vectors(values, num, eigenvalues[start:end])
+        first = claim(claims) * PIECE
 
 
 @kernel(error_model='numpy')

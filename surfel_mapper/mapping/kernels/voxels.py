@@ -27,7 +27,7 @@ One module: all work on the moments of a scan and the rows of the same voxels.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.compiling import kernel, part, stay_apart, U
 from surfel_mapper.kernels.grouping import hash_shift, home
 from surfel_mapper.kernels.hashing import (
     DEPTH,
@@ -66,6 +66,7 @@ from surfel_mapper.kernels.layout import (
 )
 from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
 from surfel_mapper.kernels.quantisation import unpack
+from surfel_mapper.kernels.sharing import claim
 from surfel_mapper.mapping.kernels.rows import (
     add_to_row,
     count_of,
@@ -147,20 +148,34 @@ def find_rows(keys, rows, table, state, found):
 
 
 @kernel()
-def add_moments(moments, view_weight, rows, stamps, table, state, stamp, part, found):
+def add_moments(moments, view_weight, rows, stamps, table, state, stamp, parts, claims, found):
     """
-    Add the moments of some voxels of a scan; return the first voxel that was not added.
+    Add the moments of some voxels of a scan, in parts that threads claim.
 
     moments      keys (K,) int64, count (K,), total (K, 3), product (K, 6), view (K, 3)
     view_weight  0: the view is multiplied by the count; 1: it is a sum already
     stamps       (R,) uint32, out: the last change of each row
     stamp        uint32, of this change; see kernels/layout.py
-    part         the first voxel, the one after the last, and the stripe that counts points
+    parts        (P, 3) int64, in and out: the first voxel, the one after the last, and the stripe
+                 that counts points; no stripe twice. The first voxel moves to the first that was
+                 not added: slab, segments or directory have no room for it. Make room and
+                 continue from there.
+    claims       (1,) int64, parts that were claimed
     found        (K,) int32, out: row of each voxel
-
-    It is one before the last if slab, segments or directory have no room for a new voxel: make
-    room and continue from there. Several threads may add parts that have no stripe in common.
     """
+    number = claim(claims)
+    while number < len(parts):
+        part = parts[number, 0], parts[number, 1], parts[number, 2]
+        parts[number, 0] = add_part(
+            moments, view_weight, rows, stamps, table, state, stamp, part, found
+        )
+        number = claim(claims)
+
+
+@kernel()
+def add_part(moments, view_weight, rows, stamps, table, state, stamp, part, found):
+    """Add the moments of a part; return the first voxel that was not added, see add_moments."""
+    stay_apart()
     keys, count, _, _, _ = moments
     start, stop, own = part
     words = words_of(moments)
@@ -232,28 +247,58 @@ def free_row(flat, at, following, later):
 
 @kernel()
 def remove_moments(
-    moments, view_weight, rows, stamps, table, state, stamp, part, found, min_points, fallen
+    moments,
+    view_weight,
+    rows,
+    stamps,
+    table,
+    state,
+    stamp,
+    parts,
+    claims,
+    found,
+    min_points,
+    fallen,
+    ends,
 ):
     """
-    Subtract moments, or nothing if a voxel does not hold them; free the rows that become empty.
+    Subtract moments, in parts that threads claim; free the rows that become empty.
 
     stamps      (R,) uint32, out: the last change of each row
     stamp       uint32, of this change; see kernels/layout.py
-    part        the first voxel, the one after the last, and the stripe that counts points
+    parts       (P, 3) int64: the first voxel, the one after the last, and the stripe that counts
+                points; no stripe twice
+    claims      (1,) int64, parts that were claimed
     found       (K,) int32, in: row of each voxel, or a hint of it; out: the row
     min_points  smallest number of points of a surfel, at least 1
-    fallen      (K, 3) int32, out, from the first voxel on: indices of the voxels that held
-                min_points before and hold fewer
+    fallen      (K, 3) int32, out, from the first voxel of a part on: indices of the voxels that
+                held min_points before and hold fewer
+    ends        (P, 2) int64, out: the first voxel of a part that does not hold its moments, or
+                -1, and the number of its fallen voxels
 
-    Several threads may subtract parts that have no stripe in common.
-
-    Returns the first voxel that does not hold its moments, or -1, and the number of fallen voxels.
+    Of a part with a voxel that does not hold its moments nothing is subtracted.
 
     A row keeps its voxel as long as that holds points, so a hint is right unless the voxel was
     emptied since; a wrong one is replaced by a look-up. A voxel must hold at least as many points
     as are subtracted; if it holds no others, its sums must be equal. One pass that is undone on
     failure: a pass of checks before it would read every row from memory twice.
     """
+    number = claim(claims)
+    while number < len(parts):
+        part = parts[number, 0], parts[number, 1], parts[number, 2]
+        changed = rows, stamps, table, state
+        ends[number, 0], ends[number, 1] = remove_part(
+            moments, view_weight, *changed, stamp, part, found, min_points, fallen
+        )
+        number = claim(claims)
+
+
+@kernel()
+def remove_part(
+    moments, view_weight, rows, stamps, table, state, stamp, part, found, min_points, fallen
+):
+    """Subtract the moments of a part; return its ends, see remove_moments."""
+    stay_apart()
     keys, count, _, _, _ = moments
     words = words_of(moments)
     directory, buckets, num_held, _ = table

@@ -63,7 +63,7 @@ def test_chosen_rows_are_derived_in_their_order(call, num):
     rows, voxels = random_rows(40, seed=1)
     chosen = np.random.default_rng(2).integers(0, 40, num).astype(np.int32)
     outputs = outputs_for(num)
-    call(derive_surfels, np.array(rows), chosen, 0.25, 16, outputs)
+    call(derive_surfels, np.array(rows), chosen, 0.25, 16, outputs, np.zeros(1, np.int64))
     *quantities, num_points, voxel_index = outputs
     found = dict(zip(NAMES, quantities, strict=True))
     twins = [twin_of(row, voxel, 0.25) for row, voxel in zip(rows, voxels, strict=True)]
@@ -86,7 +86,7 @@ def test_chosen_rows_are_derived_in_their_order(call, num):
 def test_equal_points_spread_by_exactly_0(call, times, place):
     outputs = outputs_for(1)
     rows = np.array([row_of([place], times=times)])
-    call(derive_surfels, rows, np.zeros(1, np.int32), 0.5, 16, outputs)
+    call(derive_surfels, rows, np.zeros(1, np.int32), 0.5, 16, outputs, np.zeros(1, np.int64))
     assert outputs[4].tolist() == [[0.0] * 3]
     assert np.isnan(outputs[1]).all()
 
@@ -102,7 +102,8 @@ def test_eigenvalues_are_exact_to_rounding_for_any_number_of_points(call, times,
         places = rng.integers(-spread, spread + 1, (3, 3)) << (bits - 16)
         row = row_of(places, times=times)
         outputs = outputs_for(1)
-        call(derive_surfels, np.array([row]), np.zeros(1, np.int32), 0.5, bits, outputs)
+        chosen, claims = np.zeros(1, np.int32), np.zeros(1, np.int64)
+        call(derive_surfels, np.array([row]), chosen, 0.5, bits, outputs, claims)
         exact = twin_of(row, (0, 0, 0), 1.0)['scatter']
         trace = sum(exact[i][i] for i in range(3))
         norm_sq = sum(exact[i][j] ** 2 for i in range(3) for j in range(3))
@@ -120,7 +121,7 @@ def test_means_are_placed_for_voxels_of_any_level(call, bits):
     places = [(-reach, 0, reach - 1), (-reach, 1, reach - 1)]
     outputs = outputs_for(1)
     rows = np.array([row_of(places, (2, -3, 0))])
-    call(derive_surfels, rows, np.zeros(1, np.int32), 2.0, bits, outputs)
+    call(derive_surfels, rows, np.zeros(1, np.int32), 2.0, bits, outputs, np.zeros(1, np.int64))
     cell = 2.0 / 2**bits
     # half a cell from the faces along x and z, a whole one above the middle along y
     expected = [4.0 + cell / 2, -5.0 + cell, 2.0 - cell / 2]

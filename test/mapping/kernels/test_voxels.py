@@ -12,9 +12,9 @@ import pytest
 from surfel_mapper.kernels import hashing
 from surfel_mapper.kernels.layout import EMPTIED, KEY, ROW
 from surfel_mapper.mapping.kernels.voxels import (
-    add_moments,
+    add_part,
     find_rows,
-    remove_moments,
+    remove_part,
     restore_moments,
 )
 from surfel_mapper.mapping.moments import pack_keys, unpack_keys
@@ -48,7 +48,7 @@ class Memory:
         """Return the number of rows done, and the changed rows."""
         changed = np.full(len(moments[0]), -1, np.int32)
         done = self.call(
-            add_moments,
+            add_part,
             *(moments, weight, self.rows, self.stamps, self.table, self.state),
             *(2 * version, (start, len(moments[0]), 0), changed),
         )
@@ -64,7 +64,7 @@ class Memory:
         fallen = np.full((len(moments[0]), 3), -1, np.int32)
         found = self.find(moments[0]) if hints is None else hints
         missing, num = self.call(
-            remove_moments,
+            remove_part,
             *(moments, weight, self.rows, self.stamps, self.table, self.state),
             *(2 * version, (0, len(moments[0]), 0), found, min_points, fallen),
         )
