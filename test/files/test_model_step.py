@@ -181,7 +181,7 @@ U_HOLE = (SIDE < 1.6) & ~((np.abs(X) < 1.0) & (Y > -1.2))
 @pytest.mark.parametrize(
     ('covered', 'areas'),
     [
-        ((SIDE > 1.2) | (SIDE < 0.5), [1.0**2, 4.0**2 - 2.4**2]),
+        ((SIDE > 1.0) | (SIDE < 0.5), [1.0**2, 4.0**2 - 2.0**2]),
         (U_SHAPE & ~U_HOLE, [4.0**2 - 1.2 * 2.8 - (3.2**2 - 2.0 * 2.8)]),
     ],
     ids=['island in a hole', 'hole with its middle outside'],
