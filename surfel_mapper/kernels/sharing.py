@@ -3,10 +3,10 @@
 """
 Share work among threads without Python's lock: claim parts, watch a number for a change.
 
-Threads that call the same kernel claim the parts of its work one by one. Parts handed out by
-Python need its lock twice each, and a thread that finds it taken goes to sleep.
+Threads that call the same kernel claim the parts of its work one by one. For a part handed out by
+Python a thread needs the lock twice, and if it finds the lock taken it goes to sleep.
 
-Stands alone: one of the places that emit instructions of LLVM.
+Stands alone: one of the three places that emit instructions of LLVM.
 """
 
 from llvmlite import ir
@@ -71,14 +71,17 @@ def _first(context, builder, signature, arguments):
 @kernel()
 def watch(numbers, seen, turns, more):
     """
-    Wait until numbers[0] is no longer the one seen, then for some turns more; return whether.
+    Look until another thread has changed a number, then wait some turns more.
 
     numbers  (1,) int64
-    turns    number of times to look
-    more     number of turns after the change
+    seen     int64, the number before the change
+    turns    times to look, at most
+    more     turns after the change
 
-    A turn takes about 7 ns: a square root that depends on the last, which leaves the arithmetic
-    of the core to another thread on it.
+    Returns whether it changed, and a number without meaning.
+
+    A turn takes 6 ns: a square root that depends on the last one and is part of the result, else
+    it would not be computed. Meanwhile another thread on the core finds its units idle.
     """
     left, changed, value = U(turns), False, float(turns)
     while left > U(0):
