@@ -271,13 +271,13 @@ class VoxelTable:
         found: npt.NDArray[np.int32],
     ) -> None:
         """Add parts of moments as far as there is room; see add_moments."""
-        rows, stamps = self.rows.array, self._stamps.array.reshape(-1)
-        table, claims = self._hash.arrays, np.zeros(1, np.int64)
+        claims = np.zeros(1, np.int64)
 
         def add() -> None:
+            stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
             add_moments(
-                *(moments.arrays, moments.view_is_sum, rows, stamps, table, self._state),
-                *(stamp_of(version), parts, claims, found),
+                *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
+                *(self._state, stamp_of(version), parts, claims, found),
             )
 
         together(add, self._threads if len(parts) > 1 else 1)
@@ -303,15 +303,15 @@ class VoxelTable:
         Of several parts those that have all their voxels are subtracted even if another has not.
         """
         self._version = version
-        rows, stamps, parts = self.rows.array, self._stamps.array.reshape(-1), self._parts(moments)
-        table, claims = self._hash.arrays, np.zeros(1, np.int64)
+        parts, claims = self._parts(moments), np.zeros(1, np.int64)
+        ends, least = np.zeros((len(parts), 2), np.int64), max(min_points, 1)
         fallen: npt.NDArray[np.int32] = np.empty((len(moments), 3), np.int32)
-        ends = np.zeros((len(parts), 2), np.int64)
 
         def subtract() -> None:
+            stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
             remove_moments(
-                *(moments.arrays, moments.view_is_sum, rows, stamps, table, self._state),
-                *(stamp_of(version), parts, claims, found, max(min_points, 1), fallen, ends),
+                *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
+                *(self._state, stamp_of(version), parts, claims, found, least, fallen, ends),
             )
 
         together(subtract, self._threads if len(parts) > 1 else 1)
