@@ -284,10 +284,12 @@ def together(work: Callable[[], object], threads: int) -> None:
     the first helper.
     """
     helpers = pool(threads)
+    if helpers is None:
+        work()
+        return
     helping: list[Job[object]] = []
     try:
-        if helpers is not None:
-            helping.extend(helpers.submit(work) for _ in range(threads - 1))
+        helping.extend(helpers.submit(work) for _ in range(threads - 1))
         work()
     finally:
         begun = [helper for helper in helping if not helper.cancel()]
@@ -303,7 +305,8 @@ def wait_for(begun: list[Job[object]]) -> None:
         try:
             for job in begun:
                 job.await_soon()
-            wait(begun)
+            if not all(job.done() for job in begun):
+                wait(begun)
             break
         except KeyboardInterrupt as error:
             interrupt = error
