@@ -3,9 +3,9 @@
 """
 Threads: process the rows of arrays with several threads.
 
-The kernels release Python's lock, so plain threads suffice. Every row is computed independently,
-so the result has the same bits for any number of threads. Stands alone: filters, map and models
-share the pool.
+The kernels release Python's lock, so plain threads suffice. Rows are computed independently, or
+are sums of integers, so the result has the same bits for any number of threads. Filters, map and
+models share the pool.
 
 Threads that receive messages have to run within a third of a millisecond: Fast DDS sends a cloud
 of 4 MiB in 65 fragments in one millisecond through a buffer of eight. A fragment that is
@@ -15,25 +15,18 @@ error in its byte count (Fast DDS 2.14) delays repetitions by up to half a secon
 
 from __future__ import annotations
 
-import atexit
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
-from functools import cache, partial
+from functools import cache
 import itertools
 import os
-from queue import Empty, SimpleQueue
 import sys
 import threading
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import numpy as np
-
-from surfel_mapper.kernels.sharing import watch
+from surfel_mapper.helpers import Helpers, Job
 
 Part = TypeVar('Part')
-
-Result = TypeVar('Result')
 
 PARTS = 4
 """Number of parts per thread into which rows are divided; an idle thread takes the next part."""
@@ -80,176 +73,16 @@ def real_time_threads() -> Iterator[None]:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-AWAKE_TURNS = 50_000
-"""Times that a thread without work looks for some before it sleeps, and one that waits for a job
-for its end: about 0.3 ms. Waking a core takes 25 us on a virtual machine, and up to 100 us from
-the deeper sleep of others; a scan is handed over several times."""
-
-SETTLING_TURNS = 1000
-"""Times that a thread goes on looking, about 6 us: the one that it waited for still has Python's
-lock, and a thread that finds the lock taken goes to sleep."""
-
-
-class Signal:
-    """
-    A number that threads count up while others, for a while, look for a change.
-
-    A hint: threads that may not miss a change have to wait for something else then.
-
-    Parameters
-    ----------
-    turns : int
-        Number of times to look.
-
-    """
-
-    def __init__(self, turns: int) -> None:
-        self._count = np.zeros(1, np.int64)
-        self._turns = turns
-
-    def send(self) -> None:
-        """Let those who look for a change find one."""
-        self._count[0] += 1
-
-    def seen(self) -> int:
-        """Return the number now, to be read before testing what it tells of."""
-        return int(self._count[0])
-
-    def changes(self, seen: int) -> bool:
-        """Look for another number than the one seen; return whether there was one in time."""
-        changed, _ = watch(self._count, seen, self._turns, SETTLING_TURNS)
-        return bool(changed)
-
-
-class Job(Future[Result]):
-    """
-    A call for a helper, and what becomes of it.
-
-    Parameters
-    ----------
-    call : callable without arguments
-        Forgotten once the job is done or cancelled, as it may hold arrays that are to grow.
-    ended : Signal
-        Sent when the job is done.
-
-    """
-
-    def __init__(self, call: Callable[[], Result], ended: Signal) -> None:
-        super().__init__()
-        self._call: Callable[[], Result] | None = call
-        self._ended = ended
-
-    def cancel(self) -> bool:
-        """Cancel the call unless it has begun; return whether it is cancelled."""
-        cancelled = super().cancel()
-        if cancelled:
-            self._call = None
-        return cancelled
-
-    def do(self) -> None:
-        """Make the call, unless it was cancelled."""
-        if not self.set_running_or_notify_cancel():
-            return
-        call, self._call = self._call, None
-        assert call is not None
-        ended = self._ended
-        try:
-            result = call()
-        except BaseException as error:
-            del call
-            self.set_exception(error)
-            del self  # the error keeps this frame, and the job the error
-        else:
-            del call  # before the result is there: who waits for it may want to grow an array
-            self.set_result(result)
-        ended.send()
-
-    def result(self, timeout: float | None = None) -> Result:
-        """Return the result as any future does, but stay awake at first."""
-        self.await_soon()
-        try:
-            return super().result(timeout)
-        finally:
-            del self  # an error that is raised keeps this frame, and the job the error
-
-    def await_soon(self) -> None:
-        """Wait for the end, but no longer than it is worth to stay awake."""
-        is_near = True
-        while is_near:
-            seen = self._ended.seen()
-            is_near = not self.done() and self._ended.changes(seen)
-
-
-class Helpers:
-    """
-    Threads that do work for others; they start with the first job and end with the process.
-
-    Threads without work stay awake for a while, and so do those that wait for a job. With a pool
-    of the standard library, where both sleep at once, a job that did nothing took 85 us on two
-    cores of a virtual machine; here it takes 25.
-
-    Parameters
-    ----------
-    num : int
-        Number of threads.
-
-    """
-
-    def __init__(self, num: int) -> None:
-        turns = AWAKE_TURNS if num < usable_cores() else 0  # else others need the core
-        self._posted, self._ended = Signal(turns), Signal(turns)
-        self._jobs: SimpleQueue[Job[Any] | None] = SimpleQueue()
-        self._starting = threading.Lock()
-        self._threads = [
-            threading.Thread(target=self._work, name=f'surfel_mapper_{i}', daemon=True)
-            for i in range(num)
-        ]
-
-    def submit(self, work: Callable[..., Result], /, *arguments: Any) -> Job[Result]:
-        """Let a thread call ``work`` with the arguments."""
-        if self._threads[-1].ident is None:
-            self._start()
-        job = Job(partial(work, *arguments), self._ended)
-        self._jobs.put(job)
-        self._posted.send()
-        return job
-
-    def _start(self) -> None:
-        """Start the threads that have not been, also after one could not be."""
-        with self._starting:
-            for thread in self._threads:
-                if thread.ident is None:
-                    thread.start()
-            atexit.register(self._end)
-
-    def _work(self) -> None:
-        """Do jobs, in the order in which they came, until there is none instead of one."""
-        while job := self._next():
-            job.do()
-            del job  # it keeps the result
-
-    def _next(self) -> Job[Any] | None:
-        """Wait for a job."""
-        while True:
-            seen = self._posted.seen()
-            with suppress(Empty):
-                return self._jobs.get_nowait()
-            if not self._posted.changes(seen):
-                return self._jobs.get()
-
-    def _end(self) -> None:
-        """End the threads after the jobs that are left: none may run while Python ends."""
-        for _ in self._threads:
-            self._jobs.put(None)
-        self._posted.send()
-        for thread in self._threads:
-            thread.join()
-
-
 @cache
 def pool(threads: int) -> Helpers | None:
     """Return the pool of threads beside the caller's own, shared by all; None for one thread."""
-    return Helpers(threads - 1) if threads > 1 else None
+    if threads < 2:
+        return None
+    return Helpers(threads - 1, stay_awake=threads <= usable_cores())
+
+
+if hasattr(os, 'register_at_fork'):
+    os.register_at_fork(after_in_child=pool.cache_clear)  # threads do not follow into a child
 
 
 def split(num_rows: int, parts: int) -> list[slice]:
@@ -288,27 +121,26 @@ def together(work: Callable[[], object], threads: int) -> None:
         work()
         return
     helping: list[Job[object]] = []
+    failure: BaseException | None = None
     try:
-        helping.extend(helpers.submit(work) for _ in range(threads - 1))
+        for _ in range(threads - 1):
+            job = helpers.job(work)
+            helping.append(job)  # first: what has begun must end here, whatever comes between
+            helpers.give(job)
         work()
+    finally:  # not in a function: Ctrl-C may come before its first line
+        while True:
+            try:
+                for job in helping:
+                    if not job.cancel():
+                        job.wait()
+                break
+            except (KeyboardInterrupt, MemoryError) as error:
+                failure = error
+        if failure is not None:
+            raise failure
+    try:
+        for job in helping:
+            job.check()
     finally:
-        begun = [helper for helper in helping if not helper.cancel()]
-        wait_for(begun)
-    for helper in begun:
-        helper.result()
-
-
-def wait_for(begun: list[Job[object]]) -> None:
-    """Wait until other threads have ended, even after Ctrl-C: callers then undo the work."""
-    interrupt = None
-    while True:
-        try:
-            for job in begun:
-                job.await_soon()
-            if not all(job.done() for job in begun):
-                wait(begun)
-            break
-        except KeyboardInterrupt as error:
-            interrupt = error
-    if interrupt is not None:
-        raise interrupt
+        del job, helping  # an error keeps this frame, and the job the error

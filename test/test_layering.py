@@ -25,6 +25,7 @@ PACKAGE = ROOT / 'surfel_mapper'
 LEVELS = (
     {'errors'},
     {'arguments', 'budget', 'kernels'},
+    {'helpers'},
     {'config', 'counters', 'geometry', 'memory', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},

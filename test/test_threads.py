@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+import gc
 import itertools
 import os
 from pathlib import Path
@@ -21,12 +22,12 @@ import pytest
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.threads import (
     BACKGROUND_NICE,
-    Helpers,
     pool,
     real_time_threads,
     share,
     share_parts,
     split,
+    together,
     yield_to_others,
 )
 
@@ -143,96 +144,85 @@ def test_an_error_of_the_calling_thread_is_raised_before_those_of_helpers():
         share(work, 100, 2)
 
 
-def test_results_and_errors_of_jobs_are_returned_to_who_asks():
-    helpers = Helpers(2)
-    jobs = [helpers.submit(divmod, number, 7) for number in range(200)]
-    failed = helpers.submit(divmod, 1, 0)
-    assert [job.result() for job in jobs] == [divmod(number, 7) for number in range(200)]
-    for _ in range(2):
-        with pytest.raises(ZeroDivisionError):
-            failed.result()
+@pytest.mark.usefixtures('interrupts')
+def test_after_any_interrupt_nothing_goes_on_and_the_threads_still_work():
+    helpers, begun = pool(2), []
+
+    def work():
+        time.sleep(1e-4)
+        if threading.current_thread() is not threading.main_thread():
+            begun.append(True)
+            time.sleep(1e-4)
+
+    together(work, 2)  # compiled, and the thread is there
+    delays = np.random.default_rng(5).uniform(1e-6, 3e-4, 300)
+    handler = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    try:
+        for delay_s in delays.tolist():
+            try:
+                signal.setitimer(signal.ITIMER_REAL, delay_s)
+                try:
+                    while True:
+                        together(work, 2)
+                finally:
+                    signal.setitimer(signal.ITIMER_REAL, 0)
+            except KeyboardInterrupt:
+                num_begun = len(begun)
+                assert helpers.submit(len, begun).result() == num_begun
+    finally:
+        signal.signal(signal.SIGALRM, handler)
+    assert begun
 
 
-def test_threads_that_fell_asleep_do_the_next_job():
-    helpers = Helpers(2)
-    for _ in range(3):
-        assert helpers.submit(threading.get_ident).result() != threading.get_ident()
-        time.sleep(0.05)  # they stay awake for a third of a millisecond
-
-
-def test_waiting_for_a_long_job_takes_no_processor_time():
-    used_s = time.thread_time()
-    job = Helpers(1).submit(time.sleep, 0.3)
-    job.result()
-    assert job.done()
-    assert time.thread_time() - used_s < 0.15
-
-
-def test_a_result_is_not_waited_for_longer_than_asked():
-    may_end = threading.Event()
-    job = Helpers(1).submit(may_end.wait, 30.0)
-    with pytest.raises(TimeoutError):
-        job.result(timeout=0.01)
-    may_end.set()
-    assert job.result() is True
-
-
-def test_cancelled_jobs_are_not_done():
-    helpers, may_end, done = Helpers(1), threading.Event(), []
-    first = helpers.submit(may_end.wait, 30.0)
-    second, third = (helpers.submit(done.append, number) for number in (2, 3))
-    assert second.cancel()
-    may_end.set()
-    third.result()
-    assert done == [3]
-    assert first.result()
-
-
-def test_jobs_keep_neither_arguments_nor_results_once_they_are_done():
+def test_an_error_keeps_nothing_after_it_was_handled():
     class Scan:
         pass
 
-    helpers, scan = Helpers(1), Scan()
-    alive = weakref.ref(scan)
-    assert helpers.submit(id, scan).result()
-    failed = helpers.submit(divmod, scan, 1)
-    with pytest.raises(TypeError):
-        failed.result()
-    may_end = threading.Event()
-    helpers.submit(may_end.wait, 30.0)
-    assert helpers.submit(id, scan).cancel()  # it stays in the queue
-    del scan, failed
-    assert alive() is None
-    may_end.set()
+    def failed():
+        scan, both = Scan(), threading.Barrier(2)
+
+        def work():
+            both.wait(10.0)
+            if threading.current_thread() is not threading.main_thread():
+                raise OSError(scan is None)
+
+        with pytest.raises(OSError, match='False'):
+            together(work, 2)
+        return weakref.ref(scan)
+
+    gc.disable()
+    try:
+        assert failed()() is None
+    finally:
+        gc.enable()
 
 
-def test_a_thread_that_cannot_start_is_an_error_and_may_start_later(monkeypatch):
-    def fail(thread):
-        raise RuntimeError("can't start new thread")
-
-    helpers = Helpers(1)
-    with monkeypatch.context() as patch:
-        patch.setattr(threading.Thread, 'start', fail)
-        with pytest.raises(RuntimeError, match='new thread'):
-            helpers.submit(int)
-    assert helpers.submit(int).result() == 0
+@pytest.mark.skipif(not hasattr(os, 'fork'), reason='processes are not forked')
+def test_a_forked_process_has_threads_of_its_own():
+    assert pool(2).submit(int).result() == 0
+    child = os.fork()
+    if not child:
+        os._exit(pool(2).submit(int, '7').result())
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 
 
 AT_THE_END = """
+import atexit
 import time
-from surfel_mapper.threads import pool
+from surfel_mapper.threads import pool, together
 def work(number):
     time.sleep(0.05)
     print(number, flush=True)
+atexit.register(lambda: together(lambda: print('late', flush=True), 2))  # after the pool's
 for number in range(4):
     pool(2).submit(work, number)
 """
 
 
-def test_jobs_that_are_left_are_done_before_the_process_ends():
+def test_jobs_that_are_left_are_done_before_the_process_ends_and_later_ones_by_the_caller():
     run = [sys.executable, '-c', AT_THE_END]
     done = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=60, check=True)
-    assert done.stdout.split() == ['0', '1', '2', '3']
+    assert done.stdout.split() == ['0', '1', '2', '3', 'late', 'late']
     assert done.stderr == ''
 
 

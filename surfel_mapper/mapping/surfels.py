@@ -283,9 +283,9 @@ def derive(
 
     claims = np.zeros(1, np.int64)
 
-    def derive() -> None:
+    def derive_pieces() -> None:
         derive_surfels(rows, chosen, voxel_size_m, bits, surfels.arrays, claims)
 
     if num:  # else the kernel need not be compiled yet
-        together(derive, threads if num >= FEW else 1)
+        together(derive_pieces, threads if num >= FEW else 1)
     return surfels

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -22,6 +21,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
+from surfel_mapper.helpers import Job
 from surfel_mapper.kernels.lanes import FULL
 from surfel_mapper.mapping.channels import CHANNELS, summed_columns
 from surfel_mapper.mapping.moments import LEAST_SHARED, point_keys, ScanMoments
@@ -71,7 +71,7 @@ class Begun(NamedTuple):
     scan: Scan
     T_map_sensor: Transform
     config: Config
-    result: Future[Ahead]
+    result: Job[Ahead]
 
     def is_of(self, scan: Scan, T_map_sensor: Transform, config: Config) -> bool:
         """Return whether a scan is this one, at the same pose and with the same settings."""

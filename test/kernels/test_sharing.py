@@ -69,7 +69,7 @@ def test_a_change_is_seen_at_the_first_look(call):
 def test_a_change_by_another_thread_is_seen():
     numbers, found = np.zeros(1, np.int64), []
     watch(numbers, 0, 1, 1)  # compiled before the thread starts
-    forever = 2**62
+    forever = 2**34
     thread = Thread(target=lambda: found.append(watch(numbers, 0, forever, 5)[0]), daemon=True)
     thread.start()
     time.sleep(0.05)
