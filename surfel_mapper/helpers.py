@@ -50,8 +50,9 @@ class Signal:
         self._turns = turns
 
     def send(self) -> None:
-        """Let those who look for a change find one."""
-        self._count[0] += 1
+        """Let those who look for a change find one, if there is memory for a number."""
+        with suppress(MemoryError):
+            self._count[0] += 1
 
     def seen(self) -> int:
         """Return the number now, to be read before testing what it tells of."""
@@ -82,7 +83,7 @@ class Job(Generic[Result]):
     def __init__(self, call: Callable[[], Result], ended: Signal) -> None:
         self._call: Callable[[], Result] | None = call
         self._ended = ended
-        self._owner: dict[str, str] = {}
+        self._owner = {'': ''}  # with room for one more: taking the call needs no memory
         self._running = threading.Lock()
         self._running.acquire()
         self._is_done = False
