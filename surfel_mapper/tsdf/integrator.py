@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import INTERPOLATIONS, SEMANTICS, TsdfConfig
-from surfel_mapper.threads import pool, split
+from surfel_mapper.threads import share
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.kernels import lookup as kernels
 from surfel_mapper.tsdf.kernels.blocks import FREE_VISITS, STAMP
@@ -235,14 +235,14 @@ class Integrator:
             self._channels(stamp_ns),
         )
 
-        def fuse(part: slice) -> int:
-            where = tuple(values[part] for values in each)
-            return int(integrate_blocks(where, *common, found[part]))
+        lost: list[int] = []
 
-        helpers = pool(self._threads)
-        parts = split(len(rows), self._threads)
-        lost = [helpers.submit(fuse, part) for part in parts[1:]] if helpers else []
-        return found, fuse(parts[0]) + sum(one.result() for one in lost)
+        def fuse(part: slice) -> None:
+            where = tuple(values[part] for values in each)
+            lost.append(int(integrate_blocks(where, *common, found[part])))
+
+        share(fuse, len(rows), self._threads)
+        return found, sum(lost)
 
     def _free_for_long(self, rows: Int64) -> npt.NDArray[np.bool_]:
         """
