@@ -55,7 +55,7 @@ class Signal:
             self._count[0] += 1
 
     def seen(self) -> int:
-        """Return the number now, to be read before testing what it tells of."""
+        """Return the number now; read it before you check whether there is anything to wait for."""
         return int(self._count[0])
 
     def changes(self, seen: int) -> bool:

@@ -125,7 +125,7 @@ def together(work: Callable[[], object], threads: int) -> None:
     try:
         for _ in range(threads - 1):
             job = helpers.job(work)
-            helping.append(job)  # first: what has begun must end here, whatever comes between
+            helping.append(job)  # before it can begin: an interrupt may come between the two
             helpers.give(job)
         work()
     finally:  # not in a function: Ctrl-C may come before its first line
