@@ -55,7 +55,7 @@ class Signal:
             self._count[0] += 1
 
     def seen(self) -> int:
-        """Return the number now; read it before you check whether there is anything to wait for."""
+        """Return the number now; read it before you check whether there is something to do."""
         return int(self._count[0])
 
     def changes(self, seen: int) -> bool:
