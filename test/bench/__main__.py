@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
         'The street is simulated once, 1.6 MB a scan, and kept in --cache. Peers come from PyPI\n'
         'at the first call with --peers, into environments of their own in --cache (1.2 GB), and\n'
         'take about ten minutes. Both may be deleted at any time. Then all benches\n'
-        'with --peers take two and a quarter hours; each prints its seconds.',
+        'with --peers take about two hours; each prints its seconds.',
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument(
