@@ -101,6 +101,10 @@ LAYOUTS = {
     'padded to 16': ([*XYZ, ('intensity', 12, 7)], 16),
     '22 bytes': ([*XYZ, ('intensity', 12, 7), ('ring', 16, 4), ('time', 18, 7)], 22),
     '26 bytes, float64 time': ([*XYZ, ('intensity', 12, 7), ('ring', 16, 4), ('t', 18, 8)], 26),
+    '32 bytes': ([*XYZ, ('intensity', 16, 7), ('ring', 20, 4), ('time', 24, 7)], 32),
+    'behind a word, 16 bytes': ([('i', 0, 7), ('x', 4, 7), ('y', 8, 7), ('z', 12, 7)], 16),
+    'between words, 16 bytes': ([('i', 0, 2), ('x', 1, 7), ('y', 5, 7), ('z', 9, 7)], 16),
+    'backwards, 32 bytes': ([('z', 20, 7), ('y', 24, 7), ('x', 28, 7), ('t', 0, 8)], 32),
     '48 bytes': ([*XYZ, ('intensity', 16, 7), ('t', 20, 6), ('ring', 26, 2), ('n', 32, 6)], 48),
     'float64': ([('x', 0, 8), ('y', 8, 8), ('z', 16, 8)], 24),
     'float64, not aligned': ([('x', 1, 8), ('y', 9, 8), ('z', 17, 8), ('i', 0, 1)], 25),
@@ -125,6 +129,16 @@ def test_a_layout_of_a_sensor_decodes(name, big):
 @pytest.mark.parametrize('name', LAYOUTS)
 def test_padded_rows_decode_in_the_order_of_the_points(name):
     assert_decodes(message(*LAYOUTS[name], height=4, width=5, padding=3))
+
+
+@pytest.mark.parametrize('width', [1, 2, 15, 16, 17, 100])
+@pytest.mark.parametrize('name', ['padded to 16', 'behind a word, 16 bytes', '32 bytes'])
+def test_any_number_of_points_of_whole_words_decodes(name, width):
+    msg = message(*LAYOUTS[name], width=width)
+    assert_decodes(replace(msg, data=bytes(msg.data)))
+    shifted = np.empty(len(msg.data) + 1, np.uint8)[1:]  # words of the message between words
+    shifted[:] = msg.data
+    assert_decodes(replace(msg, data=shifted))
 
 
 def test_organised_points_are_in_the_order_of_their_rows():
