@@ -310,14 +310,10 @@ def packed(
     found: npt.NDArray[Any] = np.empty((num_points, 3), dtype, order='F')
     if len(kinds) == 1 and dtype in kinds:
         # loads numba, for which an `info` of a bag without clouds does not wait
-        from surfel_mapper.messages.kernels.coordinates import gather_coordinates, gather_words
+        from surfel_mapper.messages.kernels.coordinates import gather_coordinates
 
         for values in views:
             values.flags.writeable = False  # as of bytes: a writable array is another type
-        words, step = words_of(views)
-        if step in (4, 8):
-            gather_words(words, step, found.T)
-            return found
         x, y, z = map(np.atleast_2d, views)
         gather_coordinates(x, y, z, found.T)
         return found
@@ -326,29 +322,11 @@ def packed(
     return found
 
 
-def words_of(views: list[npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], int]:
-    """
-    Return the words (M,) from the first x on, and the number of words from each x to the next.
-
-    It is 0 unless the points are float32 at whole words, in one row, and y and z follow each x.
-    """
-    first = views[0]
-    at = [values.ctypes.data for values in views]
-    if first.dtype != np.float32 or first.ndim != 1 or not len(first) or not first.flags.aligned:
-        return first, 0
-    step, rest = divmod(first.strides[0], 4)
-    if rest or step < 3 or [place - at[0] for place in at] != [0, 4, 8]:
-        return first, 0
-    num = (len(first) - 1) * step + 3
-    return np.lib.stride_tricks.as_strided(first, (num,), (4,), writeable=False), step
-
-
 def warm_up() -> None:
-    """Compile the kernels that decode clouds of float32."""
-    points = np.zeros((2, 4), np.float32)  # a view of a single one would be contiguous
-    for names in ('xyz', 'xyzi'):
-        cloud = from_columns(dict(zip(names, points.T, strict=False)))
-        _ = to_scan(parse_cloud(cloud_bytes(cloud, stamp_ns=0, frame_id=''))).points  # decodes
+    """Compile the kernel that decodes clouds of float32."""
+    points = np.zeros((2, 3), np.float32)  # a view of a single one would be contiguous
+    cloud = from_columns(dict(zip('xyz', points.T, strict=True)))
+    _ = to_scan(parse_cloud(cloud_bytes(cloud, stamp_ns=0, frame_id=''))).points  # decodes them
 
 
 def from_columns(columns: Mapping[str, npt.NDArray[Any]]) -> CloudBytes:
