@@ -149,7 +149,7 @@ def test_after_any_interrupt_nothing_goes_on_and_the_threads_still_work():
     helpers, begun = pool(2), []
 
     def work():
-        time.sleep(1e-4)
+        time.sleep(1e-4)  # both threads work for a while, so that interrupts come in between
         if threading.current_thread() is not threading.main_thread():
             begun.append(True)
             time.sleep(1e-4)

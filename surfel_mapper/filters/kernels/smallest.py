@@ -107,8 +107,8 @@ def largest(squares, count):
     """
     Return the largest of the first squares.
 
-    Four maxima are kept, because one has to wait for the one before it: the search for 30
-    neighbours took 1.08 times as long.
+    With one maximum instead of four each comparison waits for the one before it, and the search
+    for 30 neighbours takes 1.08 times as long.
     """
     first = second = third = fourth = 0.0
     i = U(0)
