@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -41,10 +41,40 @@ MANY_LEAVES = 256
 
 Points = npt.NDArray[np.float64]
 Ids = npt.NDArray[np.int64]
-Rows = npt.NDArray[np.int32]
+Places = npt.NDArray[np.int32]
 
-Tree = tuple[npt.NDArray[Any], ...]
-"""As the kernels take it; see kernels/search_tree.py."""
+Kind = TypeVar('Kind', bound=np.generic)
+
+
+class SearchTree(NamedTuple):
+    """
+    A search tree of points, as the kernels take it; see kernels/search_tree.py.
+
+    What is found out about the points is in the order of the tree, in which points near each other
+    are next to each other, until by_row puts it into that of the input.
+    """
+
+    xyz: Points
+    order: Places
+    links: npt.NDArray[np.int32]
+    boxes: Points
+    leaves: npt.NDArray[np.int32]
+
+    @property
+    def points(self) -> tuple[Points, Points, Points]:
+        """Coordinates x, y and z of the points, (N,) each, m, in the order of the tree."""
+        x, y, z = self.xyz[:, : len(self.order)]
+        return x, y, z
+
+    def rows(self, places: Places, *, none: int) -> npt.NDArray[np.int32]:
+        """Return the rows of places, and for N a number that stands for none."""
+        return np.append(self.order, np.int32(none))[places]
+
+    def by_row(self, values: npt.NDArray[Kind]) -> npt.NDArray[Kind]:
+        """Return values (N, ...), one of each point, in the order of the input."""
+        result = np.empty_like(values)
+        result[self.order] = values
+        return result
 
 
 def coordinates(scan: Scan) -> Points:
@@ -70,8 +100,8 @@ def threads_of_search() -> Any:
     )
 
 
-def search_tree(points: Points, threads: int = 1) -> Tree:
-    """Return the search tree of points, (N, 3) finite, N > 0."""
+def search_tree(points: Points, threads: int = 1) -> SearchTree:
+    """Return the search tree of points, (N, 3) finite."""
     num_leaves = -(-len(points) // LEAF)
     order, xyz = np.arange(len(points), dtype=np.int32), np.empty((3, num_leaves * LEAF))
     xyz[:, len(points) :] = np.inf
@@ -80,7 +110,7 @@ def search_tree(points: Points, threads: int = 1) -> Tree:
     is_shared = threads > 1 and num_leaves >= MANY_LEAVES
     least = num_leaves // (PARTS * threads) if is_shared else 0
     tasks = np.empty((4 * PARTS * threads, 3), np.int64)
-    num_tasks = build_nodes(*arrays, 0, 0, num_leaves, least, tasks)
+    num_tasks = build_nodes(*arrays, 0, 0, num_leaves, least, tasks) if num_leaves else 0
 
     def build(part: slice) -> None:
         for node, begin, end in tasks[:num_tasks][part].tolist():
@@ -88,12 +118,12 @@ def search_tree(points: Points, threads: int = 1) -> Tree:
 
     share(build, int(num_tasks), threads)
     leaves = np.flatnonzero(links[RIGHT, : 2 * num_leaves - 1] < 0).astype(np.int32)
-    return xyz, order, links, boxes, leaves
+    return SearchTree(xyz, order, links, boxes, leaves)
 
 
 def visit_neighbours(
-    visit: Callable[[Rows, Rows, Points], object],
-    points: Points,
+    visit: Callable[[slice, Places, Points], object],
+    tree: SearchTree,
     number: int,
     max_distance_m: float = math.inf,
     *,
@@ -106,11 +136,12 @@ def visit_neighbours(
     Parameters
     ----------
     visit : callable
-        Called, maybe by several threads at once, with the rows (P,) int32 of some points, those
-        of their neighbours (P, number) int32, N past the last, and the squared distances to them
-        (P, number) float64, m^2, inf past the last. Each point is in one piece.
-    points : (N, 3) float64
-        Finite.
+        Called, maybe by several threads at once, with the slice of P points in the order of the
+        tree, the places of their neighbours in that order (P, number) int32, N past the last, and
+        the squared distances to them (P, number) float64, m^2, inf past the last. Each point is
+        in one piece.
+    tree : SearchTree
+        That of search_tree.
     number : int
         Neighbours of each, including the point itself or one at the same place; at most N.
     max_distance_m : float
@@ -122,23 +153,22 @@ def visit_neighbours(
         Threads that share the work; the pieces do not depend on it.
 
     """
-    if not len(points):
+    if not len(tree.order):
         return
-    tree = search_tree(points, threads)
     # squared for comparisons; the bound is exclusive, and its square must not underflow
     within = max(float(np.nextafter(max_distance_m, math.inf)), 1e-150)
     within_sq = within * within  # infinite if too large, which ** refuses
-    num_leaves = len(tree[-1])
+    num_leaves = len(tree.leaves)
     step = max(AT_ONCE // (number * LEAF), 1)
 
     def search(part: slice) -> None:
         for begin in range(part.start * step, min(part.stop * step, num_leaves), step):
             block = np.array([begin, min(begin + step, num_leaves)])
-            size = min(block[1] * LEAF, len(points)) - begin * LEAF
-            rows, ids = np.empty(size, np.int32), np.empty((size, number), np.int32)
-            squared = np.empty((size, number))
-            find_nearest(tree, block, within_sq, ordered, rows, ids, squared)
-            visit(rows, ids, squared)
+            points = slice(begin * LEAF, min((begin + step) * LEAF, len(tree.order)))
+            shape = points.stop - points.start, number
+            near, squared = np.empty(shape, np.int32), np.empty(shape)
+            find_nearest(tuple(tree), block, within_sq, ordered, near, squared)
+            visit(points, near, squared)
 
     share(search, -(-num_leaves // step), threads)
 
@@ -167,14 +197,15 @@ class StatisticalOutliers(FiniteFilter):
         number = min(self.num_neighbours + 1, len(points))  # the nearest is the point itself
         if number < 2 or self.std_ratio == math.inf:
             return np.ones(len(points), np.bool_)
+        tree = search_tree(points, self.threads)
         distances = np.empty(len(points))
 
-        def average(rows: Rows, _: Rows, squared: Points) -> None:
-            distances[rows] = np.sqrt(squared).sum(axis=1) / (number - 1)  # its own is 0
+        def average(part: slice, _: Places, squared: Points) -> None:
+            distances[part] = np.sqrt(squared).sum(axis=1) / (number - 1)  # its own is 0
 
-        visit_neighbours(average, points, number, threads=self.threads)
+        visit_neighbours(average, tree, number, threads=self.threads)
         limit = distances.mean() + self.std_ratio * distances.std(ddof=1)
-        return np.asarray(distances <= limit, np.bool_)
+        return tree.by_row(distances <= limit)
 
 
 @register
@@ -196,10 +227,11 @@ class RadiusOutliers(FiniteFilter):
             return np.zeros(len(points), np.bool_)
         if number == 1:
             return np.ones(len(points), np.bool_)
+        tree = search_tree(points, self.threads)
         stays = np.empty(len(points), np.bool_)
 
-        def decide(rows: Rows, ids: Rows, _: Points) -> None:
-            stays[rows] = ids[:, -1] < len(points)  # as many as asked for
+        def decide(part: slice, near: Places, _: Points) -> None:
+            stays[part] = near[:, -1] < len(points)  # as many as asked for
 
-        visit_neighbours(decide, points, number, self.radius_m, threads=self.threads)
-        return stays
+        visit_neighbours(decide, tree, number, self.radius_m, threads=self.threads)
+        return tree.by_row(stays)

@@ -36,8 +36,10 @@ from surfel_mapper.filters.kernels.shapes import group_moments, neighbour_moment
 from surfel_mapper.filters.neighbours import (
     coordinates,
     Ids,
+    Places,
     Points,
-    Rows,
+    search_tree,
+    SearchTree,
     threads_of_search,
     visit_neighbours,
 )
@@ -88,12 +90,12 @@ class Moments:
         return cls(count, mean, covariance, radius)
 
     @classmethod
-    def of_neighbours(cls, points: Points, ids: Rows) -> Moments:
-        """Return the moments of neighbours, from their rows (M, K), padded by N at the end."""
-        number = len(ids)
+    def of_neighbours(cls, tree: SearchTree, near: Places) -> Moments:
+        """Return the moments of neighbours, from their places (M, K), N past the last."""
+        number = len(near)
         count, mean = np.empty(number, np.int64), np.empty((number, 3))
         covariance, radius = np.empty((6, number)), np.empty(number)
-        neighbour_moments(points, ids, count, mean, covariance, radius)
+        neighbour_moments(*tree.points, near, count, mean, covariance, radius)
         return cls(count, mean, covariance, radius)
 
     @property
@@ -272,27 +274,30 @@ class SurfaceNormal(ShapeFilter):
         """Return the scan with the columns added."""
         points = coordinates(scan)
         number = min(self.num_neighbours, len(points))
-        none = self.describe(points, np.empty(0, np.int32), np.empty((0, 1), np.int32))
+        tree = search_tree(points, self.threads)
+        none = self.describe(tree, slice(0, 0), np.empty((0, 1), np.int32))
         columns: dict[str, npt.NDArray[Any]] = {
             name: np.empty((len(points), *column.shape[1:])) for name, column in none.items()
         }
         ids = np.empty((len(points), number), np.int32) if self.needs_ids else None
 
-        def describe(rows: Rows, near: Rows, _: Points) -> None:
-            # piece by piece, in the cache: the pieces' rows are scattered over the whole scan
-            for name, column in self.describe(points, rows, near).items():
-                columns[name][rows] = column
+        def describe(part: slice, near: Places, _: Points) -> None:
+            for name, column in self.describe(tree, part, near).items():
+                columns[name][part] = column
             if ids is not None:
-                ids[rows] = np.where(near < len(points), near, -1)
+                ids[part] = tree.rows(near, none=-1)
 
         visit_neighbours(
             describe,
-            points,
+            tree,
             number,
             self.max_distance_m,
             ordered=self.needs_ids,
             threads=self.threads,
         )
+        columns = {name: tree.by_row(column) for name, column in columns.items()}
+        if ids is not None:
+            ids = tree.by_row(ids)
         if self.smooth_normals and self.keep_normals and ids is not None:
             columns[NORMALS] = smoothed(columns[NORMALS], ids)
         columns = {name: column.astype(scan.points.dtype) for name, column in columns.items()}
@@ -300,16 +305,19 @@ class SurfaceNormal(ShapeFilter):
             columns[MATCHED_IDS] = ids
         return with_columns(scan, **columns)
 
-    def describe(self, points: Points, rows: Rows, near: Rows) -> dict[str, npt.NDArray[Any]]:
-        """Return the selected columns of some points, from the rows of their neighbours."""
-        moments = Moments.of_neighbours(points, near)
+    def describe(
+        self, tree: SearchTree, part: slice, near: Places
+    ) -> dict[str, npt.NDArray[Any]]:
+        """Return the selected columns of a part of the points, from their neighbours."""
+        moments = Moments.of_neighbours(tree, near)
         columns = self.shape_columns(
             *eigen(moments.covariance, smallest_only=not self.keep_eigen_vectors), moments.count
         )
         if self.keep_densities:
             columns[DENSITIES] = moments.density
         if self.keep_mean_distances:
-            columns[MEAN_DISTS] = np.linalg.norm(points[rows] - moments.mean, axis=1)
+            points = np.stack([values[part] for values in tree.points], axis=1)
+            columns[MEAN_DISTS] = np.linalg.norm(points - moments.mean, axis=1)
         return columns
 
     @property

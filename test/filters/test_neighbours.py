@@ -8,21 +8,22 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from surfel_mapper.filters.neighbours import visit_neighbours
+from surfel_mapper.filters.neighbours import search_tree, visit_neighbours
 from surfel_mapper.filters.shapes import as_matrices, eigen, Moments, PAIRS, shares
 from test.filters.examples import filter_of, kept, random_scan, scan_of
 
 
 def all_neighbours(points, number, *limits, threads=1):
+    tree = search_tree(points, threads)
     ids = np.full((len(points), number), -7)
     distances = np.full((len(points), number), np.nan)
 
-    def gather(rows, near, squared):
-        assert (ids[rows] == -7).all()  # no point is visited twice
-        ids[rows], distances[rows] = near, np.sqrt(squared)
+    def gather(part, near, squared):
+        assert (ids[part] == -7).all()  # no point is visited twice
+        ids[part], distances[part] = tree.rows(near, none=len(points)), np.sqrt(squared)
 
-    visit_neighbours(gather, points, number, *limits, ordered=True, threads=threads)
-    return ids, distances
+    visit_neighbours(gather, tree, number, *limits, ordered=True, threads=threads)
+    return tree.by_row(ids), tree.by_row(distances)
 
 
 def cloud(number=400, seed=1):
@@ -118,17 +119,19 @@ def test_threads_make_no_difference_to_filters(name):
 
 
 def test_without_points_there_is_nothing_to_search():
-    visit_neighbours(pytest.fail, np.empty((0, 3)), 3)
+    visit_neighbours(pytest.fail, search_tree(np.empty((0, 3))), 3)
 
 
 def test_moments_are_those_of_numpy():
     points = cloud(60)
     rows = np.arange(60) % 7
     by_group = Moments.of_groups(points, rows, 7)
-    by_ids = Moments.of_neighbours(points, np.flatnonzero(rows == 3)[None].astype(np.int32))
+    tree = search_tree(points)
+    near = np.flatnonzero(rows[tree.order] == 3)[None].astype(np.int32)
+    by_places = Moments.of_neighbours(tree, near)
     inside = points[rows == 3]
     expected = np.cov(inside.T)
-    for found, i in ((by_group, 3), (by_ids, 0)):
+    for found, i in ((by_group, 3), (by_places, 0)):
         np.testing.assert_allclose(found.mean[i], inside.mean(axis=0), atol=1e-15)
         np.testing.assert_allclose(as_matrices(found.covariance)[i], expected, atol=1e-15)
         radius = np.linalg.norm(inside - inside.mean(axis=0), axis=1).max()

@@ -195,7 +195,7 @@ def gather(links, boxes, leaf, reach, stack, near, bases):
 
 
 @kernel(error_model='numpy', fastmath={'nnan'})
-def find_nearest(tree, block, within_sq, ordered, rows, ids, squared):
+def find_nearest(tree, block, within_sq, ordered, near, squared):
     """
     Find the nearest neighbours of the points of some leaves.
 
@@ -203,21 +203,20 @@ def find_nearest(tree, block, within_sq, ordered, rows, ids, squared):
     block      (2,) int64, the first leaf, and the one after the last
     within_sq  float64, m^2: only points closer than this
     ordered    bool, whether neighbours are sorted by distance, equal ones by row
-    rows       (P,) int32, out: rows of the points asked for
-    ids        (P, k) int32, out: rows of their neighbours, N past the last
+    near       (P, k) int32, out: neighbours' places in the order of the tree, N past the last
     squared    (P, k) float64, out: squared distances, m^2, inf past the last
     """
     xyz, order, links, boxes, leaves = tree
     xs, ys, zs = xyz[0], xyz[1], xyz[2]
-    k = U(ids.shape[1])
+    k = U(near.shape[1])
     size = (max(U(2) * k, k + U(32)) + U(LEAF + VECTORS - 1)) & ~U(VECTORS - 1)
     full = size - U(LEAF)
     squares, found, apart = np.empty(size), np.empty(size, np.int32), np.empty(LEAF)
     floats = np.empty(FLOATS, np.float32)
     held = squares, found, floats
-    stack, near = np.empty(128, np.int64), np.empty((6, GATHERED))
-    low_x, low_y, low_z = near[0], near[1], near[2]
-    high_x, high_y, high_z = near[3], near[4], near[5]
+    stack, sides = np.empty(128, np.int64), np.empty((6, GATHERED))
+    low_x, low_y, low_z = sides[0], sides[1], sides[2]
+    high_x, high_y, high_z = sides[3], sides[4], sides[5]
     bases, taken, gaps = np.empty(GATHERED, U), np.empty(GATHERED, U), np.empty(GATHERED)
     bound, last_x, last_y, last_z = within_sq, 0.0, 0.0, 0.0
     out = U(0)
@@ -226,7 +225,7 @@ def find_nearest(tree, block, within_sq, ordered, rows, ids, squared):
         start = U(leaf * LEAF)
         num = U(min(LEAF, len(order) - leaf * LEAF))
         reach = min(reach_of(links, boxes, node, np.int64(k), len(order)), within_sq)
-        num_near = gather(links, boxes, node, reach, stack, near, bases)
+        num_near = gather(links, boxes, node, reach, stack, sides, bases)
         for place in range(start, start + num):
             x, y, z = xs[place], ys[place], zs[place]
             bound = widened(bound, square(x - last_x, y - last_y, z - last_z), reach)
@@ -262,11 +261,10 @@ def find_nearest(tree, block, within_sq, ordered, rows, ids, squared):
             else:
                 bound = largest(squares, k) if count == k else within_sq
             count = min(count, k)
-            rows[out] = order[place]
             if ordered:
                 sort(squares, found, order, count)
             for i in range(count):
-                ids[out, i], squared[out, i] = order[U(found[i])], squares[i]
+                near[out, i], squared[out, i] = found[i], squares[i]
             for i in range(count, k):
-                ids[out, i], squared[out, i] = len(order), math.inf
+                near[out, i], squared[out, i] = len(order), math.inf
             out += U(1)

@@ -52,33 +52,33 @@ def group_moments(points, rows, count, mean, covariance, radius):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def neighbour_moments(points, ids, count, mean, covariance, radius):
+def neighbour_moments(xs, ys, zs, near, count, mean, covariance, radius):
     """
     Compute the moments of the neighbours of points.
 
-    points      (N, 3) float64, m
-    ids         (M, K) int32, rows of the neighbours, padded by N at the end
+    xs, ys, zs  (N,) float64, m
+    near        (M, K) int32, places of the neighbours in these, padded by N at the end
     count       (M,) int64, out: number of neighbours
     mean        (M, 3) float64, out, m
     covariance  (6, M) float64, out: xx xy xz yy yz zz of scatter / (count - 1), m^2
     radius      (M,) float64, out: from the mean to the farthest, m
     """
-    for i in range(np.uint64(len(ids))):
-        number = np.uint64(ids.shape[1])
-        while number > np.uint64(0) and ids[i, number - np.uint64(1)] == len(points):
+    for i in range(np.uint64(len(near))):
+        number = np.uint64(near.shape[1])
+        while number > np.uint64(0) and near[i, number - np.uint64(1)] == len(xs):
             number -= np.uint64(1)
         sx, sy, sz = 0.0, 0.0, 0.0
         for k in range(number):
-            row = np.uint64(ids[i, k])
-            sx += points[row, 0]
-            sy += points[row, 1]
-            sz += points[row, 2]
+            place = np.uint64(near[i, k])
+            sx += xs[place]
+            sy += ys[place]
+            sz += zs[place]
         held = np.float64(number)
         mx, my, mz = sx / held, sy / held, sz / held
         xx, xy, xz, yy, yz, zz, far_sq = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(number):
-            row = np.uint64(ids[i, k])
-            x, y, z = points[row, 0] - mx, points[row, 1] - my, points[row, 2] - mz
+            place = np.uint64(near[i, k])
+            x, y, z = xs[place] - mx, ys[place] - my, zs[place] - mz
             xx += x * x
             xy += x * y
             xz += x * z

@@ -222,7 +222,7 @@ def test_moments_of_neighbours_equal_numpy(call):
     ids[3, 2:], ids[4, 1:] = 40, 40
     count, mean = np.empty(10, np.int64), np.empty((10, 3))
     covariance, radius = np.empty((6, 10)), np.empty(10)
-    call(neighbour_moments, points, ids, count, mean, covariance, radius)
+    call(neighbour_moments, *points.T.copy(), ids, count, mean, covariance, radius)
     assert count.tolist() == [6, 6, 6, 2, 1, 6, 6, 6, 6, 6]
     for row, near in enumerate(ids):
         expected = numpy_moments(points[near[near < 40]])
