@@ -13,8 +13,10 @@ from surfel_mapper.kernels.lanes import (
     load_sums,
     masked_sum,
     num_below,
+    NUMBERS,
     num_used,
     place_of_half,
+    place_of_least,
     plus_place,
     store_sums,
     WIDEST,
@@ -177,3 +179,32 @@ def test_floats_below_a_limit_are_counted_wherever_they_are(call):
         floats = np.ones(FLOATS, np.float32)
         floats[place] = 0.0
         assert call(count_below, floats, np.float32(1.0)) == 1
+
+
+@njit
+def least_of(numbers, passed):
+    return place_of_least(numbers, passed)
+
+
+@both
+def test_the_least_number_not_passed_over_is_found_wherever_it_is(call):
+    rng = np.random.default_rng(6)
+    for _ in range(200):
+        numbers = np.zeros(NUMBERS + 8)  # those past the last do not count
+        numbers[:NUMBERS] = rng.choice([0.0, 1e-300, 0.25, 0.5, 7.0, 1e300, np.inf], NUMBERS)
+        passed = int(rng.integers(0, 2**NUMBERS - 1))
+        left = [i for i in range(NUMBERS) if not passed >> i & 1]
+        expected = min(left, key=lambda i: numbers[i])
+        assert call(least_of, numbers, np.uint64(passed)) == expected
+    for place in range(NUMBERS):
+        only = np.uint64(2**NUMBERS - 1 - 2**place)
+        assert call(least_of, np.full(NUMBERS, np.inf), only) == place
+    assert call(least_of, np.zeros(NUMBERS), np.uint64(2**NUMBERS - 1)) == NUMBERS - 1
+
+
+@both
+def test_numbers_that_differ_by_more_than_the_places_in_their_bits_are_told_apart(call):
+    for number in (1e-12, 0.3, 1.0, 1.99, 5e5):
+        numbers = np.full(NUMBERS, number)
+        numbers[9] *= 1.0 - 2.0**-15
+        assert call(least_of, numbers, np.uint64(0)) == 9

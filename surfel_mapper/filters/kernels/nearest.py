@@ -21,7 +21,7 @@ import numpy as np
 from surfel_mapper.filters.kernels.search_tree import FIRST, LEAF, PARENT, RIGHT
 from surfel_mapper.filters.kernels.smallest import keep_least, largest, sort, VECTORS
 from surfel_mapper.kernels.compiling import kernel, part, U
-from surfel_mapper.kernels.lanes import FLOATS
+from surfel_mapper.kernels.lanes import FLOATS, place_of_least
 
 GATHERED = 256
 """Maximum number of leaves gathered for one leaf; if there are more, its points are searched for
@@ -219,14 +219,15 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
     high_x, high_y, high_z = sides[3], sides[4], sides[5]
     bases, taken, gaps = np.empty(GATHERED, U), np.empty(GATHERED, U), np.empty(GATHERED)
     bound, last_x, last_y, last_z = within_sq, 0.0, 0.0, 0.0
-    out = U(0)
     for leaf in range(block[0], block[1]):
         node = np.int64(leaves[leaf])
         start = U(leaf * LEAF)
         num = U(min(LEAF, len(order) - leaf * LEAF))
         reach = min(reach_of(links, boxes, node, np.int64(k), len(order)), within_sq)
         num_near = gather(links, boxes, node, reach, stack, sides, bases)
-        for place in range(start, start + num):
+        at, visited = U(0), U(0)
+        for _ in range(num):
+            place, out = start + at, start + at - U(block[0] * LEAF)
             x, y, z = xs[place], ys[place], zs[place]
             bound = widened(bound, square(x - last_x, y - last_y, z - last_z), reach)
             last_x, last_y, last_z = x, y, z
@@ -234,6 +235,7 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
                 count, bound = search(
                     xs, ys, zs, links, boxes, node, x, y, z, k, bound, held, apart, stack
                 )
+                at += U(1)
             else:
                 for i in range(U(num_near)):
                     dx = outside(low_x[i], high_x[i], x)
@@ -241,6 +243,8 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
                     dz = outside(low_z[i], high_z[i], z)
                     gaps[i] = square(dx, dy, dz)
                 count = scan(xs, ys, zs, start, x, y, z, bound, U(0), squares, found, apart)
+                visited |= U(1) << at
+                at = U(place_of_least(apart, visited))
                 if count > k:
                     bound = keep_least(squares, found, count, k, bound, floats)
                     count = k
@@ -267,4 +271,3 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
                 near[out, i], squared[out, i] = found[i], squares[i]
             for i in range(count, k):
                 near[out, i], squared[out, i] = len(order), math.inf
-            out += U(1)
