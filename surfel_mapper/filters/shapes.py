@@ -134,7 +134,7 @@ def eigen(matrices: Points, *, smallest_only: bool = False) -> tuple[Points, Poi
         smallest_vectors(values, smallest, vectors)
     else:
         eigenvectors(matrices, values, smallest, vectors)
-    return values.T.copy(), vectors
+    return values.T, vectors
 
 
 def eigen_by_size(matrices: Points) -> tuple[Points, Points]:
@@ -279,7 +279,9 @@ class SurfaceNormal(ShapeFilter):
         columns: dict[str, npt.NDArray[Any]] = {
             name: np.empty((len(points), *column.shape[1:])) for name, column in none.items()
         }
-        ids = np.empty((len(points), number), np.int32) if self.needs_ids else None
+        ids: npt.NDArray[np.int32] | None = (
+            np.empty((len(points), number), np.int32) if self.needs_ids else None
+        )
 
         def describe(part: slice, near: Places, _: Points) -> None:
             for name, column in self.describe(tree, part, near).items():
@@ -305,9 +307,7 @@ class SurfaceNormal(ShapeFilter):
             columns[MATCHED_IDS] = ids
         return with_columns(scan, **columns)
 
-    def describe(
-        self, tree: SearchTree, part: slice, near: Places
-    ) -> dict[str, npt.NDArray[Any]]:
+    def describe(self, tree: SearchTree, part: slice, near: Places) -> dict[str, npt.NDArray[Any]]:
         """Return the selected columns of a part of the points, from their neighbours."""
         moments = Moments.of_neighbours(tree, near)
         columns = self.shape_columns(

@@ -86,10 +86,10 @@ def neighbour_moments(xs, ys, zs, near, count, mean, covariance, radius):
             yz += y * z
             zz += z * z
             far_sq = max(far_sq, (x * x + y * y) + z * z)
-        free = max(held - 1.0, 1.0)
+        share = 1.0 / max(held - 1.0, 1.0)
         count[i] = np.int64(number)
         mean[i, 0], mean[i, 1], mean[i, 2] = mx, my, mz
-        covariance[0, i], covariance[1, i] = xx / free, xy / free
-        covariance[2, i], covariance[3, i] = xz / free, yy / free
-        covariance[4, i], covariance[5, i] = yz / free, zz / free
+        covariance[0, i], covariance[1, i] = xx * share, xy * share
+        covariance[2, i], covariance[3, i] = xz * share, yy * share
+        covariance[4, i], covariance[5, i] = yz * share, zz * share
         radius[i] = math.sqrt(far_sq)
