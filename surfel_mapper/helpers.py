@@ -94,6 +94,11 @@ class Job(Generic[Result]):
         """Take the call for someone unless another one has; return whether they have it now."""
         return self._owner.setdefault('owner', who) == who  # one step, however often repeated
 
+    @property
+    def is_done(self) -> bool:
+        """Whether the call has ended."""
+        return self._is_done
+
     def cancel(self) -> bool:
         """Cancel the call unless it has begun; return whether it is cancelled."""
         if not self._is_taken_by('caller'):

@@ -6,14 +6,17 @@ Reduction of scans to the exact moments that enter the map and the window, and t
 With ``map.threads`` another thread deskews, filters and reduces the next two scans while the map
 takes the one before them. None of these reads anything of the map, so the order changes no bit.
 Work that was begun is used only for the same scan at the same pose; otherwise it is done again.
+Scans are decoded by the other thread too, but by this one while it would have to wait.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +39,9 @@ Step = Callable[[], object]
 
 AHEAD = 2
 """Scans that are begun ahead: after the first, the thread has work while the next is decoded."""
+
+LONG_WAIT_S = 0.0003
+"""Wait for the other thread after which this one decodes scans, which takes 0.1 to 0.5 ms."""
 
 
 class WarmUpSteps(NamedTuple):
@@ -103,6 +109,8 @@ class Reduction:
         self._pool = pool(threads)
         self.scans_ahead = AHEAD if self._pool is not None else 0
         self._begun: deque[Begun] = deque(maxlen=AHEAD)
+        self._waited_s = 0.0
+        self._decodes = False
 
     def begin(
         self,
@@ -121,6 +129,11 @@ class Reduction:
             return
         if any(begun.is_of(scan, T_map_sensor, config) for begun in self._begun):
             return
+        is_behind = bool(self._begun) and not self._begun[-1].result.is_done
+        self._decodes = is_behind and (self._decodes or self._waited_s > LONG_WAIT_S)
+        if self._decodes:
+            with suppress(MemoryError):  # the other thread tries again, and has it reported
+                _ = scan.points
         work = prepare(scan, T_map_sensor)
         result = self._pool.submit(run_ahead, work, T_map_sensor, self._map, config)
         self._begun.append(Begun(scan, T_map_sensor, config, result))
@@ -137,8 +150,14 @@ class Reduction:
             self._begun.popleft()
         if not self._begun:
             return None
-        result = self._begun[0].result
-        return lambda: result.result().points
+        return partial(self._wait_for, self._begun[0].result)
+
+    def _wait_for(self, result: Job[Ahead]) -> FilteredScan:
+        """Return the points of a scan that was begun, and note how long that took."""
+        start = perf_counter()
+        points = result.result().points
+        self._waited_s = perf_counter() - start
+        return points
 
     def reduce(self, scan: Scan, T_map_sensor: Transform, config: Config) -> WindowedScan:
         """

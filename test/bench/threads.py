@@ -3,8 +3,8 @@
 """
 Two threads against one on the same scans, from decode to normals.
 
-``calls``: one thread decodes and reduces the next scan while the other inserts this one and
-derives its normals. ``Mapper``: the pipeline with ``map.threads`` 2 and more scans waiting, as in
+``calls``: one thread decodes and reduces the next two scans, as in the pipeline, while the other
+inserts this one and derives its normals. ``Mapper``: the pipeline with ``map.threads`` 2 and more scans waiting, as in
 a replay or a node with a backlog; ``prepared`` is the same with deskewing and a chain of filters,
 which the other thread does too. Two threads and one take turns, forty scans at a time, and every
 other turn in the opposite order; ``ratio`` is the median of the ratios of the turns. At the start
@@ -14,6 +14,7 @@ scans; of twenty scans that was 4 %. The maps are compared at the end.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 import json
 from pathlib import Path
@@ -24,10 +25,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from surfel_mapper.config import Config
+from surfel_mapper.helpers import Job
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.messages.pointcloud2 import RawCloud, to_scan
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.reduction import AHEAD
 from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
 from surfel_mapper.threads import pool
 from test.bench.options import Options
@@ -70,12 +73,13 @@ class ByCalls(Ours):
     def _ahead(self, turn: Turn) -> Iterator[ScanMoments]:
         """Yield the moments of every scan while the other thread makes those of the next."""
         assert self._helper is not None
-        begun = self._helper.submit(self._moments, turn[0])
-        for scan in turn[1:]:
-            moments = begun.result()
-            begun = self._helper.submit(self._moments, scan)
-            yield moments
-        yield begun.result()
+        begun: deque[Job[ScanMoments]] = deque()
+        for scan in turn:
+            begun.append(self._helper.submit(self._moments, scan))
+            if len(begun) > AHEAD:
+                yield begun.popleft().result()
+        while begun:
+            yield begun.popleft().result()
 
     def _moments(self, scan: tuple[int, RawCloud]) -> ScanMoments:
         number, message = scan

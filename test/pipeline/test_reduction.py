@@ -9,6 +9,7 @@ comes between two scans.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 import threading
 
@@ -142,6 +143,79 @@ def test_points_are_decoded_by_the_thread_that_reduces_them(threads, is_here):
     assert mapper.counters.dropped['no_pose'] == 1
     assert [thread == threading.get_ident() for thread in decoded_by[1:]] == [is_here] * 2
     assert len(decoded_by) == 3
+
+
+class BehindReduction:
+    """A reduction whose other thread works on each scan only once it is let go."""
+
+    def __init__(self):
+        self.gates = [threading.Event() for _ in range(3)]
+        self.decoded_by = {}
+        self.failures = []
+        self._reduction, self._config = Reduction(SurfelMap(0.5), 2), Config()
+        self.scans = [
+            Scan(points=LazyPoints(20, partial(self._decode, i)), stamp_ns=i, frame_id='lidar')
+            for i in range(3)
+        ]
+
+    def _decode(self, number):
+        if self.failures:
+            raise self.failures.pop()
+        self.decoded_by[number] = threading.get_ident()
+        return np.random.default_rng(number).uniform(-3.0, 3.0, (20, 3))
+
+    def begin(self, number):
+        def prepare(scan, _):
+            return lambda: self.gates[number].wait(60) and FilteredScan(scan, scan)
+
+        self._reduction.begin(self.scans[number], np.eye(4), self._config, prepare)
+
+    def end(self, number):
+        arguments = self.scans[number], np.eye(4), self._config
+        assert self._reduction.begun(*arguments)().filtered is self.scans[number]
+        return self._reduction.reduce(*arguments).moments.num_points
+
+
+def test_scans_are_decoded_here_if_the_other_thread_is_behind_and_was_waited_for():
+    slow, here = BehindReduction(), threading.get_ident()
+    slow.begin(0)
+    slow.begin(1)
+    assert slow.decoded_by == {}  # it is behind, but no one has waited
+    threading.Timer(0.05, slow.gates[0].set).start()
+    assert slow.end(0) == 20
+    slow.begin(2)
+    assert slow.decoded_by.pop(2) == here
+    slow.gates[1].set()
+    slow.gates[2].set()
+    assert slow.end(1) == slow.end(2) == 20
+    assert set(slow.decoded_by) == {0, 1}
+    assert here not in slow.decoded_by.values()
+
+
+def test_no_scan_is_decoded_here_if_the_other_thread_has_nothing_left_to_do():
+    slow = BehindReduction()
+    slow.begin(0)
+    threading.Timer(0.05, slow.gates[0].set).start()
+    assert slow.end(0) == 20
+    slow.begin(1)
+    assert set(slow.decoded_by) == {0}
+    slow.gates[1].set()
+    assert slow.end(1) == 20
+
+
+def test_without_memory_to_decode_here_the_other_thread_decodes():
+    slow = BehindReduction()
+    slow.begin(0)
+    slow.begin(1)
+    threading.Timer(0.05, slow.gates[0].set).start()
+    assert slow.end(0) == 20
+    slow.failures.append(MemoryError('as if there was none'))
+    slow.begin(2)
+    assert slow.failures == []
+    assert 2 not in slow.decoded_by
+    slow.gates[1].set()
+    slow.gates[2].set()
+    assert slow.end(1) == slow.end(2) == 20
 
 
 def test_scans_that_wait_together_are_mapped_together():
