@@ -173,6 +173,18 @@ def visit_neighbours(
     share(search, -(-num_leaves // step), threads)
 
 
+def neighbour_rows(points: Points, number: int, threads: int = 1) -> npt.NDArray[np.int32]:
+    """Return the rows of the nearest neighbours of N points, (N, number), number <= N, in order."""
+    tree = search_tree(points, threads)
+    ids = np.empty((len(points), number), np.int32)
+
+    def gather(part: slice, near: Places, _: Points) -> None:
+        ids[part] = tree.order[near]
+
+    visit_neighbours(gather, tree, number, ordered=True, threads=threads)
+    return tree.by_row(ids)
+
+
 INT32_MAX = 2**31 - 1
 
 

@@ -46,11 +46,9 @@ from surfel_mapper.filters.columns import NORMALS
 from surfel_mapper.filters.kernels.tensor_voting import closed_form_votes, first_votes
 from surfel_mapper.filters.neighbours import (
     coordinates,
-    Places,
+    neighbour_rows,
     Points,
-    search_tree,
     threads_of_search,
-    visit_neighbours,
 )
 from surfel_mapper.filters.registry import register
 from surfel_mapper.filters.shapes import eigen, eigen_by_size, PAIRS
@@ -129,14 +127,8 @@ class Voting:
     def among(cls, points: Points, filter_: VotingFilter) -> Voting:
         """Return the voting of the nearest neighbours of each point, with a filter's settings."""
         number = min(filter_.num_neighbours + 1, len(points))  # the nearest is the point itself
-        tree = search_tree(points, filter_.threads)
-        ids = np.empty((len(points), number), np.int32)
-
-        def gather(part: slice, near: Places, _: Points) -> None:
-            ids[part] = tree.rows(near, none=len(points))
-
-        visit_neighbours(gather, tree, number, ordered=True, threads=filter_.threads)
-        return cls(points, tree.by_row(ids), filter_.sigma, filter_.symmetric_votes)
+        ids = neighbour_rows(points, number, filter_.threads)
+        return cls(points, ids, filter_.sigma, filter_.symmetric_votes)
 
     def first(self) -> Votes:
         """Return the votes of voters without tensors, sparse."""

@@ -4,12 +4,12 @@
 Two threads against one on the same scans, from decode to normals.
 
 ``calls``: one thread decodes and reduces the next two scans, as in the pipeline, while the other
-inserts this one and derives its normals. ``Mapper``: the pipeline with ``map.threads`` 2 and more scans waiting, as in
-a replay or a node with a backlog; ``prepared`` is the same with deskewing and a chain of filters,
-which the other thread does too. Two threads and one take turns, forty scans at a time, and every
-other turn in the opposite order; ``ratio`` is the median of the ratios of the turns. At the start
-of a turn one thread waits until the other has reduced the first scan, as in a replay once for all
-scans; of twenty scans that was 4 %. The maps are compared at the end.
+inserts this one and derives its normals. ``Mapper``: the pipeline with ``map.threads`` 2 and more
+scans waiting, as in a replay or a node with a backlog; ``prepared`` is the same with deskewing and
+a chain of filters, which the other thread does too. Two threads and one take turns, forty scans at
+a time, and every other turn in the opposite order; ``ratio`` is the median of the ratios of the
+turns. At the start of a turn one thread waits until the other has reduced the first scan, as in a
+replay once for all scans; of twenty scans that was 4 %. The maps are compared at the end.
 """
 
 from __future__ import annotations
