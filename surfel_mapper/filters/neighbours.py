@@ -174,7 +174,7 @@ def visit_neighbours(
 
 
 def neighbour_rows(points: Points, number: int, threads: int = 1) -> npt.NDArray[np.int32]:
-    """Return the rows of the nearest neighbours of N points, (N, number), number <= N, in order."""
+    """Return the rows of the neighbours of N points, (N, number), number <= N, nearest first."""
     tree = search_tree(points, threads)
     ids = np.empty((len(points), number), np.int32)
 

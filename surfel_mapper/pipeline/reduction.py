@@ -40,8 +40,9 @@ Step = Callable[[], object]
 AHEAD = 2
 """Scans that are begun ahead: after the first, the thread has work while the next is decoded."""
 
-LONG_WAIT_S = 0.0003
-"""Wait for the other thread after which this one decodes scans, which takes 0.1 to 0.5 ms."""
+LONG_WAIT_S = 0.0008
+"""Wait for the other thread after which this one decodes scans: longer than that takes (up to 0.5
+ms), or it would be the one behind."""
 
 
 class WarmUpSteps(NamedTuple):
@@ -138,7 +139,7 @@ class Reduction:
         result = self._pool.submit(run_ahead, work, T_map_sensor, self._map, config)
         self._begun.append(Begun(scan, T_map_sensor, config, result))
         if not self._decodes:
-            sleep(0.0)  # give Python's lock away: else it begins when a kernel does, 0.3 ms later
+            sleep(0.0)  # give Python's lock away: else it begins 0.3 ms later, with a kernel here
 
     def begun(
         self, scan: Scan, T_map_sensor: Transform, config: Config
