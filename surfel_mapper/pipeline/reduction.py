@@ -133,7 +133,7 @@ class Reduction:
         is_behind = bool(self._begun) and not self._begun[-1].result.is_done
         self._decodes = is_behind and (self._decodes or self._waited_s > LONG_WAIT_S)
         if self._decodes:
-            with suppress(MemoryError):  # the other thread tries again, and has it reported
+            with suppress(Exception):  # the other thread tries again, and has it reported
                 _ = scan.points
         work = prepare(scan, T_map_sensor)
         result = self._pool.submit(run_ahead, work, T_map_sensor, self._map, config)

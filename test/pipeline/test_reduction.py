@@ -203,13 +203,14 @@ def test_no_scan_is_decoded_here_if_the_other_thread_has_nothing_left_to_do():
     assert slow.end(1) == 20
 
 
-def test_without_memory_to_decode_here_the_other_thread_decodes():
+@pytest.mark.parametrize('error', [MemoryError, ValueError])
+def test_after_an_error_of_decoding_here_the_other_thread_decodes(error):
     slow = BehindReduction()
     slow.begin(0)
     slow.begin(1)
     threading.Timer(0.05, slow.gates[0].set).start()
     assert slow.end(0) == 20
-    slow.failures.append(MemoryError('as if there was none'))
+    slow.failures.append(error('as if there was no memory'))
     slow.begin(2)
     assert slow.failures == []
     assert 2 not in slow.decoded_by
