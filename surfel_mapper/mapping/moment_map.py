@@ -170,7 +170,8 @@ class MomentMap:
         MapError
             If their voxel size differs, or no points can have these moments.
         NotInMapError
-            If a voxel holds fewer points, or equally many with other sums. Nothing is changed.
+            If a voxel holds fewer points, or equally many with other sums. Nothing is changed,
+            though with several threads some of the voxels may be reported as changed.
             Moments that were never added are detected unless every one of their voxels holds
             more points of other scans.
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Sequence
 from itertools import takewhile
 from typing import Any
 
@@ -40,9 +41,9 @@ from surfel_mapper.mapping.kernels.voxels import (
     remove_moments,
     restore_moments,
 )
-from surfel_mapper.mapping.moments import ScanMoments, STRIPE_BITS
+from surfel_mapper.mapping.moments import LEAST_SHARED, ScanMoments, STRIPE_BITS
 from surfel_mapper.mapping.storage import HashTable, ROWS, Slab
-from surfel_mapper.threads import together
+from surfel_mapper.threads import share_parts, together
 
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries, enough for 6e9 voxels."""
@@ -55,6 +56,9 @@ Part = tuple[int, int, int]
 
 NO_PART: Part = 0, 0, 0
 """A part without voxels."""
+
+Change = tuple[int, npt.NDArray[np.int32]]
+"""A version, and the rows that it changed."""
 
 LEAST = 1 << 18
 """Minimum capacity of the change log, rows; 1 MiB."""
@@ -221,12 +225,19 @@ class VoxelTable:
         rows = rows_changed_after(self.rows.array, stamps, used, stamp, changes, min_points)
         return np.asarray(rows)
 
-    def changed_at(
-        self, rows: npt.NDArray[np.int32], version: int, min_points: int
-    ) -> npt.NDArray[np.int32]:
-        """Return those of rows of at least min_points points last changed at a version."""
-        stamps, stamp = self._stamps.array.reshape(-1), stamp_of(version)
-        return np.asarray(rows_changed_at(self.rows.array, stamps, rows, stamp, min_points))
+    def changed_at(self, changes: Sequence[Change], min_points: int) -> npt.NDArray[np.int32]:
+        """Return those rows of changes that hold min_points points and changed last by them."""
+        stamps = self._stamps.array.reshape(-1)
+        parts = [np.empty(0, np.int32)] * len(changes)
+
+        def select(part: int) -> None:
+            version, rows = changes[part]
+            stamp = stamp_of(version)
+            parts[part] = rows_changed_at(self.rows.array, stamps, rows, stamp, min_points)
+
+        is_large = sum(len(rows) for _, rows in changes) >= LEAST_SHARED
+        share_parts(select, range(len(changes)), self._threads if is_large else 1)
+        return np.concatenate([np.empty(0, np.int32), *parts])
 
     def occupied(self, min_points: int = 1) -> npt.NDArray[np.int32]:
         """Return the rows of at least min_points points, one point at least."""
@@ -393,7 +404,7 @@ class ChangeLog:
     """
 
     def __init__(self, version: int) -> None:
-        self._entries: deque[tuple[int, npt.NDArray[np.int32]]] = deque()
+        self._entries: deque[Change] = deque()
         self._num_rows = 0
         self._start = version
 
@@ -427,9 +438,8 @@ class ChangeLog:
         """
         if version < self._start:
             return None
-        entries = takewhile(lambda entry: entry[0] > version, reversed(self._entries))
-        parts = [table.changed_at(rows, at, min_points) for at, rows in entries]
-        return np.concatenate(parts) if parts else np.empty(0, np.int32)
+        changes = [*takewhile(lambda change: change[0] > version, reversed(self._entries))]
+        return table.changed_at(changes, min_points)
 
 
 def stamp_of(version: int) -> int:
