@@ -68,7 +68,9 @@ class SearchTree(NamedTuple):
 
     def rows(self, places: Places, *, none: int) -> npt.NDArray[np.int32]:
         """Return the rows of places, and for N a number that stands for none."""
-        return np.append(self.order, np.int32(none))[places]
+        found = self.order.take(places, mode='clip')
+        found[places == len(self.order)] = none
+        return found
 
     def by_row(self, values: npt.NDArray[Kind]) -> npt.NDArray[Kind]:
         """Return values (N, ...), one of each point, in the order of the input."""
@@ -174,15 +176,15 @@ def visit_neighbours(
 
 
 def neighbour_rows(points: Points, number: int, threads: int = 1) -> npt.NDArray[np.int32]:
-    """Return the rows of the neighbours of N points, (N, number), number <= N, nearest first."""
+    """Return the rows of the neighbours of N points, (N, number), nearest first; N for none."""
     tree = search_tree(points, threads)
     ids = np.empty((len(points), number), np.int32)
 
     def gather(part: slice, near: Places, _: Points) -> None:
-        ids[part] = tree.order[near]
+        ids[tree.order[part]] = tree.rows(near, none=len(points))  # a second array might be large
 
     visit_neighbours(gather, tree, number, ordered=True, threads=threads)
-    return tree.by_row(ids)
+    return ids
 
 
 INT32_MAX = 2**31 - 1

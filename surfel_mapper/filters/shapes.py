@@ -287,7 +287,7 @@ class SurfaceNormal(ShapeFilter):
             for name, column in self.describe(tree, part, near).items():
                 columns[name][part] = column
             if ids is not None:
-                ids[part] = tree.rows(near, none=-1)
+                ids[tree.order[part]] = tree.rows(near, none=-1)
 
         visit_neighbours(
             describe,
@@ -297,9 +297,8 @@ class SurfaceNormal(ShapeFilter):
             ordered=self.needs_ids,
             threads=self.threads,
         )
-        columns = {name: tree.by_row(column) for name, column in columns.items()}
-        if ids is not None:
-            ids = tree.by_row(ids)
+        for name in columns:
+            columns[name] = tree.by_row(columns[name])
         if self.smooth_normals and self.keep_normals and ids is not None:
             columns[NORMALS] = smoothed(columns[NORMALS], ids)
         columns = {name: column.astype(scan.points.dtype) for name, column in columns.items()}

@@ -30,10 +30,12 @@ def compact(xyz, keep, out):
     out   (3, K) of the same type, K the number of points kept
     """
     num, num_out, i, k = U(xyz.shape[1]), U(out.shape[1]), U(0), U(0)
-    while i + U(BLOCK) <= num and k + U(BLOCK) <= num_out:
+    while i + U(BLOCK) <= num and k < num_out:
         kept = 0
         for j in range(U(BLOCK)):
             kept += np.int64(keep[i + j])
+        if kept > 0 and k + U(BLOCK) > num_out:
+            break  # what is written after the last one would not fit
         for axis in range(3):
             values, to, place = xyz[axis], out[axis], k
             if kept == BLOCK:

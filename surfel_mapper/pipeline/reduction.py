@@ -41,8 +41,8 @@ AHEAD = 2
 """Scans that are begun ahead: after the first, the thread has work while the next is decoded."""
 
 LONG_WAIT_S = 0.0008
-"""Wait for the other thread after which this one decodes scans: longer than that takes (up to 0.5
-ms), or it would be the one behind."""
+"""Wait for the other thread after which this one decodes scans; 500,000 points take as long. After
+a shorter one it would be this thread that is behind."""
 
 
 class WarmUpSteps(NamedTuple):
@@ -158,9 +158,10 @@ class Reduction:
     def _wait_for(self, result: Job[Ahead]) -> FilteredScan:
         """Return the points of a scan that was begun, and note how long that took."""
         start = perf_counter()
-        points = result.result().points
-        self._waited_s = perf_counter() - start
-        return points
+        try:
+            return result.result().points
+        finally:
+            self._waited_s = perf_counter() - start
 
     def reduce(self, scan: Scan, T_map_sensor: Transform, config: Config) -> WindowedScan:
         """

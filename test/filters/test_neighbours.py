@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from surfel_mapper.filters.neighbours import search_tree, visit_neighbours
+from surfel_mapper.filters.neighbours import neighbour_rows, search_tree, visit_neighbours
 from surfel_mapper.filters.shapes import as_matrices, eigen, Moments, PAIRS, shares
 from test.filters.examples import filter_of, kept, random_scan, scan_of
 
@@ -54,6 +54,15 @@ def test_points_beyond_the_limit_are_no_neighbours_and_one_at_it_is():
     ids, distances = all_neighbours(points, 3, 1.0)
     assert ids.tolist() == [[0, 1, 3], [1, 0, 3], [2, 3, 3]]
     assert distances[2].tolist() == [0.0, np.inf, np.inf]
+
+
+def test_points_at_a_distance_whose_square_is_infinite_are_no_neighbours():
+    points = cloud(40) * 1e160
+    ids, distances = all_neighbours(points, 3)
+    np.testing.assert_array_equal(ids[:, 0], np.arange(40))
+    assert (ids[:, 1:] == 40).all()
+    assert np.isinf(distances[:, 1:]).all()
+    np.testing.assert_array_equal(neighbour_rows(points, 3), ids)
 
 
 def test_a_crowd_at_one_place_is_answered_without_searching_all_of_it():

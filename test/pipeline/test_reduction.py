@@ -124,7 +124,7 @@ def test_every_update_is_that_of_one_thread(threads, way, settings_of):
 
 
 @pytest.mark.parametrize(('threads', 'is_here'), [(1, True), (2, False)])
-def test_points_are_decoded_by_the_thread_that_reduces_them(threads, is_here):
+def test_points_are_decoded_by_the_thread_that_reduces_them_if_it_is_not_behind(threads, is_here):
     mapper, decoded_by = mapper_with(threads), []
 
     def decode():

@@ -20,9 +20,10 @@ import math
 import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.lanes import NUMBERS
 
-LEAF = 16
-"""Points of a leaf; 8 and 12 were slower."""
+LEAF = NUMBERS
+"""Points of a leaf, as many as place_of_least compares; 8 and 12 were slower."""
 
 FIRST, RIGHT, PARENT = range(3)
 
