@@ -5,7 +5,7 @@ Scan: the points of one sweep of a sensor, as arrays.
 
 Coordinates keep the type of the cloud (float32 or float64), because the map quantises a point
 once, in float64; rounding it before would be a second quantisation. Those of a message are decoded
-when they are first read, mostly by the thread that reduces the scan: not if it is dropped before.
+when they are first read, most often by the thread that reduces the scan.
 """
 
 from __future__ import annotations

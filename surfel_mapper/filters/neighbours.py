@@ -48,10 +48,11 @@ Kind = TypeVar('Kind', bound=np.generic)
 
 class SearchTree(NamedTuple):
     """
-    A search tree of points, as the kernels take it; see kernels/search_tree.py.
+    A search tree of points, as the kernels take it; kernels/search_tree.py describes the arrays.
 
-    What is found out about the points is in the order of the tree, in which points near each other
-    are next to each other, until by_row puts it into that of the input.
+    Results are in the order of the tree, where near points are close in memory; ``by_row`` sorts
+    them into the order of the input. A place is an index in the order of the tree, a row one in
+    the input.
     """
 
     xyz: Points
@@ -67,7 +68,7 @@ class SearchTree(NamedTuple):
         return x, y, z
 
     def rows(self, places: Places, *, none: int) -> npt.NDArray[np.int32]:
-        """Return the rows of places, and for N a number that stands for none."""
+        """Return the row of each place, and ``none`` where the place is N."""
         found = self.order.take(places, mode='clip')
         found[places == len(self.order)] = none
         return found
@@ -176,12 +177,29 @@ def visit_neighbours(
 
 
 def neighbour_rows(points: Points, number: int, threads: int = 1) -> npt.NDArray[np.int32]:
-    """Return the rows of the neighbours of N points, (N, number), nearest first; N for none."""
+    """
+    Return the rows of the nearest neighbours of all points.
+
+    Parameters
+    ----------
+    points : (N, 3) float64, m
+        Finite.
+    number : int
+        Neighbours of each, including the point itself; at most N.
+    threads : int
+        Threads that share the search.
+
+    Returns
+    -------
+    (N, number) int32
+        Nearest first; N where the squared distance is infinite.
+
+    """
     tree = search_tree(points, threads)
     ids = np.empty((len(points), number), np.int32)
 
     def gather(part: slice, near: Places, _: Points) -> None:
-        ids[tree.order[part]] = tree.rows(near, none=len(points))  # a second array might be large
+        ids[tree.order[part]] = tree.rows(near, none=len(points))
 
     visit_neighbours(gather, tree, number, ordered=True, threads=threads)
     return ids

@@ -279,9 +279,7 @@ class SurfaceNormal(ShapeFilter):
         columns: dict[str, npt.NDArray[Any]] = {
             name: np.empty((len(points), *column.shape[1:])) for name, column in none.items()
         }
-        ids: npt.NDArray[np.int32] | None = (
-            np.empty((len(points), number), np.int32) if self.needs_ids else None
-        )
+        ids = np.empty((len(points), number), np.int32) if self.needs_ids else None
 
         def describe(part: slice, near: Places, _: Points) -> None:
             for name, column in self.describe(tree, part, near).items():

@@ -35,7 +35,7 @@ def compact(xyz, keep, out):
         for j in range(U(BLOCK)):
             kept += np.int64(keep[i + j])
         if kept > 0 and k + U(BLOCK) > num_out:
-            break  # what is written after the last one would not fit
+            break  # the block would be written past the end of out
         for axis in range(3):
             values, to, place = xyz[axis], out[axis], k
             if kept == BLOCK:

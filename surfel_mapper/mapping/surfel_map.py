@@ -84,7 +84,7 @@ class SurfelMap(MomentMap):
         Columns of the points to sum exactly as well: ``intensity``, ``rgb``.
     threads : int
         Number of threads that share the work; results do not depend on it, but for the order of
-        the voxels of large scans.
+        the voxels of large scans, and what ``surfels_changed`` returns after a refused ``remove``.
     level : int
         The lattice unit is ``voxel_size_m / 2^(16 + level)``; not 0 only in maps that
         ``coarsen`` returned, to which no scan can be added.

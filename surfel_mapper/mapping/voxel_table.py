@@ -226,7 +226,11 @@ class VoxelTable:
         return np.asarray(rows)
 
     def changed_at(self, changes: Sequence[Change], min_points: int) -> npt.NDArray[np.int32]:
-        """Return those rows of changes that hold min_points points and changed last by them."""
+        """
+        Return the rows that were last changed by one of some changes, (K,), each once.
+
+        Rows of fewer than min_points points are left out.
+        """
         stamps = self._stamps.array.reshape(-1)
         parts = [np.empty(0, np.int32)] * len(changes)
 
