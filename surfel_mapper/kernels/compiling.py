@@ -51,6 +51,26 @@ def _mark_noinline(context, builder, signature, arguments):
     return context.get_dummy_value()
 
 
+def use_widest_vectors():
+    """
+    Compile the loops of the function that calls this for registers of 512 bits, if there are any.
+
+    LLVM prefers 256 bits on processors of Intel, which once slowed down at 512 bits.
+    """
+
+
+@type_callable(use_widest_vectors)
+def _returns_none(context):
+    return lambda: types.none
+
+
+@lower_builtin(use_widest_vectors)
+def _mark_widest(context, builder, signature, arguments):
+    # add of llvmlite knows only attributes without a value
+    set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+    return context.get_dummy_value()
+
+
 @contextmanager
 def compilations() -> Iterator[Sequence[object]]:
     """Give a list that grows with each function compiled, not loaded from the cache, meanwhile."""

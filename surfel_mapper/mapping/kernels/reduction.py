@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, stay_apart, U
+from surfel_mapper.kernels.compiling import kernel, part, stay_apart, U, use_widest_vectors
 from surfel_mapper.kernels.grouping import (
     CHUNK,
     find_key,
@@ -71,6 +71,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     Points left out have the key -1, whose row is the first: sums[0] is of no use but for its
     count. The last row stays zero. After -1 the table is clear again: call with larger arrays.
     """
+    use_widest_vectors()
     table, keys, sums, chunk_keys, places, starts, run_rows = scratch
     words = sums.ravel()
     left_out[:] = 0
@@ -189,6 +190,7 @@ def pack_moments(keys, sums, places, origin, voxel_size, moments):
     moments     key (K,) int64, count (K,) int32, total (K, 3) int32, product (K, 6) int64,
                 view (K, 3) int16, out
     """
+    use_widest_vectors()
     key, count, total, product, view = moments
     if len(places):
         for row in range(U(len(places))):
