@@ -9,7 +9,13 @@ import numba
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.compiling import before_compiling, kernel, part, stay_apart
+from surfel_mapper.kernels.compiling import (
+    before_compiling,
+    kernel,
+    part,
+    stay_apart,
+    use_widest_vectors,
+)
 
 needs_compiler = pytest.mark.skipif(
     numba.config.DISABLE_JIT, reason='kernels are interpreted in this run'
@@ -54,6 +60,26 @@ def test_a_kernel_is_no_function_of_c():
 
     assert any(name.startswith('_ZN7cpython') for name in names)
     assert not any(name.startswith('cfunc.') for name in names)
+
+
+@kernel(cache=False)
+def doubled(values):
+    """Double all values, with the widest vectors that there are."""
+    use_widest_vectors()
+    for i in range(len(values)):
+        values[i] *= 2.0
+
+
+@needs_compiler
+def test_a_kernel_uses_registers_of_512_bits_if_there_are_any():
+    values = np.arange(20.0)
+
+    doubled(values)
+
+    assert values.tolist() == list(range(0, 40, 2))
+    features = numba.core.codegen.get_host_cpu_features().split(',')
+    (code,) = doubled.inspect_llvm().values()
+    assert ('<8 x double>' in code) == ('+avx512f' in features)
 
 
 @kernel(cache=False)

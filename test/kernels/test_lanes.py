@@ -11,7 +11,6 @@ from surfel_mapper.kernels.lanes import (
     FULL,
     highest_match,
     load_sums,
-    masked_sum,
     num_below,
     num_used,
     NUMBERS,
@@ -19,6 +18,7 @@ from surfel_mapper.kernels.lanes import (
     place_of_least,
     plus_place,
     store_sums,
+    sum_unless,
     WIDEST,
     WORDS,
 )
@@ -30,12 +30,12 @@ HIGHEST = 65535
 
 
 @njit
-def add_at(words, at, places, mask):
+def add_at(words, at, places, only_the_last):
     sums = load_sums(words, at)
     for i in range(len(places)):
         place = (1 << 48) | (places[i, 2] << 32) | (places[i, 1] << 16) | places[i, 0]
         others = plus_place(load_sums(words, np.uint64(0)), place)
-        sums = masked_sum(sums, mask, others)
+        sums = sum_unless(only_the_last, sums, others)
     store_sums(words, at, sums)
 
 
@@ -56,18 +56,18 @@ def test_places_are_added_to_the_words_from_an_index_on(call, at):
     words = np.arange(40) ** 3
     words[:WORDS] = 0
     before = words.copy()
-    call(add_at, words, np.uint64(at), places, -1)
+    call(add_at, words, np.uint64(at), places, False)
     after = before.copy()
     after[at : at + WORDS] += expected(places)
     assert words.tolist() == after.tolist()
 
 
 @both
-def test_a_mask_of_zero_drops_the_sums(call):
+def test_sums_are_dropped(call):
     places = np.array([[1, 2, 3], [HIGHEST, 4, HIGHEST]])
     words = np.zeros(3 * WORDS, np.int64)
     words[WORDS:] = -5
-    call(add_at, words, np.uint64(WORDS), places, 0)
+    call(add_at, words, np.uint64(WORDS), places, True)
     assert words[WORDS : 2 * WORDS].tolist() == expected(places[1:])
     assert (words[2 * WORDS :] == -5).all()
 
@@ -76,14 +76,14 @@ def test_a_mask_of_zero_drops_the_sums(call):
 def test_words_hold_the_sums_of_a_full_voxel_and_the_count_of_the_widest(corner):
     words = np.zeros(2 * WORDS, np.int64)
     places = np.array([corner] * FULL)
-    add_at(words, np.uint64(WORDS), places, -1)
+    add_at(words, np.uint64(WORDS), places, False)
     assert words[WORDS:].tolist() == expected(places)
     x, _, z = corner
     assert words[WORDS] & ((1 << COUNT_BITS) - 1) == FULL * x
     assert words[WORDS + 1] >> HIGH_BITS & ((1 << HIGH_BITS) - 1) == FULL * z
     for _ in range((WIDEST - FULL) // FULL):
-        add_at(words, np.uint64(WORDS), places, -1)
-    add_at(words, np.uint64(WORDS), places[: (WIDEST - FULL) % FULL], -1)
+        add_at(words, np.uint64(WORDS), places, False)
+    add_at(words, np.uint64(WORDS), places[: (WIDEST - FULL) % FULL], False)
     assert words[WORDS] >> COUNT_BITS == WIDEST
 
 

@@ -28,9 +28,9 @@ from surfel_mapper.kernels.grouping import (
 from surfel_mapper.kernels.hashing import hash_key, stripe_of
 from surfel_mapper.kernels.lanes import (
     load_sums,
-    masked_sum,
     plus_place,
     store_sums,
+    sum_unless,
     WORDS,
 )
 from surfel_mapper.kernels.layout import (
@@ -126,19 +126,20 @@ def add_places(places, num, chunk_keys, run_rows, words, later):
     zeros = U(len(words) - WORDS)
     run, previous = U(0), chunk_keys[0]
     sums = load_sums(words, U(WORDS) * U(np.uint32(run_rows[run])))
-    for i in range(U(num)):
-        if i % U(LINE) == U(0) and i < U(len(x)):
-            prefetch(x, i)
-            prefetch(y, i)
-            prefetch(z, i)
-        is_new = chunk_keys[i] != previous
-        previous = chunk_keys[i]
-        run += U(is_new)
-        at = U(WORDS) * U(np.uint32(run_rows[run]))
-        others = load_sums(words, at if is_new else zeros)
-        others = plus_place(others, places[i])
-        sums = masked_sum(sums, np.int64(is_new) - 1, others)
-        store_sums(words, at, sums)
+    for line in range(U(0), U(num), U(LINE)):
+        if line < U(len(x)):
+            prefetch(x, line)
+            prefetch(y, line)
+            prefetch(z, line)
+        for i in range(line, min(line + U(LINE), U(num))):
+            is_new = chunk_keys[i] != previous
+            previous = chunk_keys[i]
+            run += U(is_new)
+            at = U(WORDS) * U(np.uint32(run_rows[run]))
+            others = load_sums(words, at if is_new else zeros)
+            others = plus_place(others, places[i])
+            sums = sum_unless(is_new, sums, others)
+            store_sums(words, at, sums)
 
 
 @part()
