@@ -55,7 +55,9 @@ def use_widest_vectors():
     """
     Compile the loops of the function that calls this for registers of 512 bits, if there are any.
 
-    LLVM prefers 256 bits on processors of Intel, which once slowed down at 512 bits.
+    LLVM prefers 256 bits on processors of Intel, as older ones slow down with 512. Reducing a scan
+    takes 0.93 of the time with 512 there, but deriving surfels 1.1 of it: measure before you use
+    this.
     """
 
 

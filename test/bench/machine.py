@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
+import mmap
 import os
 from pathlib import Path
 import platform
@@ -49,6 +50,20 @@ def resident_bytes() -> int:
     """Return the memory of this process as Linux states it."""
     pages = int(Path('/proc/self/statm').read_text(encoding='ascii').split()[1])
     return pages * os.sysconf('SC_PAGE_SIZE')
+
+
+def find_memory(num_bytes: int = 1 << 28) -> None:
+    """
+    Touch memory and free it, so that the host of a virtual machine has found it.
+
+    Hosts take back what has been free for some seconds. Then a page of 2 MiB takes 5.8 ms when it
+    is touched first, instead of 0.24, and the scan that does so is the slowest of a run.
+    """
+    with mmap.mmap(-1, num_bytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as memory:
+        if hasattr(mmap, 'MADV_HUGEPAGE'):
+            with suppress(OSError):  # only a hint
+                memory.madvise(mmap.MADV_HUGEPAGE)
+        memory[:: mmap.PAGESIZE] = bytes(-(-num_bytes // mmap.PAGESIZE))
 
 
 @contextmanager
