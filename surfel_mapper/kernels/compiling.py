@@ -40,17 +40,6 @@ def stay_apart():
     """
 
 
-@type_callable(stay_apart)
-def _returns_nothing(context):
-    return lambda: types.none
-
-
-@lower_builtin(stay_apart)
-def _mark_noinline(context, builder, signature, arguments):
-    builder.function.attributes.add('noinline')
-    return context.get_dummy_value()
-
-
 def use_widest_vectors():
     """
     Compile the loops of the function that calls this for registers of 512 bits, if there are any.
@@ -61,9 +50,16 @@ def use_widest_vectors():
     """
 
 
+@type_callable(stay_apart)
 @type_callable(use_widest_vectors)
-def _returns_none(context):
+def _returns_nothing(context):
     return lambda: types.none
+
+
+@lower_builtin(stay_apart)
+def _mark_noinline(context, builder, signature, arguments):
+    builder.function.attributes.add('noinline')
+    return context.get_dummy_value()
 
 
 @lower_builtin(use_widest_vectors)
