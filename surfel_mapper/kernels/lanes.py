@@ -231,7 +231,7 @@ def _emit_sum_unless(context, builder, signature, arguments):
     both = ir.Constant(ir.ArrayType(_VECTOR, 2), [_constant([-1] * WORDS), _constant([0] * WORDS)])
     masks = cgutils.global_constant(builder, 'masks', both)
     masks.align = 8 * WORDS
-    # from memory: spreading a number over lanes takes the unit that picks bytes of places
+    # loaded: spreading a number over lanes needs the execution port that picks bytes of places
     mask = builder.load(builder.gep(masks, [_WORD(0), builder.zext(is_dropped, _WORD)]))
     return builder.add(builder.and_(sums, mask), others)
 
@@ -239,8 +239,8 @@ def _emit_sum_unless(context, builder, signature, arguments):
 @lower_builtin(plus_place, Lanes, types.int64)
 def _emit_plus_place(context, builder, signature, arguments):
     sums, place = arguments
-    # behind a fence, or the compiler makes one instruction of spreading and picking, which takes
-    # three steps on processors of Intel: adding took 1.2 times as long
+    # the fence keeps spreading and picking apart: LLVM merges them into an instruction of three
+    # micro-operations on Intel, and adding took 1.2 times as long
     spread = builder.bitcast(_fenced(builder, _spread(builder, place)), _BYTES)
     first, second = (_pick(builder, spread, ((), (), *bytes_)) for bytes_ in _FACTORS)
     lower_halves = _constant([_HALF] * WORDS)  # the compiler has to know that factors are short

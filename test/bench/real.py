@@ -35,7 +35,7 @@ import numpy.typing as npt
 
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.memory import keep_freed_memory
-from test.bench.machine import find_memory, one_core
+from test.bench.machine import one_core, prefault
 from test.bench.numpy_map import NumpyMap
 from test.bench.options import Options
 from test.bench.ours import Ours
@@ -117,7 +117,7 @@ def drives(options: Options) -> Iterator[tuple[str, Street, Options]]:
 
 def step_row(name: str, points: npt.NDArray[np.float32], size_m: float, options: Options) -> Row:
     """Return the processor times of a step by stage, and of numpy."""
-    find_memory()
+    prefault()
     ours, numpy_map = Ours(size_m, WINDOW), NumpyMap(size_m, WINDOW)
     columns = [np.ascontiguousarray(column) for column in points.T]
     laps: list[npt.NDArray[np.float64]] = []

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from test.bench.machine import find_memory, one_core
+from test.bench.machine import one_core, prefault
 from test.bench.options import Options, WARM_SCANS
 from test.bench.ours import Ours
 from test.bench.real import real_scans, STEP_M
@@ -91,7 +91,7 @@ def moved_in_turns(
     """Return what ``in_turns`` does, of a scan that is moved a step at a time."""
     times: Figures = {name: [] for name in maps}
     changed: Figures = {name: [] for name in maps}
-    find_memory()
+    prefault()
     pose = np.eye(4)
     for number in range(untimed + timed):
         pose[:3, 3] = np.array(STEP_M) * number
@@ -111,7 +111,7 @@ def in_turns(
     """Return times, and numbers of changed voxels, of every map, each given every scan."""
     times: Figures = {name: [] for name in maps}
     changed: Figures = {name: [] for name in maps}
-    find_memory()
+    prefault()
     for number, message, counts in street.drive(untimed, timed):
         pose = street.pose(number)
         for name in sorted(maps, reverse=number % 2 == 1):
