@@ -66,7 +66,7 @@ def pose_matrix(xyz: Iterable[float], q_xyzw: Iterable[float]) -> Transform:
 
     """
     try:
-        t, q = [float(v) for v in xyz], [float(v) for v in q_xyzw]
+        t, q = [*map(float, xyz)], [*map(float, q_xyzw)]
     except TypeError:
         raise ValueError(
             f'pose of a {type(xyz).__name__} and a {type(q_xyzw).__name__}, expected 3 numbers '
@@ -76,7 +76,7 @@ def pose_matrix(xyz: Iterable[float], q_xyzw: Iterable[float]) -> Transform:
         raise ValueError(
             f'pose of {len(t)} and {len(q)} numbers, expected 3 (x y z) and 4 (qx qy qz qw)'
         )
-    if not all(math.isfinite(v) for v in t + q):
+    if not all(map(math.isfinite, t + q)):
         raise ValueError(f'pose {t} {q}: expected finite numbers')
     norm = math.sqrt(((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3])
     if abs(norm - 1.0) > MAX_NORM_ERROR:

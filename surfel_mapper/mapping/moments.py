@@ -80,9 +80,10 @@ class ScanMoments:
     rows : (K,) int32, optional
         Rows of the voxels in the map that inserted these moments last. Only hints, which save
         the look-up at removal: a map confirms each by the key in the row.
-    stripes : (S + 1,) int64, optional
-        The first voxel of each stripe, and K, of voxels that are in the order of their stripes:
-        those of one stripe have the same highest bits of the hash. None: in any order.
+    stripes : (S, 3) int64, optional
+        The first voxel of each stripe, the one after its last, and its number, of voxels that are
+        in the order of their stripes: those of one stripe have the same highest bits of the hash.
+        None: in any order.
     num_reduced : int, optional
         Number of points of which a Reducer made these moments, so that a map need not test if
         points can have them. None for others, copies with other values too.

@@ -32,7 +32,6 @@ from surfel_mapper.mapping.kernels.reduction import (
     BEYOND,
     NOT_FINITE,
     pack_moments,
-    places_by_stripe,
     reduce_points,
     sum_channels,
     TOO_FAR,
@@ -56,8 +55,10 @@ CAUSES = {
 IDENTITY, UNKNOWN = np.eye(4), np.full(3, np.nan)
 """Pose of points that are in the map frame, and place of an unknown sensor."""
 
-IN_ORDER = np.empty(0, np.int32)
-"""Places of voxels that stay in the order of their first points."""
+NUM_STRIPES = 1 << STRIPE_BITS
+
+IN_ORDER = np.empty((0, 3), np.int64)
+"""Stripes of voxels that stay in the order of their first points."""
 
 NO_LIMITS = np.array([0.0, np.inf])
 """Squared limits of the range by default."""
@@ -188,7 +189,6 @@ class Reducer:
         num_points, part = xyz.shape[1], WIDEST
         if num_points <= WIDEST:
             num = scratch.fill(xyz, quantisation)
-            scratch.table.fill(-1)  # faster than visiting the scattered entries in use
             left_out = scratch.left_out.tolist()
             moments = ScanMoments(
                 voxel_size_m=self.voxel_size_m,
@@ -200,14 +200,12 @@ class Reducer:
                 left_out={cause: left_out[row] for cause, row in CAUSES.items() if left_out[row]},
             )
             keys, sums = scratch.keys[2 : num + 2], scratch.sums[1 : num + 1]
-            places = IN_ORDER
-            if self._by_stripe and num >= LEAST_SHARED:
-                places = np.empty(num, np.int32)
-                bounds = np.zeros((1 << STRIPE_BITS) + 1, np.int64)
-                places_by_stripe(keys, STRIPE_BITS, places, bounds)
-                object.__setattr__(moments, 'stripes', bounds)
+            is_shared = self._by_stripe and num >= LEAST_SHARED
+            stripes = np.empty((NUM_STRIPES, 3), np.int64) if is_shared else IN_ORDER
             size_m, arrays = self.voxel_size_m, moments.arrays
-            largest = pack_moments(keys, sums, places, origin, size_m, arrays)
+            largest = pack_moments(keys, sums, stripes, origin, size_m, arrays)
+            if is_shared:
+                object.__setattr__(moments, 'stripes', stripes)
             if largest <= FULL:
                 return moments
             part = max(FULL, num_points * FULL // (2 * largest))  # half full on average

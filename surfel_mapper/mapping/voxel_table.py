@@ -265,13 +265,12 @@ class VoxelTable:
         """Return the parts of the voxels that threads may change at the same time, (P, 3)."""
         if self._threads == 1 or moments.stripes is None:
             return np.array([[0, len(moments), 0]])
-        bounds = moments.stripes
-        return np.stack([bounds[:-1], bounds[1:], np.arange(len(bounds) - 1)], axis=1)
+        return moments.stripes
 
     def _add(self, moments: ScanMoments, version: int, found: npt.NDArray[np.int32]) -> None:
         """Add moments without channels; write the row of each voxel to found once it is added."""
         self._version = version
-        parts = self._parts(moments)
+        parts = self._parts(moments).copy()
         while len(parts):
             self._add_parts(moments, version, parts, found)
             parts = parts[parts[:, 0] < parts[:, 1]]

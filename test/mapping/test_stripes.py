@@ -42,8 +42,10 @@ def test_voxels_are_put_in_the_order_of_their_stripes():
     assert len(order) >= LEAST_SHARED
     for found, values in zip(moments.arrays, expected.arrays, strict=True):
         np.testing.assert_array_equal(found, values[order])
-    bounds = np.searchsorted(stripes[order], range(NUM_STRIPES + 1))
-    assert moments.stripes.tolist() == bounds.tolist()
+    bounds = np.searchsorted(stripes[order], range(NUM_STRIPES + 1)).tolist()
+    assert moments.stripes.tolist() == [
+        list(part) for part in zip(bounds[:-1], bounds[1:], range(NUM_STRIPES), strict=True)
+    ]
     assert expected.stripes is None
 
 
@@ -126,7 +128,7 @@ def test_a_removal_that_one_stripe_refuses_changes_nothing(columns):
     version = surfel_map.version
     surfel_map.add(points_at(1), columns=values)
     wrong = surfel_map.reduce(points_at(0), columns=values)
-    at = int(wrong.stripes[3]) + 5
+    at = int(wrong.stripes[3, 0]) + 5
     wrong.total[at, 0] += 1
     wrong.count[at] += 1  # one point more than the voxel holds
     digest, rows = surfel_map.digest(), surfel_map.find(first.key)

@@ -58,7 +58,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     pose      (3, 4) or (4, 4) float64, takes points of the sensor frame to the map frame
     scale     float64, 65536 / voxel size
     range_sq  (2,) float64, m^2: smallest and largest squared distance from the sensor
-    scratch   table (B,) int32, B a power of two, all -1; out: row of each key by hash;
+    scratch   table (B,) int32, row of each key by hash, B a power of two, all -1 before and after;
               keys (E + 2,) int64, out: from keys[2] on voxel keys in the order of first
               appearance, E <= B / 2;
               sums (E + 2, WORDS) int64, out: from sums[1] on those of the places in the voxel,
@@ -69,7 +69,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
               the voxel indices
 
     Points left out have the key -1, whose row is the first: sums[0] is of no use but for its
-    count. The last row stays zero. After -1 the table is clear again: call with larger arrays.
+    count. The last row stays zero. After -1 call with larger arrays.
     """
     use_widest_vectors()
     table, keys, sums, chunk_keys, places, starts, run_rows = scratch
@@ -102,6 +102,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
                 if run_rows[run] == 0:
                     for i in range(starts[run], starts[run + 1]):
                         left_out[reason(x[i], y[i], z[i], range_sq)] += 1
+    table[:] = -1  # faster than visiting the scattered entries in use
     return num_rows - 1
 
 
@@ -154,38 +155,15 @@ def reason(x, y, z, range_sq):
     return TOO_FAR if distance_sq > range_sq[1] else BEYOND
 
 
-@kernel()
-def places_by_stripe(keys, stripe_bits, places, bounds):
-    """
-    Find the places of the voxels of a scan by stripe, those of one in the order of the scan.
-
-    keys    (K,) int64
-    places  (K,) int32, out
-    bounds  (2^stripe_bits + 1,) int64, zeros, out: the first place of each stripe, and K
-    """
-    num = U(len(keys))
-    ends = np.zeros(len(bounds), np.int64)
-    for voxel in range(num):
-        stripe = stripe_of(hash_key(keys[voxel]), stripe_bits)
-        places[voxel] = stripe
-        ends[U(stripe + 1)] += 1
-    for stripe in range(1, len(bounds)):
-        ends[stripe] += ends[stripe - 1]
-        bounds[stripe] = ends[stripe]
-    for voxel in range(num):
-        stripe = U(places[voxel])
-        places[voxel] = ends[stripe]
-        ends[stripe] += 1
-
-
 @kernel(error_model='numpy')
-def pack_moments(keys, sums, places, origin, voxel_size, moments):
+def pack_moments(keys, sums, stripes, origin, voxel_size, moments):
     """
     Write the moments of a scan; return the largest count.
 
     keys        (K,) int64, as reduce_points leaves them
     sums        (K, WORDS) int64
-    places      (K,) int32, the row of the outputs for each; (0,): their order stays
+    stripes     (S, 3) int64, out: the first voxel of each stripe, the one after its last, and its
+                number; S = 0: voxels stay in their order
     origin      (3,) float64, the sensor in the map frame, m; nan if unknown
     voxel_size  float64, m
     moments     key (K,) int64, count (K,) int32, total (K, 3) int32, product (K, 6) int64,
@@ -193,13 +171,40 @@ def pack_moments(keys, sums, places, origin, voxel_size, moments):
     """
     use_widest_vectors()
     key, count, total, product, view = moments
-    if len(places):
+    if len(stripes):
+        places = places_by_stripe(keys, stripes)
         for row in range(U(len(places))):
             key[U(places[row])] = keys[row]
     else:
+        places = np.empty(0, np.int32)
         key[:] = keys
     look_back(key, origin, voxel_size, view)
     return unpack_sums(sums, places, count, total, product)
+
+
+@part()
+def places_by_stripe(keys, stripes):
+    """
+    Return the places (K,) int32 of the voxels of a scan by stripe, each in the order of the scan.
+
+    keys, stripes  see pack_moments; their number is a power of two
+    """
+    num = U(len(keys))
+    stripe_bits = np.int64(64 - hash_shift(len(stripes)))
+    places, ends = np.empty(num, np.int32), np.zeros(len(stripes) + 1, np.int64)
+    for voxel in range(num):
+        stripe = stripe_of(hash_key(keys[voxel]), stripe_bits)
+        places[voxel] = stripe
+        ends[U(stripe + 1)] += 1
+    for stripe in range(len(stripes)):
+        ends[stripe + 1] += ends[stripe]
+        stripes[stripe, 0], stripes[stripe, 1] = ends[stripe], ends[stripe + 1]
+        stripes[stripe, 2] = stripe
+    for voxel in range(num):
+        stripe = U(places[voxel])
+        places[voxel] = ends[stripe]
+        ends[stripe] += 1
+    return places
 
 
 @part()
