@@ -280,6 +280,13 @@ def test_a_refused_stage_is_not_registered():
         '/**:\n  ros__parameters:\n    window: {max_scans: 7}\n',
         '/**:\n  ros__parameters:\n    window.max_scans: 7\n',
         'surfel_mapper:\n  ros__parameters:\n    window: {max_scans: 7}\n',
+        'my_mapper:\n  ros__parameters:\n    window: {max_scans: 7}\n',
+        'robot1:\n  surfel_mapper:\n    ros__parameters:\n      window: {max_scans: 7}\n',
+        'amcl:\n  ros__parameters: {alpha1: 0.2}\n'
+        'surfel_mapper:\n  ros__parameters: {window.max_scans: 7}\n',
+        '/**:\n  ros__parameters: {window.max_scans: 9}\n'
+        '/robot1/surfel_mapper:\n  ros__parameters: {window.max_scans: 7}\n'
+        'global_costmap: {global_costmap: {ros__parameters: {plugins: []}}}\n',
         'window:\n  max_scans: 7\n',
         'window.max_scans: 7\n',
     ],
@@ -311,6 +318,16 @@ def test_an_empty_file_gives_the_defaults(tmp_path, text):
         ('map:\n  voxel_size_m: -1.0\n', r'map\.voxel_size_m: -1'),
         ('map:\n  voxel_size_m: 0,5\n', r"map\.voxel_size_m: '0,5', expected a number"),
         ('/**:\n  ros__parameters: 7\n', 'expected a mapping'),
+        (
+            'amcl:\n  ros__parameters: {a: 1}\nmapper:\n  ros__parameters: {map.min_points: 3}\n',
+            'parameters of the nodes amcl, mapper, expected those of one, or of one that is named '
+            'surfel_mapper',
+        ),
+        (
+            'a:\n  surfel_mapper:\n    ros__parameters: {map.min_points: 3}\n'
+            'b:\n  surfel_mapper:\n    ros__parameters: {map.min_points: 4}\n',
+            'parameters of the nodes a/surfel_mapper, b/surfel_mapper, expected those of one',
+        ),
         ('windows:\n  max_scans: 7\n', r'windows\.max_scans: no such setting'),
     ],
 )

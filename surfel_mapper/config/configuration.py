@@ -20,6 +20,7 @@ from surfel_mapper.config.layers import (
     ModelsLayerConfig,
     TsdfConfig,
 )
+from surfel_mapper.config.parameters_file import ros_parameters
 from surfel_mapper.config.registration import AlignConfig, LoopsConfig, RegistrationConfig
 from surfel_mapper.config.settings import (
     checked,
@@ -258,7 +259,8 @@ def load_config(path: str | Path | None = None) -> Config:
     Parameters
     ----------
     path : str or Path, optional
-        A YAML file of ROS parameters (``/**: ros__parameters: ...``), or of the stages alone.
+        A YAML file of ROS parameters (``/**: ros__parameters: ...``), or of the stages alone. Of a
+        file for several nodes those of ``/**`` and of ``surfel_mapper`` are taken.
         ``use_sim_time`` and ``qos_overrides`` belong to rclpy and are ignored.
 
     Raises
@@ -286,20 +288,6 @@ def load_config(path: str | Path | None = None) -> Config:
         return Config.from_mapping(ros_parameters(content))
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}') from error
-
-
-def ros_parameters(content: Any) -> dict[str, Any]:
-    """Return the settings in a parameters file with or without ``ros__parameters``."""
-    if not isinstance(content, Mapping):
-        raise ConfigError(f'a {type(content).__name__}, expected a mapping of settings')
-    settings: dict[str, Any] = {}
-    for name, value in content.items():
-        if isinstance(value, Mapping) and 'ros__parameters' in value:
-            settings.update(flatten(value['ros__parameters'] or {}))
-        else:
-            settings.update(flatten({name: value}))
-    for_node = ('use_sim_time', 'qos_overrides.')
-    return {name: value for name, value in settings.items() if not name.startswith(for_node)}
 
 
 def settings_table() -> str:
