@@ -20,6 +20,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 import itertools
 import os
+from pathlib import Path
 import sys
 import threading
 from typing import TypeVar
@@ -36,9 +37,24 @@ BACKGROUND_NICE = 10
 """Niceness added to threads in the background: of a busy core they get a tenth."""
 
 
+CGROUP_QUOTA = Path('/sys/fs/cgroup/cpu.max')
+"""Processor time of a container, us a period and the period, such as ``150000 100000``; or ``max``
+instead of the first."""
+
+
 def usable_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+    """
+    Return the number of cores that this process may use, and that the quota of a container fills.
+
+    A quota of 1.5 cores fills one: with more threads than that all of them stand still as soon as
+    the time of a period is used up.
+    """
+    cores = len(os.sched_getaffinity(0))
+    try:
+        quota_us, period_us = CGROUP_QUOTA.read_text(encoding='ascii').split()
+    except (OSError, ValueError):  # no container, or not of Linux
+        return cores
+    return max(min(cores, int(quota_us) // int(period_us)), 1) if quota_us.isdigit() else cores
 
 
 def yield_to_others() -> None:

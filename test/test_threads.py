@@ -19,6 +19,7 @@ import weakref
 import numpy as np
 import pytest
 
+from surfel_mapper import threads as threads_module
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.threads import (
     BACKGROUND_NICE,
@@ -28,6 +29,7 @@ from surfel_mapper.threads import (
     share_parts,
     split,
     together,
+    usable_cores,
     yield_to_others,
 )
 
@@ -37,6 +39,30 @@ ROOT = Path(__file__).parents[1]
 def in_order(surfels):
     """Return the arrays of surfels, sorted by voxel."""
     return surfels.select(np.lexsort(surfels.voxel_index.T)).arrays
+
+
+@pytest.mark.parametrize(
+    ('quota', 'expected'),
+    [
+        (None, 4),
+        ('', 4),
+        ('max 100000', 4),
+        ('800000 100000', 4),
+        ('200000 100000', 2),
+        ('150000 100000', 1),
+        ('20000 100000', 1),
+        ('100000 50000', 2),
+    ],
+)
+def test_usable_cores_are_those_that_the_quota_of_a_container_fills(
+    quota, expected, tmp_path, monkeypatch
+):
+    limit = tmp_path / 'cpu.max'
+    if quota is not None:
+        limit.write_text(f'{quota}\n', encoding='ascii')
+    monkeypatch.setattr(threads_module, 'CGROUP_QUOTA', limit)
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda _: {0, 1, 2, 3})
+    assert usable_cores() == expected
 
 
 @pytest.mark.parametrize('threads', [2, 3])

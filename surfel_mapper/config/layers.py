@@ -258,7 +258,9 @@ class TsdfConfig(Stage):
         'by direction; auto, the first of these that is kept.',
         choices=('auto', 'color', 'label', 'slope'),
     )
-    threads: int = setting(0, 'Threads; 0: one for each core.', low=0, high=1024)
+    threads: int = setting(
+        0, 'Threads; 0: one for each core that the process may use.', low=0, high=1024
+    )
 
     def check(self, stage: str) -> None:
         """Check conditions on several settings."""

@@ -13,14 +13,13 @@ from __future__ import annotations
 from dataclasses import replace
 import logging
 import math
-import os
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import INTERPOLATIONS, SEMANTICS, TsdfConfig
-from surfel_mapper.threads import share
+from surfel_mapper.threads import share, usable_cores
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.kernels import lookup as kernels
 from surfel_mapper.tsdf.kernels.blocks import FREE_VISITS, STAMP
@@ -98,7 +97,7 @@ class Integrator:
         self._selection = BlockSelection(config)
         self._has_warned = False
         self._num_images = 0
-        self._threads = config.threads or os.cpu_count() or 1
+        self._threads = config.threads or usable_cores()
         side = np.arange(config.voxels_per_side) * config.voxel_size_m
         z, y, x = np.meshgrid(side, side, side, indexing='ij')
         self._voxels = np.stack([x.ravel(), y.ravel(), z.ravel()])
