@@ -219,10 +219,10 @@ class Mapper:
         return [name for name in missing if images is None or not images.will_give(scan, name)]
 
     def _accept(self, scan: Scan) -> None:
-        """Queue a scan; if time was set back, clear the map first."""
+        """Queue a scan; if time was set back, and not ahead by one scan, clear the map first."""
         newest_ns = self._queue.newest_of(scan.frame_id)
         back_s = 0.0 if newest_ns is None else (newest_ns - scan.stamp_ns) / 1e9
-        if back_s > self.config.input.reset_after_s:
+        if back_s > self.config.input.reset_after_s and not self._queue.drop_odd_before(scan):
             self._start_anew(scan, back_s)
         self._poses.mount(scan.frame_id)
         self._queue.push(scan)

@@ -63,6 +63,7 @@ class ScanQueue:
         self._scans: deque[Scan] = deque()
         self.posed: deque[PosedScan] = deque()
         self._newest_ns: dict[str, int] = {}
+        self._before_ns: dict[str, int] = {}
         self.ended = False
 
     @property
@@ -100,12 +101,39 @@ class ScanQueue:
             self._newest_ns[scan.frame_id] = last_ns
             return
         if len(self._newest_ns) >= MAX_FRAMES:
-            del self._newest_ns[next(iter(self._newest_ns))]
+            silent = next(iter(self._newest_ns))
+            del self._newest_ns[silent]
+            self._before_ns.pop(silent, None)
         self._newest_ns[scan.frame_id] = scan.stamp_ns  # at the end: in order of arrival
+        if last_ns is not None:
+            self._before_ns[scan.frame_id] = last_ns
         self._scans.append(scan)
         while len(self._scans) > self._max_scans:
             reason = f'{self._max_scans} newer scans wait for their poses'
             self._drops.scan(self._scans.popleft(), 'queue_full', reason)
+
+    def drop_odd_before(self, scan: Scan) -> bool:
+        """
+        Take the last scan of a frame for the odd one, if the given scan continues those before it.
+
+        Its stamp is forgotten, and it is dropped if it still waits for its pose. Returns whether
+        that was so; if not, time was set back.
+        """
+        frame_id = scan.frame_id
+        before_ns = self._before_ns.pop(frame_id, None)
+        if before_ns is None or scan.stamp_ns <= before_ns:
+            return False
+        odd_ns = self._newest_ns[frame_id]
+        self._newest_ns[frame_id] = before_ns
+        reason = f'its stamp is {(odd_ns - scan.stamp_ns) / 1e9:.3f} s ahead of the next scan'
+        for place, waiting in enumerate(self._scans):
+            if (waiting.frame_id, waiting.stamp_ns) == (frame_id, odd_ns):
+                del self._scans[place]
+                self._drops.scan(waiting, 'odd_stamp', reason)
+                return True
+        text = f'scan at {odd_ns / 1e9:.6f} s in frame {frame_id!r}: {reason}, but it is mapped'
+        self._drops.warn('odd_stamp', text)
+        return True
 
     def fill_posed(self, number: int, config: PoseConfig) -> int:
         """Fill ``posed`` to a number of scans, if their poses are there; return its length."""
@@ -127,6 +155,7 @@ class ScanQueue:
     def forget_stamps(self) -> None:
         """Forget the newest stamps, as after time was set back."""
         self._newest_ns.clear()
+        self._before_ns.clear()
 
     def _next(self, config: PoseConfig) -> PosedScan | None:
         """Remove the next scan whose pose is there; drop those before it that get none."""

@@ -36,6 +36,52 @@ def test_one_scan_with_an_odd_stamp_is_dropped_and_the_map_stays(odd_s, caplog):
     assert_counts_add_up(mapper)
 
 
+@pytest.mark.parametrize('ahead_s', [1.2, 5.0, 59.0])
+def test_one_scan_with_a_stamp_ahead_is_dropped_while_it_waits_and_the_map_stays(ahead_s, caplog):
+    mapper, expected = mapper_with(), mapper_with()
+    drive(mapper, 100.0, 100.1)
+    assert insert(mapper, scan_at(100.2 + ahead_s)) == []
+    assert drive(mapper, 100.3, 100.4) == [100.3, 100.4]
+    drive(expected, 100.0, 100.1, 100.3, 100.4)
+    assert mapper.map.digest() == expected.map.digest()
+    assert mapper.counters.dropped == {'odd_stamp': 1}
+    assert mapper.counters.resets == 0
+    assert f'its stamp is {ahead_s - 0.1:.3f} s ahead of the next scan' in caplog.text
+    assert_counts_add_up(mapper)
+
+
+def test_one_scan_with_a_stamp_ahead_stays_if_it_is_mapped_and_so_does_the_map(caplog):
+    mapper, expected = mapper_with(pose__source='identity'), mapper_with(pose__source='identity')
+    stamps_s = [100.0, 100.1, 105.2, 100.3, 100.4]
+    updates = insert(mapper, *map(scan_at, stamps_s))
+    assert [update.stamp_ns / 1e9 for update in updates] == stamps_s
+    insert(expected, *map(scan_at, sorted(stamps_s)))
+    assert mapper.map.digest() == expected.map.digest()
+    assert mapper.counters.dropped == {}
+    assert mapper.counters.resets == 0
+    assert 'scan at 105.200000 s' in caplog.text
+    assert_counts_add_up(mapper)
+
+
+def test_a_scan_with_a_stamp_ahead_is_found_among_others_that_wait():
+    mapper = mapper_with(pose__max_wait_s=10.0)
+    drive(mapper, 100.0)
+    scans = [scan_at(100.1), scan_at(100.1, 'rear'), scan_at(102.0), scan_at(100.2)]
+    assert insert(mapper, *scans) == []
+    assert mapper.counters.dropped == {'odd_stamp': 1}
+    add_pose(mapper, 100.3)
+    assert len(list(mapper.insert_ready())) == 3
+    assert_counts_add_up(mapper)
+
+
+def test_time_is_set_back_after_two_scans_ahead_and_to_before_the_last_two():
+    for stamps_s in ([100.0, 105.0, 105.1, 100.1, 100.2], [100.0, 105.0, 99.0, 99.1]):
+        mapper = mapper_with(pose__source='identity')
+        insert(mapper, *map(scan_at, stamps_s))
+        assert mapper.counters.resets == 1
+        assert len(mapper.window) == 2
+
+
 @pytest.mark.parametrize('odd_s', [YEAR_2033_S, 40.0])
 def test_one_pose_with_an_odd_stamp_is_ignored(odd_s):
     mapper = mapper_with()
