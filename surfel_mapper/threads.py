@@ -46,8 +46,8 @@ def usable_cores() -> int:
     """
     Return the number of cores that this process may use, and that the quota of a container fills.
 
-    A quota of 1.5 cores fills one: with more threads than that all of them stand still as soon as
-    the time of a period is used up.
+    A quota of 1.5 cores fills one: beyond it all threads stand still as soon as the time of a
+    period is used up. Two on one core's quota took 1.5 times as long as one, on 1.5 cores as long.
     """
     cores = len(os.sched_getaffinity(0))
     try:
