@@ -52,7 +52,7 @@ def usable_cores() -> int:
     cores = len(os.sched_getaffinity(0))
     try:
         quota_us, period_us = CGROUP_QUOTA.read_text(encoding='ascii').split()
-    except (OSError, ValueError):  # no container, or not of Linux
+    except (OSError, ValueError):  # no limit that cgroup 2 states
         return cores
     return max(min(cores, int(quota_us) // int(period_us)), 1) if quota_us.isdigit() else cores
 

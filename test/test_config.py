@@ -285,6 +285,7 @@ def test_a_refused_stage_is_not_registered():
         'amcl:\n  ros__parameters: {alpha1: 0.2}\n'
         'surfel_mapper:\n  ros__parameters: {window.max_scans: 7}\n',
         '/**:\n  ros__parameters: {window.max_scans: 9}\n'
+        '/*:\n  ros__parameters: {window.max_scans: 8}\n'
         '/robot1/surfel_mapper:\n  ros__parameters: {window.max_scans: 7}\n'
         'global_costmap: {global_costmap: {ros__parameters: {plugins: []}}}\n',
         'window:\n  max_scans: 7\n',

@@ -14,8 +14,8 @@ from typing import Any
 from surfel_mapper.config.settings import flatten
 from surfel_mapper.errors import ConfigError
 
-NODE, ANY_NODE, PARAMETERS = 'surfel_mapper', '/**', 'ros__parameters'
-"""Keys of a file of ROS parameters: the node's own name, every node, what belongs to a node."""
+NODE, PARAMETERS = 'surfel_mapper', 'ros__parameters'
+"""Keys of a file of ROS parameters: the node's own name, and what belongs to a node."""
 
 
 def ros_parameters(content: Any) -> dict[str, Any]:
@@ -24,11 +24,17 @@ def ros_parameters(content: Any) -> dict[str, Any]:
 
     A robot's file may hold those of several nodes; then those of ``/**`` and of the node named
     surfel_mapper are taken, in whatever namespace.
+
+    Raises
+    ------
+    ConfigError
+        If it is no mapping, or it is not clear which node is meant.
+
     """
     if not isinstance(content, Mapping):
         raise ConfigError(f'a {type(content).__name__}, expected a mapping of settings')
     parts = list(parts_of(content))
-    nodes = [node for node, _ in parts if node not in ('', ANY_NODE)]
+    nodes = [node for node, _ in parts if node and not node.endswith('*')]
     own = [node for node in nodes if len(nodes) == 1 or node.split('/')[-1] == NODE]
     if nodes and len(own) != 1:
         raise ConfigError(
@@ -37,7 +43,7 @@ def ros_parameters(content: Any) -> dict[str, Any]:
         )
     settings: dict[str, Any] = {}
     for node, values in parts:
-        if node in ('', ANY_NODE, *own):
+        if not node or node.endswith('*') or node in own:
             settings.update(flatten(values))
     for_node = ('use_sim_time', 'qos_overrides.')
     return {name: value for name, value in settings.items() if not name.startswith(for_node)}
