@@ -13,10 +13,11 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-import time
 from typing import Any
 
 import numpy as np
+
+from surfel_mapper.compilation import clock
 
 STAGES = (
     'read',
@@ -189,12 +190,12 @@ class Laps:
     """Times of consecutive stages."""
 
     def __init__(self) -> None:
-        self._start = self._lap = time.perf_counter()
+        self._start = self._lap = clock()
         self._stages: dict[str, float] = {}
 
     def end(self, stage: str) -> None:
         """End a stage and start the next."""
-        now = time.perf_counter()
+        now = clock()
         self._stages[stage] = (now - self._lap) * 1e3
         self._lap = now
 
@@ -205,7 +206,7 @@ class Laps:
 
 
 def percentiles(milliseconds: deque[float]) -> dict[str, float]:
-    """Return median and 99th percentile of times; the latter without the first, which compiles."""
+    """Return median and 99th percentile of times; the latter without the first, in a cold cache."""
     return {
         'median': round(float(np.median(milliseconds)), 3),
         'p99': round(float(np.percentile([*milliseconds][len(milliseconds) > 1 :], 99)), 3),
@@ -221,10 +222,10 @@ class _Timed(AbstractContextManager[None]):
         self._counters, self._stage = counters, stage
 
     def __enter__(self) -> None:
-        self._start = time.perf_counter()
+        self._start = clock()
 
     def __exit__(self, *_: object) -> None:
-        self._counters.add_times({self._stage: (time.perf_counter() - self._start) * 1e3})
+        self._counters.add_times({self._stage: (clock() - self._start) * 1e3})
 
 
 def decimals(value: float | None, factor: float = 1.0) -> str:

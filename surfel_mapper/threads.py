@@ -15,7 +15,8 @@ error in its byte count (Fast DDS 2.14) delays repetitions by up to half a secon
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache
 import itertools
@@ -23,11 +24,6 @@ import os
 from pathlib import Path
 import sys
 import threading
-from typing import TypeVar
-
-from surfel_mapper.helpers import Helpers, Job
-
-Part = TypeVar('Part')
 
 PARTS = 4
 """Number of parts per thread into which rows are divided; an idle thread takes the next part."""
@@ -90,11 +86,11 @@ def real_time_threads() -> Iterator[None]:
 
 
 @cache
-def pool(threads: int) -> Helpers | None:
+def pool(threads: int) -> ThreadPoolExecutor | None:
     """Return the pool of threads beside the caller's own, shared by all; None for one thread."""
     if threads < 2:
         return None
-    return Helpers(threads - 1, stay_awake=threads <= usable_cores())
+    return ThreadPoolExecutor(threads - 1, thread_name_prefix='surfel_mapper')
 
 
 if hasattr(os, 'register_at_fork'):
@@ -108,55 +104,26 @@ def split(num_rows: int, parts: int) -> list[slice]:
 
 
 def share(work: Callable[[slice], object], num_rows: int, threads: int) -> None:
-    """Do the work on all rows, in parts of nearly equal length; see ``share_parts``."""
-    parts = PARTS * threads if threads > 1 else 1
-    share_parts(work, split(num_rows, parts), threads)
-
-
-def share_parts(work: Callable[[Part], object], parts: Iterable[Part], threads: int) -> None:
-    """Do the work on all parts, with the help of idle threads of the pool; see ``together``."""
-    left = iter(parts)  # shared; Python's lock protects it
-
-    def take_parts() -> None:
-        for part in left:
-            work(part)
-
-    together(take_parts, threads)
-
-
-def together(work: Callable[[], object], threads: int) -> None:
     """
-    Call a function, also by idle threads of the pool; each call takes parts until none is left.
+    Do the work on all rows, in slices of nearly equal length, with the threads of the pool.
 
-    The calling thread never waits for a thread that is busy with other work, only for parts that
-    another thread has begun, also if a part fails. Of several errors its own is raised, or that of
-    the first helper.
+    The calling thread takes slices too, and never waits for a thread that is busy with other work.
     """
     helpers = pool(threads)
     if helpers is None:
-        work()
+        work(slice(0, num_rows))
         return
-    helping: list[Job[object]] = []
-    failure: BaseException | None = None
+    slices = iter(split(num_rows, PARTS * threads))  # shared: Python's lock protects it
+
+    def take_slices() -> None:
+        for rows in slices:
+            work(rows)
+
+    helping = [helpers.submit(take_slices) for _ in range(threads - 1)]
     try:
-        for _ in range(threads - 1):
-            job = helpers.job(work)
-            helping.append(job)  # before it can begin: an interrupt may come between the two
-            helpers.give(job)
-        work()
-    finally:  # not in a function: Ctrl-C may come before its first line
-        while True:
-            try:
-                for job in helping:
-                    if not job.cancel():
-                        job.wait()
-                break
-            except (KeyboardInterrupt, MemoryError) as error:
-                failure = error
-        if failure is not None:
-            raise failure
-    try:
-        for job in helping:
-            job.check()
+        take_slices()
     finally:
-        del job, helping  # an error keeps this frame, and the job the error
+        begun = [future for future in helping if not future.cancel()]
+        wait(begun)
+    for future in begun:
+        future.result()

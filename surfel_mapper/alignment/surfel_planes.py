@@ -167,7 +167,7 @@ class SurfelPlanes:
         continuation_keys(
             surfels.position,
             surfels.normal,
-            surfels.eigenvalues[:, 0],
+            surfels.eigenvalues,
             surfels.voxel_index,
             (size_m, self._noise_sq, SIGMAS),
             keys,

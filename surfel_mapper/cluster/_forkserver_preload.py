@@ -22,4 +22,4 @@ with suppress(SurfelMapperError):  # a worker meets the same error, and reports 
     from surfel_mapper.cluster import shards, tiles  # noqa: F401 - for the workers
     from surfel_mapper.pipeline import Mapper
 
-    Mapper().warm_up(rare=False)
+    Mapper().warm_up()

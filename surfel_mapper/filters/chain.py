@@ -24,12 +24,12 @@ import contextlib
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
-import time
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.compilation import clock
 from surfel_mapper.config import near, parse_yaml, read_yaml, settings_of
 from surfel_mapper.config.settings import checked
 from surfel_mapper.errors import ConfigError, FilterError
@@ -191,7 +191,7 @@ class Chain:
         scan = as_scan(scan)
         steps = []
         for name, each in zip(self.names, self.filters, strict=True):
-            start, points_in = time.perf_counter(), len(scan)
+            start, points_in = clock(), len(scan)
             not_finite = 0
             try:
                 if isinstance(each, FiniteFilter):
@@ -202,18 +202,17 @@ class Chain:
                     scan = each.apply(scan)
             except FilterError as error:
                 raise FilterError(f'filter {name}: {error}') from error
-            milliseconds = (time.perf_counter() - start) * 1e3
+            milliseconds = (clock() - start) * 1e3
             steps.append(Step(name, points_in, len(scan), milliseconds, not_finite))
         return scan, tuple(steps)
 
-    def warm_up(self) -> None:
-        """Compile the kernels of this package's filters for float32 and float64."""
-        for dtype in (np.float32, np.float64):
-            scan = example(dtype)
-            for each in self.filters:
-                if type(each).__module__.startswith('surfel_mapper.'):
-                    with contextlib.suppress(FilterError):  # needs a column that the example lacks
-                        replace(each).apply(scan)  # a copy: a filter may count its scans
+    def warm_up(self, dtype: npt.DTypeLike = np.float32) -> None:
+        """Compile the kernels of this package's filters for points of a type."""
+        scan = example(dtype)
+        for each in self.filters:
+            if type(each).__module__.startswith('surfel_mapper.'):
+                with contextlib.suppress(FilterError):  # needs a column that the example lacks
+                    replace(each).apply(scan)  # a copy: a filter may count its scans
 
 
 def example(dtype: npt.DTypeLike) -> Scan:

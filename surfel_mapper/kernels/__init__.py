@@ -26,6 +26,7 @@ import shutil
 import tempfile
 from types import FunctionType
 
+from surfel_mapper.compilation import PROGRESS
 from surfel_mapper.errors import DependencyError
 
 HOW_TO_INSTALL = (
@@ -40,6 +41,7 @@ HOW_TO_INSTALL = (
 
 try:
     import numba as _numba
+    from numba.core import event as _event
 except ImportError as error:
     raise DependencyError(f'numba cannot be loaded ({error}). {HOW_TO_INSTALL}') from error
 
@@ -123,8 +125,8 @@ def _prepare_cache() -> None:
         atexit.register(shutil.rmtree, directory, ignore_errors=True)
         _numba.config.CACHE_DIR = directory  # type: ignore[attr-defined]
         _log.warning(
-            'no writable cache directory for compiled kernels, so every start takes half a '
-            'minute: set NUMBA_CACHE_DIR to a writable directory'
+            'no writable cache directory for compiled kernels, so every start compiles them: set '
+            'NUMBA_CACHE_DIR to a writable directory'
         )
         return
     digests = _source_digests()
@@ -137,5 +139,18 @@ def _prepare_cache() -> None:
         _discard_stale(cache, own)
 
 
+class _Reporter(_event.Listener):  # type: ignore[misc]
+    """Reports compilations, not loads from the cache; see compilation.py."""
+
+    def on_start(self, event: _event.Event) -> None:
+        """Report the begin of one."""
+        PROGRESS.begin()
+
+    def on_end(self, event: _event.Event) -> None:
+        """Report its end."""
+        PROGRESS.end()
+
+
 if not _numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
     _prepare_cache()
+    _event.register('numba:compile', _Reporter())

@@ -12,12 +12,9 @@ a function of its own in the machine code too; ``use_widest_vectors`` chooses th
 Stands alone: kernels of any folder may use it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from functools import partial
 
 from numba import njit, types
-from numba.core.event import install_listener, install_recorder, Listener
 from numba.extending import lower_builtin, type_callable
 import numpy as np
 
@@ -67,33 +64,3 @@ def _mark_widest(context, builder, signature, arguments):
     # add of llvmlite knows only attributes without a value
     set.add(builder.function.attributes, '"prefer-vector-width"="512"')
     return context.get_dummy_value()
-
-
-@contextmanager
-def compilations() -> Iterator[Sequence[object]]:
-    """Give a list that grows with each function compiled, not loaded from the cache, meanwhile."""
-    with install_recorder('numba:compile') as recorder:
-        yield recorder.buffer
-
-
-@contextmanager
-def before_compiling(call: Callable[[], None]) -> Iterator[None]:
-    """Call a function once if something is compiled in a with-block, before it is."""
-    with install_listener('numba:compile', FirstCompilation(call)):
-        yield
-
-
-class FirstCompilation(Listener):
-    """Calls a function at the first compilation it hears of."""
-
-    def __init__(self, call):
-        self._call = call
-
-    def on_start(self, event):
-        """Call it, once."""
-        call, self._call = self._call, None
-        if call is not None:
-            call()
-
-    def on_end(self, event):
-        """Do nothing: the interface of numba asks for it."""

@@ -17,12 +17,6 @@ An entry is one int64: the hash in the upper 32 bits and row + 1 in the lower, 0
 Splitting and removing need only the hash, never the rows; a look-up that finds an equal hash
 confirms it by the key in the row, which the caller is about to use.
 
-A table of several threads has stripes: the keys whose hashes have the same highest bits. Segments,
-rows and counts of one stripe are its own, so that two threads may change different stripes at the
-same time. Stripes are given rows and segments in groups that they fill alone: with single ones a
-thread waits for cache lines that the other has written, and two threads add 1.5 times as fast as
-one instead of 1.8 times.
-
 The kernels take the table as one tuple: directory (2^depth,) int32, the segment of each prefix of
 the hash; buckets (S * 512,) int64, the entries; held (S,) int32, rows in each segment; local_depth
 (S,) int8, number of hash bits that all rows of a segment share. Its depth is in the state.
@@ -49,25 +43,16 @@ FULLEST = SEGMENT * 3 // 4
 # Entries of the state of a table, an int64 array that kernels write.
 DEPTH = 0
 """The directory has 2^DEPTH entries."""
-STRIPING = 1
-"""The table has 2^STRIPING stripes."""
-LINE = 16
-"""Words of the state between a stripe and the next: a thread writes two cache lines of its own."""
-# Those of the first stripe; LINE words later follow those of the second.
-FREE_ROW = LINE
+FREE_ROW = 1
 """First row of the chain of free rows, -1 if the chain is empty."""
-NEXT_ROW = LINE + 1
-"""The row that is used next if the chain is empty, of rows that were never used, ..."""
-END_ROW = LINE + 2
-"""... and the one after the last of these."""
-NEXT_SEGMENT = LINE + 3
-"""The segment that is used next, of segments that were never used, ..."""
-END_SEGMENT = LINE + 4
-"""... and the one after the last of these."""
-VOXELS = LINE + 5
-POINTS = LINE + 6
-STATE = 2 * LINE
-"""Length of the state of a table of one stripe."""
+NEXT_ROW = 2
+"""The row that is used next if the chain is empty: this and later ones were never used."""
+NEXT_SEGMENT = 3
+"""The segment that is used next: this and later ones were never used."""
+VOXELS = 4
+POINTS = 5
+STATE = 6
+"""Length of the state."""
 
 LOW = np.int64(0xFFFFFFFF)
 
@@ -79,12 +64,6 @@ def hash_key(key):
     mixed ^= mixed >> np.uint64(32)
     mixed *= np.uint64(0xD6E8FEB86659FD93)
     return np.int64(mixed >> np.uint64(32))
-
-
-@njit(cache=True, nogil=True, inline='always')
-def stripe_of(hashed, stripe_bits):
-    """Return the stripe of a hash, of 2^stripe_bits ones."""
-    return hashed >> (32 - stripe_bits)
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -246,11 +225,10 @@ def split_segment(hashed, table, state, entries):
     depth = state[DEPTH]
     old = np.int64(directory[hashed >> (32 - depth)])
     bits = np.int64(local_depth[old])
-    own = stripe_of(hashed, state[STRIPING]) * LINE
-    new = state[NEXT_SEGMENT + own]
-    if bits == depth or new == state[END_SEGMENT + own]:
+    new = state[NEXT_SEGMENT]
+    if bits == depth or new == len(held):
         return False
-    state[NEXT_SEGMENT + own] = new + 1
+    state[NEXT_SEGMENT] = new + 1
     local_depth[old] = local_depth[new] = bits + 1
     for place in range(SEGMENT):
         entries[place] = buckets[old * SEGMENT + place]

@@ -57,8 +57,7 @@ PIECE = 16
 
 # Stamp of a row, kept beside the rows: the last change of its voxel. Bit 0 says that the change
 # emptied it, the 31 upper bits are the lower ones of the version of the map.
-EMPTIED = UNUSED = 1
-"""UNUSED, a row that version 0 emptied, was given to a stripe and never used."""
+EMPTIED = 1
 STAMPS = (1 << 32) - 1
 """Mask of a stamp. Versions repeat after 2^31 changes, 1.7 years of a window at 20 scans/s. A row
 that stayed the same for as long counts as changed in a request for changes that old."""

@@ -13,8 +13,6 @@ Limits: voxel indices within 21 signed bits an axis (524 km each way at 0.5 m), 
 scan in a voxel, 2^31 points of the map in a voxel.
 
 Points are reduced to moments and surfels derived from them in ``SurfelMap`` (surfel_map.py).
-
-(One module because it is one class: all of it changes or reads the same table of voxels.)
 """
 
 from __future__ import annotations
@@ -62,8 +60,6 @@ class MomentMap:
         The lattice unit is ``voxel_size_m / 2^(16 + level)``.
     origin_m : (3,) float, m
         Place of the origin of the map in an outer frame.
-    threads : int
-        Number of threads that share the work.
 
     Errors are those of SurfelMap.
 
@@ -75,7 +71,6 @@ class MomentMap:
         columns: tuple[str, ...],
         level: int,
         origin_m: npt.ArrayLike,
-        threads: int,
     ) -> None:
         if as_whole('level', level) not in range(MAX_LEVEL + 1):
             raise ValueError(f'level: {level}, expected 0 to {MAX_LEVEL}')
@@ -85,11 +80,10 @@ class MomentMap:
         self.version = 0
         self.columns = columns
         self._channel_names = channel_names(columns)
-        self._threads = threads
         self._reset()
 
     def _reset(self) -> None:
-        self._table = VoxelTable(len(self._channel_names), self._threads)
+        self._table = VoxelTable(len(self._channel_names))
         self._changes = ChangeLog(self.version)
         self.cleared_at = self.version
 
@@ -170,8 +164,7 @@ class MomentMap:
         MapError
             If their voxel size differs, or no points can have these moments.
         NotInMapError
-            If a voxel holds fewer points, or equally many with other sums. Nothing is changed,
-            though with several threads some of the voxels may be reported as changed.
+            If a voxel holds fewer points, or equally many with other sums. Nothing is changed.
             Moments that were never added are detected unless every one of their voxels holds
             more points of other scans.
 

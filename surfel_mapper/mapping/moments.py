@@ -33,12 +33,6 @@ HASHED_ARRAYS = ('key', 'count', 'total', 'product', 'view')
 """The arrays of ScanMoments in the order in which a digest hashes them."""
 
 
-STRIPE_BITS = 3
-"""Maps that several threads change have 2^3 stripes, enough for the threads to end at one time."""
-
-LEAST_SHARED = 20_000
-"""Voxels of a scan from which on threads share them; with fewer the hand-over takes longer."""
-
 ARRAYS = (
     ('key', (), (np.int64,)),
     ('count', (), (np.int32, np.int64)),
@@ -80,10 +74,6 @@ class ScanMoments:
     rows : (K,) int32, optional
         Rows of the voxels in the map that inserted these moments last. Only hints, which save
         the look-up at removal: a map confirms each by the key in the row.
-    stripes : (S, 3) int64, optional
-        The first voxel of each stripe, the one after its last, and its number, of voxels that are
-        in the order of their stripes: those of one stripe have the same highest bits of the hash.
-        None: in any order.
     num_reduced : int, optional
         Number of points of which a Reducer made these moments, so that a map need not test if
         points can have them. None for others, copies with other values too.
@@ -101,7 +91,6 @@ class ScanMoments:
     channels: npt.NDArray[np.int64] = None  # type: ignore[assignment]  # none: (K, 0)
     left_out: Mapping[str, int] = field(default_factory=dict)
     rows: npt.NDArray[np.int32] | None = field(default=None, init=False, repr=False)
-    stripes: npt.NDArray[np.int64] | None = field(default=None, init=False, repr=False)
     num_reduced: int | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:

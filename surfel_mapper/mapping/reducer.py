@@ -37,7 +37,7 @@ from surfel_mapper.mapping.kernels.reduction import (
     TOO_FAR,
     TOO_NEAR,
 )
-from surfel_mapper.mapping.moments import LEAST_SHARED, ScanMoments, STRIPE_BITS
+from surfel_mapper.mapping.moments import ScanMoments
 
 ENTRIES = 4
 """Table entries for each voxel: real lidars change the voxel with almost every point, and a table
@@ -54,11 +54,6 @@ CAUSES = {
 
 IDENTITY, UNKNOWN = np.eye(4), np.full(3, np.nan)
 """Pose of points that are in the map frame, and place of an unknown sensor."""
-
-NUM_STRIPES = 1 << STRIPE_BITS
-
-IN_ORDER = np.empty((0, 3), np.int64)
-"""Stripes of voxels that stay in the order of their first points."""
 
 NO_LIMITS = np.array([0.0, np.inf])
 """Squared limits of the range by default."""
@@ -108,16 +103,11 @@ class Reducer:
         Edge of a voxel.
     columns : tuple of str
         Columns of the points to sum in addition.
-    by_stripe : bool
-        Whether voxels are put in the order of their stripes, which threads then share.
 
     """
 
-    def __init__(
-        self, voxel_size_m: float, columns: tuple[str, ...] = (), *, by_stripe: bool = False
-    ) -> None:
+    def __init__(self, voxel_size_m: float, columns: tuple[str, ...] = ()) -> None:
         self.voxel_size_m = voxel_size_m
-        self._by_stripe = by_stripe
         self._columns = columns
         self._idle = [Scratch()]
 
@@ -170,9 +160,7 @@ class Reducer:
             sums = np.empty((len(moments), values.shape[1]), np.int64)
             sum_channels(points.T, *quantisation, moments.key, scratch.table, values, sums)
             scratch.table.fill(-1)
-            stripes = moments.stripes
             moments = replace(moments, channel_names=channel_names(self._columns), channels=sums)
-            object.__setattr__(moments, 'stripes', stripes)
         self._idle.append(scratch)
         num_reduced = len(points) - sum(moments.left_out.values())
         object.__setattr__(moments, 'num_reduced', num_reduced)
@@ -200,12 +188,7 @@ class Reducer:
                 left_out={cause: left_out[row] for cause, row in CAUSES.items() if left_out[row]},
             )
             keys, sums = scratch.keys[2 : num + 2], scratch.sums[1 : num + 1]
-            is_shared = self._by_stripe and num >= LEAST_SHARED
-            stripes = np.empty((NUM_STRIPES, 3), np.int64) if is_shared else IN_ORDER
-            size_m, arrays = self.voxel_size_m, moments.arrays
-            largest = pack_moments(keys, sums, stripes, origin, size_m, arrays)
-            if is_shared:
-                object.__setattr__(moments, 'stripes', stripes)
+            largest = pack_moments(keys, sums, origin, self.voxel_size_m, moments.arrays)
             if largest <= FULL:
                 return moments
             part = max(FULL, num_points * FULL // (2 * largest))  # half full on average
@@ -285,14 +268,10 @@ def as_origin(origin: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
     """
-    Return points as the kernels take them: (N, 3) float32 or float64 in Fortran order.
+    Return points as the kernels take them: (N, 3) float64 in Fortran order.
 
     Arrays that fulfil this and are writeable are not copied.
     """
-    if type(points) is np.ndarray and points.dtype == np.float32 and points.ndim == 2:
-        flags = points.flags  # the usual case; the general one takes 20 us in a cold cache
-        if points.shape[1] == 3 and flags.f_contiguous and flags.aligned and flags.writeable:
-            return points
     array = as_array('points', points)
     if array.dtype.names:  # Surfels, or a structured array
         columns = ', '.join(array.dtype.names[:4])
@@ -305,5 +284,4 @@ def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
         raise ValueError(f'points: shape {array.shape}, expected (N, 3)')
     if array.dtype.kind not in 'fiu':
         raise ValueError(f'points: dtype {array.dtype}, expected numbers')
-    dtype = np.float32 if array.dtype in (np.float32, np.float16) else np.float64
-    return np.require(array, dtype, ['F', 'A', 'W'])
+    return np.require(array, np.float64, ['F', 'A', 'W'])

@@ -9,7 +9,7 @@ written, so the slab may double.
 
 HashTable: the arrays of kernels/hashing.py. Kernels stop when there is no room; the caller makes
 room and calls again. The table grows by segments, each of which splits separately, so that no step
-is long. Rows and segments are given to the stripes of a table in groups.
+is long.
 """
 
 from __future__ import annotations
@@ -113,10 +113,7 @@ def _anonymous(num_bytes: int) -> mmap.mmap:
 
 
 SEGMENTS = 16
-"""Segments that a stripe is given at once: their numbers of rows fill a cache line."""
-
-ROWS = 8192
-"""Rows that a stripe is given at once, so that those of two stripes share no cache line."""
+"""Segments of a new table."""
 
 
 class HashTable:
@@ -127,99 +124,49 @@ class HashTable:
     ----------
     max_depth : int
         The directory has at most 2^max_depth entries.
-    stripe_bits : int
-        There are 2^stripe_bits stripes; see kernels/hashing.py.
 
     Attributes
     ----------
     state : (S,) int64
         The scalars that kernels write; see kernels/hashing.py.
-    rows_given : int
-        Number of rows of the slab that the stripes were given; later ones are untouched.
 
     """
 
-    def __init__(self, max_depth: int, stripe_bits: int = 0) -> None:
+    def __init__(self, max_depth: int) -> None:
         self._max_depth = max_depth
-        stripes = 1 << stripe_bits  # each has a segment at the start
-        num_segments = stripes * SEGMENTS
-        first = np.arange(0, num_segments, SEGMENTS, np.int32)
-        self._buckets = Slab(num_segments, hashing.SEGMENT)
-        self._directory: npt.NDArray[np.int32] = first
-        self._held: npt.NDArray[np.int32] = np.zeros(num_segments, np.int32)
-        self._local_depth: npt.NDArray[np.int8] = np.full(num_segments, stripe_bits, np.int8)
-        self.rows_given, self._segments_given = 0, num_segments
-        self.state = np.zeros((1 + stripes) * hashing.LINE, np.int64)
-        self.state[hashing.DEPTH] = self.state[hashing.STRIPING] = stripe_bits
-        for stripe, segment in enumerate(first.tolist()):
-            self.state[hashing.FREE_ROW + stripe * hashing.LINE] = -1
-            self._give(hashing.NEXT_SEGMENT, stripe, segment + 1, segment + SEGMENTS)
+        self._buckets = Slab(SEGMENTS, hashing.SEGMENT)
+        self._directory: npt.NDArray[np.int32] = np.zeros(1, np.int32)
+        self._num_rows: npt.NDArray[np.int32] = np.zeros(SEGMENTS, np.int32)
+        self._local_depth: npt.NDArray[np.int8] = np.zeros(SEGMENTS, np.int8)
+        self.state = np.zeros(hashing.STATE, np.int64)
+        self.state[hashing.FREE_ROW] = -1
+        self.state[hashing.NEXT_SEGMENT] = 1
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """Directory, buckets, held, local_depth, as the kernels take them."""
+        """Directory, buckets, rows of each segment, local_depth, as the kernels take them."""
         buckets = self._buckets.array.reshape(-1)
-        return self._directory, buckets, self._held, self._local_depth
-
-    def of_stripes(self, entry: int) -> list[int]:
-        """Return an entry of the state for each stripe."""
-        found: list[int] = self.state[entry :: hashing.LINE].tolist()
-        return found
-
-    def _give(self, entry: int, stripe: int, first: int, end: int) -> None:
-        """Give rows or segments to a stripe, in one step: Ctrl-C may come between two."""
-        at = entry + stripe * hashing.LINE
-        self.state[at : at + 2] = first, end
+        return self._directory, buckets, self._num_rows, self._local_depth
 
     @property
     def num_keys(self) -> int:
         """Number of keys in the table."""
-        return sum(self.of_stripes(hashing.VOXELS))
+        return int(self.state[hashing.VOXELS])
 
     @property
     def rows_used(self) -> int:
-        """Number of rows of the slab from which on none was ever used."""
-        return max(self.of_stripes(hashing.NEXT_ROW))
-
-    @property
-    def num_rows_used(self) -> int:
         """Number of rows of the slab ever used."""
-        return self.rows_given - self._num_left(hashing.NEXT_ROW, hashing.END_ROW)
+        return int(self.state[hashing.NEXT_ROW])
 
     @property
     def nbytes(self) -> int:
         """Bytes in use."""
-        num_left = self._num_left(hashing.NEXT_SEGMENT, hashing.END_SEGMENT)
-        buckets = (self._segments_given - num_left) * hashing.SEGMENT * 8
-        return buckets + self._directory.nbytes + self._held.nbytes
+        buckets = int(self.state[hashing.NEXT_SEGMENT]) * hashing.SEGMENT * 8
+        return buckets + self._directory.nbytes + self._num_rows.nbytes
 
-    def _num_left(self, following: int, end: int) -> int:
-        """Return how many rows or segments the stripes were given and have not used."""
-        return sum(self.of_stripes(end)) - sum(self.of_stripes(following))
-
-    def _without(self, following: int, end: int) -> list[int]:
-        """Return the stripes that have used all rows or segments that they were given."""
-        lefts = zip(self.of_stripes(following), self.of_stripes(end), strict=True)
-        return [stripe for stripe, (first, last) in enumerate(lefts) if first == last]
-
-    def _short_of_rows(self) -> list[int]:
-        """Return the stripes that have no row for a new key."""
-        free = self.of_stripes(hashing.FREE_ROW)
-        used_up = self._without(hashing.NEXT_ROW, hashing.END_ROW)
-        return [stripe for stripe in used_up if free[stripe] < 0]
-
-    def lacks_row(self) -> bool:
-        """Return whether a stripe has no row for a new key."""
-        return bool(self._short_of_rows())
-
-    def give_rows(self, num_rows: int) -> bool:
-        """Give rows of a slab of num_rows to the stripes without any; False if all are given."""
-        before = self.rows_given
-        for stripe in self._short_of_rows():
-            first, end = self.rows_given, min(self.rows_given + ROWS, num_rows)
-            self.rows_given = end  # first: rows may be lost, but not given twice
-            self._give(hashing.NEXT_ROW, stripe, first, end)
-        return self.rows_given > before
+    def lacks_row(self, num_rows: int) -> bool:
+        """Return whether a slab of num_rows has no row for a new key."""
+        return bool(self.state[hashing.FREE_ROW] < 0) and self.rows_used == num_rows
 
     def grow(self) -> None:
         """
@@ -231,23 +178,17 @@ class HashTable:
             If the table has its maximum size, or memory is exhausted.
 
         """
-        num_segments = len(self._held)
-        used_up = self._without(hashing.NEXT_SEGMENT, hashing.END_SEGMENT)
-        if not used_up:
+        num_segments = len(self._num_rows)
+        if self.state[hashing.NEXT_SEGMENT] < num_segments:
             self._double_directory()
-        elif self._segments_given == num_segments:
-            self._buckets.grow(2 * num_segments)
-            held = np.append(self._held, np.zeros_like(self._held))
-            local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
-            self._held, self._local_depth = held, local_depth  # both or none: of one length
-        else:
-            first = self._segments_given
-            self._segments_given = first + SEGMENTS
-            self._give(hashing.NEXT_SEGMENT, used_up[0], first, first + SEGMENTS)
+            return
+        self._buckets.grow(2 * num_segments)
+        self._num_rows = np.append(self._num_rows, np.zeros_like(self._num_rows))
+        self._local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
 
     def _double_directory(self) -> None:
         depth = int(self.state[hashing.DEPTH])
         if depth == self._max_depth:
             raise MapLimitError(f'{self.num_keys} keys: the hash table is full')
-        directory = np.repeat(self._directory, 2)
-        self.state[hashing.DEPTH], self._directory = depth + 1, directory
+        self._directory = np.repeat(self._directory, 2)
+        self.state[hashing.DEPTH] = depth + 1

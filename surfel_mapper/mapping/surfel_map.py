@@ -82,9 +82,6 @@ class SurfelMap(MomentMap):
         Edge of a voxel, m.
     columns : tuple of str
         Columns of the points to sum exactly as well: ``intensity``, ``rgb``.
-    threads : int
-        Number of threads that share the work; results do not depend on it, but for the order of
-        the voxels of large scans, and what ``surfels_changed`` returns after a refused ``remove``.
     level : int
         The lattice unit is ``voxel_size_m / 2^(16 + level)``; not 0 only in maps that
         ``coarsen`` returned, to which no scan can be added.
@@ -96,8 +93,8 @@ class SurfelMap(MomentMap):
     Raises
     ------
     ValueError
-        If the voxel size is not positive and finite, a column cannot be summed, threads is less
-        than 1, the level is negative or beyond 15, or the origin is not finite.
+        If the voxel size is not positive and finite, a column cannot be summed, the level is
+        negative or beyond 15, or the origin is not finite.
 
     """
 
@@ -106,7 +103,6 @@ class SurfelMap(MomentMap):
         voxel_size_m: float = 0.5,
         *,
         columns: tuple[str, ...] = (),
-        threads: int = 1,
         level: int = 0,
         origin_m: npt.ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
@@ -117,12 +113,10 @@ class SurfelMap(MomentMap):
             )
         if not 0.0 < as_numbers('voxel_size_m', voxel_size_m) < math.inf:
             raise ValueError(f'voxel_size_m: {voxel_size_m}, expected positive and finite')
-        if as_whole('threads', threads) < 1:
-            raise ValueError(f'threads: {threads}, expected 1 or more')
-        super().__init__(float(voxel_size_m), columns, level, origin_m, threads)
+        super().__init__(float(voxel_size_m), columns, level, origin_m)
         self._reported = self.version
         self._warned_of_units = False
-        self._reducer = Reducer(self.voxel_size_m, columns, by_stripe=threads > 1)
+        self._reducer = Reducer(self.voxel_size_m, columns)
 
     def add(
         self,
@@ -357,7 +351,7 @@ class SurfelMap(MomentMap):
 
     def copy(self) -> SurfelMap:
         """Return an independent copy."""
-        settings = {'columns': self.columns, 'level': self.level, 'threads': self._threads}
+        settings = {'columns': self.columns, 'level': self.level}
         return _rebuilt(self.voxel_size_m, settings, self.origin_m, self.moments())
 
     @classmethod
@@ -400,12 +394,12 @@ class SurfelMap(MomentMap):
 
     def __reduce__(self) -> Any:
         """Pickle the exact state; ``copy`` and ``deepcopy`` use it too."""
-        settings = {'columns': self.columns, 'level': self.level, 'threads': self._threads}
+        settings = {'columns': self.columns, 'level': self.level}
         return _rebuilt, (self.voxel_size_m, settings, self.origin_m, self.moments())
 
     def _derive(self, chosen: npt.NDArray[np.int32]) -> Surfels:
         bits = layout.BITS + self.level
-        surfels = derive(self._table.rows.array, chosen, self.voxel_size_m, bits, self._threads)
+        surfels = derive(self._table.rows.array, chosen, self.voxel_size_m, bits)
         if not self._channel_names:
             return surfels
         sums = self._table.channels(chosen)

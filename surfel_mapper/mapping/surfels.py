@@ -19,7 +19,6 @@ import numpy.typing as npt
 from surfel_mapper.arguments import as_array, made_array
 from surfel_mapper.errors import DependencyError
 from surfel_mapper.mapping.kernels.surfels import derive_surfels
-from surfel_mapper.threads import together
 
 
 class OneSurfel(NamedTuple):
@@ -32,10 +31,6 @@ class OneSurfel(NamedTuple):
     eigenvalues: npt.NDArray[np.float64]
     num_points: int
     voxel_index: tuple[int, int, int]
-
-
-FEW = 16384
-"""Below this number of surfels waking a thread takes longer than it saves: 0.1 ms if it sleeps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -251,7 +246,6 @@ def derive(
     chosen: npt.NDArray[np.int32],
     voxel_size_m: float,
     bits: int,
-    threads: int = 1,
 ) -> Surfels:
     """
     Derive the surfels of selected rows of a slab.
@@ -266,8 +260,6 @@ def derive(
         Edge of a voxel, m.
     bits : int
         A voxel is 2^bits lattice units wide.
-    threads : int
-        Number of threads that share the work.
 
     """
     num = len(chosen)
@@ -280,12 +272,6 @@ def derive(
         num_points=np.empty(num, np.int64),
         voxel_index=np.empty((num, 3), np.int32),
     )
-
-    claims = np.zeros(1, np.int64)
-
-    def derive_pieces() -> None:
-        derive_surfels(rows, chosen, voxel_size_m, bits, surfels.arrays, claims)
-
     if num:  # else the kernel need not be compiled yet
-        together(derive_pieces, threads if num >= FEW else 1)
+        derive_surfels(rows, chosen, voxel_size_m, bits, surfels.arrays)
     return surfels

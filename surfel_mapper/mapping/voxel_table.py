@@ -5,19 +5,15 @@ VoxelTable: the memory of a map, a row of integers for each voxel, found by hash
 
 Owns the arrays that the kernels work on and enlarges them when a kernel has no room. Rows and
 buckets grow without being copied and a full segment of the hash table splits separately, so that
-no scan waits while the whole map is rehashed. Divides a scan into parts that threads change at the
-same time.
+no scan waits while the whole map is rehashed.
 
 ChangeLog: the rows that the latest versions changed. Without it, asking for changes would look at
 the stamp of every row. It holds at most a quarter of the rows: beyond that, reading all stamps in
 order is as fast.
-
-(One module because the log is read by means of the stamps of the table.)
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from itertools import takewhile
@@ -39,23 +35,12 @@ from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
     find_rows,
     remove_moments,
-    restore_moments,
 )
-from surfel_mapper.mapping.moments import LEAST_SHARED, ScanMoments, STRIPE_BITS
-from surfel_mapper.mapping.storage import HashTable, ROWS, Slab
-from surfel_mapper.threads import share_parts, together
+from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.storage import HashTable, Slab
 
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries, enough for 6e9 voxels."""
-
-UNDO_BYTES = 64
-"""Memory that undoing takes, bytes a voxel: it is allocated before, and freed for it."""
-
-Part = tuple[int, int, int]
-"""The first voxel of a part of a scan, the one after its last, and a stripe that counts for it."""
-
-NO_PART: Part = 0, 0, 0
-"""A part without voxels."""
 
 Change = tuple[int, npt.NDArray[np.int32]]
 """A version, and the rows that it changed."""
@@ -72,8 +57,6 @@ class VoxelTable:
     ----------
     num_channels : int
         Number of channels that are summed beside the moments, in rows of their own.
-    threads : int
-        Number of threads that share the work.
 
     Attributes
     ----------
@@ -82,14 +65,12 @@ class VoxelTable:
 
     """
 
-    def __init__(self, num_channels: int = 0, threads: int = 1) -> None:
+    def __init__(self, num_channels: int = 0) -> None:
         self.rows = Slab(1024, layout.ROW)
         self._stamps = Slab(1024, 1, np.uint32)
         self._version = 0
         self._channels = Slab(1024, num_channels) if num_channels else None
-        self._hash = HashTable(MAX_DEPTH, STRIPE_BITS if threads > 1 else 0)
-        self._threads = threads
-        self._undoable: set[tuple[np.dtype[Any], ...]] = set()
+        self._hash = HashTable(MAX_DEPTH)
         self._state = self._hash.state
 
     @property
@@ -100,14 +81,14 @@ class VoxelTable:
     @property
     def num_points(self) -> int:
         """Number of points of all voxels."""
-        return sum(self._hash.of_stripes(hashing.POINTS))
+        return int(self._state[hashing.POINTS])
 
     @property
     def nbytes(self) -> int:
         """Bytes in use for voxels and their hash table."""
         slabs = (self.rows, self._stamps, self._channels)
         row_bytes = sum(slab.row_bytes for slab in slabs if slab)
-        return self._hash.num_rows_used * row_bytes + self._hash.nbytes
+        return self._hash.rows_used * row_bytes + self._hash.nbytes
 
     def add(self, moments: ScanMoments, version: int) -> npt.NDArray[np.int32]:
         """
@@ -116,24 +97,21 @@ class VoxelTable:
         Raises
         ------
         MapLimitError
-            If there is no memory for the voxels.
-
-        The table is unchanged after any exception, including a failed allocation anywhere, and
-        if there is no memory at all from then on.
+            If there is no memory for the voxels. The table is unchanged.
 
         """
-        found = np.empty(len(moments), np.int32)
-        found.fill(-1)  # np.full takes 10 us more in a cold cache
-        reserve = np.empty(len(moments) * UNDO_BYTES, np.uint8)
+        rows = np.empty(len(moments), np.int32)
+        num_added, self._version = 0, version
         try:
-            self._add(moments, version, found)
-            if self._channels:
-                self._channels.array[found.astype(np.intp)] += moments.channels
+            while (num_added := self._add(moments, num_added, rows)) < len(moments):
+                self._make_room()
         except BaseException:
-            del reserve
-            self._undo_add(moments, version, found)
+            added = slice(0, num_added)
+            self._subtract(moments.select(added), rows[added], 1)
             raise
-        return found
+        if self._channels:
+            self._channels.array[rows.astype(np.intp)] += moments.channels
+        return rows
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key, -1 if not found."""
@@ -146,8 +124,6 @@ class VoxelTable:
     ) -> tuple[int, npt.NDArray[np.int32], npt.NDArray[np.int32]]:
         """
         Subtract moments from their voxels, or nothing if one does not hold them.
-
-        The table is unchanged after any exception, as after one of ``add``.
 
         Returns
         -------
@@ -163,20 +139,10 @@ class VoxelTable:
             rows = self.find(moments.key)
         else:
             rows = np.array(moments.rows, np.int32)  # hints, confirmed by the kernel
-        before = self._hash.of_stripes(hashing.POINTS)
-        kind = moments.count.dtype, moments.total.dtype, moments.view.dtype
-        if kind not in self._undoable:  # compile it while there is memory
-            self._restore(moments, version, rows, NO_PART)
-            self._undoable.add(kind)
-        try:
-            missing, fallen = self._subtract(moments, version, rows, min_points)
-            if missing >= 0:
-                self._undo_subtract(moments, version, rows, before)
-            elif self._channels:
-                self._channels.array[rows.astype(np.intp)] -= moments.channels
-        except BaseException:
-            self._undo_subtract(moments, version, rows, before)
-            raise
+        self._version = version
+        missing, fallen = self._subtract(moments, rows, max(min_points, 1))
+        if missing < 0 and self._channels:
+            self._channels.array[rows.astype(np.intp)] -= moments.channels
         return missing, rows, fallen
 
     def checked(self, rows: npt.ArrayLike) -> npt.NDArray[np.int32]:
@@ -232,16 +198,11 @@ class VoxelTable:
         Rows of fewer than min_points points are left out.
         """
         stamps = self._stamps.array.reshape(-1)
-        parts = [np.empty(0, np.int32)] * len(changes)
-
-        def select(part: int) -> None:
-            version, rows = changes[part]
-            stamp = stamp_of(version)
-            parts[part] = rows_changed_at(self.rows.array, stamps, rows, stamp, min_points)
-
-        is_large = sum(len(rows) for _, rows in changes) >= LEAST_SHARED
-        share_parts(select, range(len(changes)), self._threads if is_large else 1)
-        return np.concatenate([np.empty(0, np.int32), *parts])
+        selected = [
+            rows_changed_at(self.rows.array, stamps, rows, stamp_of(version), min_points)
+            for version, rows in changes
+        ]
+        return np.concatenate([np.empty(0, np.int32), *selected])
 
     def occupied(self, min_points: int = 1) -> npt.NDArray[np.int32]:
         """Return the rows of at least min_points points, one point at least."""
@@ -261,138 +222,37 @@ class VoxelTable:
         num = rows_held(self.rows.array, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
-    def _parts(self, moments: ScanMoments) -> npt.NDArray[np.int64]:
-        """Return the parts of the voxels that threads may change at the same time, (P, 3)."""
-        if self._threads == 1 or moments.stripes is None:
-            return np.array([[0, len(moments), 0]])
-        return moments.stripes
-
-    def _add(self, moments: ScanMoments, version: int, found: npt.NDArray[np.int32]) -> None:
-        """Add moments without channels; write the row of each voxel to found once it is added."""
-        self._version = version
-        parts = self._parts(moments).copy()
-        while len(parts):
-            self._add_parts(moments, version, parts, found)
-            parts = parts[parts[:, 0] < parts[:, 1]]
-            if len(parts):
-                self._make_room()
-
-    def _add_parts(
-        self,
-        moments: ScanMoments,
-        version: int,
-        parts: npt.NDArray[np.int64],
-        found: npt.NDArray[np.int32],
-    ) -> None:
-        """Add parts of moments as far as there is room; see add_moments."""
-        claims = np.zeros(1, np.int64)
-
-        def add() -> None:
-            stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
-            add_moments(
-                *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
-                *(self._state, stamp_of(version), parts, claims, found),
-            )
-
-        together(add, self._threads if len(parts) > 1 else 1)
-
-    def _undo_add(self, moments: ScanMoments, version: int, found: npt.NDArray[np.int32]) -> None:
-        """Subtract the moments that an incomplete ``add`` added; channels are added last."""
-        for start, stop, _ in self._parts(moments).tolist():
-            end = bisect_left(found, True, start, stop, key=lambda row: row < 0)
-            if end > start:
-                added = slice(start, end)
-                self._subtract(moments.select(added), version, found[added], 1)
+    def _add(self, moments: ScanMoments, start: int, found: npt.NDArray[np.int32]) -> int:
+        """Add moments from a voxel on, as far as there is room; see add_moments."""
+        stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
+        done: int = add_moments(
+            *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
+            *(self._state, stamp_of(self._version), start, found),
+        )
+        return done
 
     def _subtract(
-        self,
-        moments: ScanMoments,
-        version: int,
-        found: npt.NDArray[np.int32],
-        min_points: int,
+        self, moments: ScanMoments, found: npt.NDArray[np.int32], min_points: int
     ) -> tuple[int, npt.NDArray[np.int32]]:
-        """
-        Subtract moments without channels; see remove_moments.
-
-        Of several parts those that have all their voxels are subtracted even if another has not.
-        """
-        self._version = version
-        parts, claims = self._parts(moments), np.zeros(1, np.int64)
-        ends, least = np.zeros((len(parts), 2), np.int64), max(min_points, 1)
+        """Subtract moments without channels; see remove_moments."""
         fallen: npt.NDArray[np.int32] = np.empty((len(moments), 3), np.int32)
-
-        def subtract() -> None:
-            stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
-            remove_moments(
-                *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
-                *(self._state, stamp_of(version), parts, claims, found, least, fallen, ends),
-            )
-
-        together(subtract, self._threads if len(parts) > 1 else 1)
-        if len(parts) == 1:
-            return int(ends[0, 0]), fallen[: ends[0, 1]]
-        missing = [voxel for voxel in ends[:, 0].tolist() if voxel >= 0]
-        fell = [fallen[first:][:num] for first, num in zip(parts[:, 0], ends[:, 1], strict=True)]
-        return missing[0] if missing else -1, np.concatenate(fell)
-
-    def _undo_subtract(
-        self,
-        moments: ScanMoments,
-        version: int,
-        found: npt.NDArray[np.int32],
-        before: list[int],
-    ) -> None:
-        """
-        Add the moments that an incomplete ``remove`` subtracted; channels are subtracted last.
-
-        Parameters
-        ----------
-        moments, version
-            As for ``remove``.
-        found : (K,) int32
-            Rows of the voxels.
-        before : list of int
-            Number of points that each stripe had counted before.
-
-        """
-        now = self._hash.of_stripes(hashing.POINTS)
-        for start, stop, stripe in self._parts(moments).tolist():
-            if now[stripe] < before[stripe]:
-                self._restore(moments, version, found, (start, stop, stripe))
-
-    def _restore(
-        self,
-        moments: ScanMoments,
-        version: int,
-        found: npt.NDArray[np.int32],
-        part: Part,
-    ) -> None:
-        """Add the moments of a part again that was subtracted, without channels."""
-        restore_moments(
-            moments.arrays,
-            moments.view_is_sum,
-            self.rows.array,
-            self._stamps.array.reshape(-1),
-            self._hash.arrays,
-            self._state,
-            stamp_of(version),
-            part,
-            found,
+        stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
+        missing, num_fallen = remove_moments(
+            *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
+            *(self._state, stamp_of(self._version), found, min_points, fallen),
         )
+        return missing, fallen[:num_fallen]
 
     def _make_room(self) -> None:
-        """Give rows to the stripes, or enlarge the array that had no room for a new voxel."""
-        if not self._hash.lacks_row():
+        """Enlarge the array that had no room for a new voxel."""
+        num_rows = len(self.rows.array)
+        if not self._hash.lacks_row(num_rows):
             self._hash.grow()
             return
-        num_rows = len(self.rows.array)
-        first = self._hash.rows_given
-        self._stamps.array[first : first + (ROWS << STRIPE_BITS)] = layout.EMPTIED
-        if not self._hash.give_rows(num_rows):
-            self._stamps.grow(2 * num_rows)
-            if self._channels:
-                self._channels.grow(2 * num_rows)
-            self.rows.grow(2 * num_rows)  # last: the rows tell how many there are
+        self._stamps.grow(2 * num_rows)
+        if self._channels:
+            self._channels.grow(2 * num_rows)
+        self.rows.grow(2 * num_rows)  # last: the rows tell how many there are
 
 
 class ChangeLog:

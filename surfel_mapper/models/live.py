@@ -23,12 +23,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.compilation import clock
 from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
@@ -104,7 +104,7 @@ class LiveModels:
 
     def update(self) -> ModelUpdate:
         """Follow the changes of the map since the last call."""
-        start = perf_counter()
+        start = clock()
         self._surfels = self._model = None
         if not self.config.noise_m:
             self._follow_noise()
@@ -127,7 +127,7 @@ class LiveModels:
             removed=tuple(removed),
             merged=tuple(matched.merged),
             split=tuple(matched.split),
-            milliseconds=(perf_counter() - start) * 1e3,
+            milliseconds=(clock() - start) * 1e3,
             num_changed=change.num_voxels,
         )
 

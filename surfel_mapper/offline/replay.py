@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from functools import partial
 import logging
 from pathlib import Path
-import time
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.arguments import as_path, check_kind
+from surfel_mapper.compilation import clock, PROGRESS
 from surfel_mapper.errors import BagError, ConfigError, MapError
 from surfel_mapper.files.atomic import finite_or_none, make_directory
 from surfel_mapper.offline.summary import causes_text
@@ -184,12 +184,12 @@ def replay(
         with listeners(directory, options, mapper) as listening:
             listen: list[Callable[[Update], object]] = [partial(history.add, mapper), *listening]
             mapper.derives = bool(listening)  # the files hold the surfels of the end
-            start_s = time.perf_counter()
+            start_s = clock()
             trajectory, was_stopped = mapped(recording, mapper, listen, progress, stopped)
             refuse_empty(recording, mapper, was_stopped)
             with write_first(partial(write_maps, directory, options.formats, mapper, trajectory)):
                 aligned = align(mapper, options)
-            replay_s = time.perf_counter() - start_s
+            replay_s = clock() - start_s
             trajectory.follow_alignment(mapper)
             write_maps(directory, options.formats, mapper, trajectory, window=options.window)
             mapper.finish_layers()
@@ -197,6 +197,7 @@ def replay(
             **recording.describe(),
             'recorded_s': recording.recorded_s,
             'replay_s': replay_s,
+            'compile_s': PROGRESS.seconds,
             'window': options.window,
             'interrupted': was_stopped,
             'cut': list(recording.cuts),
@@ -278,7 +279,7 @@ def started_mapper(config: Config) -> Mapper:
 
     mapper = Mapper(config)
     load_start(mapper)
-    mapper.warm_up(rare=False)
+    mapper.warm_up()
     return mapper
 
 

@@ -19,6 +19,7 @@ import logging
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.compilation import Stage
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Laps
 from surfel_mapper.errors import AlignmentError, MapError, PoseError
@@ -42,8 +43,8 @@ from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import has_own_frame
 from surfel_mapper.pipeline.preparation import Preparation
 from surfel_mapper.pipeline.prepared import Prepared
-from surfel_mapper.pipeline.reduction import moments_at, Reduction, WarmUpSteps
-from surfel_mapper.pipeline.reduction import warm_up_steps as reduction_steps
+from surfel_mapper.pipeline.reduction import moments_at, Reduction
+from surfel_mapper.pipeline.reduction import warm_up_stages as reduction_stages
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.update import Update
@@ -178,21 +179,18 @@ class Inserter:
             self.loops.follow_window()
         return alignment
 
-    def warm_up_steps(self, config: Config) -> WarmUpSteps:
-        """Return the steps that compile all kernels; see Mapper.warm_up_steps."""
-        first_scan, every_scan, rare = reduction_steps(config)
-        is_registered = config.pose.source == 'registration'
-        if self.layers.follow_scans or is_registered or config.viewer.enabled:
-            first_scan, every_scan = [*first_scan, *every_scan], []  # these need surfels at once
-        if config.window.keep_points:
-            rare.append(self.aligner.warm_up)
-        prepare = partial(self.preparation.warm_up, config)
-        return WarmUpSteps([prepare, *first_scan, self.layers.warm_up], every_scan, rare)
+    def warm_up_stages(self, config: Config) -> list[Stage]:
+        """Return the stages that compile kernels; see Mapper.warm_up_stages."""
+        return [
+            *self.preparation.warm_up_stages(config),
+            *reduction_stages(config),
+            *self.layers.warm_up_stages(),
+        ]
 
-    def scans_ahead(self, config: Config) -> int:
-        """Return the number of scans that another thread prepares before they are inserted."""
-        runs_ahead = config.map.mode != 'frozen' and self.preparation.runs_ahead()
-        return self._reduction.scans_ahead if runs_ahead else 0
+    def runs_ahead(self, config: Config) -> bool:
+        """Return whether another thread prepares the next scan while one is inserted."""
+        can_run_ahead = config.map.mode != 'frozen' and self.preparation.runs_ahead()
+        return can_run_ahead and self._reduction.runs_ahead
 
     def begin(self, scan: Scan, pose: Transform, config: Config) -> None:
         """

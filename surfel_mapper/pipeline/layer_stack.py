@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.compilation import Stage
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Laps
 from surfel_mapper.errors import CloudFormatError, SurfelMapperError
@@ -64,16 +65,6 @@ class LayerStack:
     def needs_free_rays(self) -> bool:
         """Whether a layer needs the directions in which the sensor met nothing."""
         return any(layer.needs_free_rays for layer in self)
-
-    @property
-    def follow_scans(self) -> bool:
-        """Whether a layer does anything when a scan is inserted."""
-        methods = ('follow', 'voxels_to_clear')
-        return any(
-            getattr(type(layer), name) is not getattr(Layer, name)
-            for layer in self
-            for name in methods
-        )
 
     @property
     def images(self) -> Images:
@@ -138,10 +129,9 @@ class LayerStack:
             with self._drops.guarded(f'finishing layer {layer.name}'):
                 layer.finish()
 
-    def warm_up(self) -> None:
-        """Compile the kernels of all layers."""
-        for layer in self:
-            layer.warm_up()
+    def warm_up_stages(self) -> list[Stage]:
+        """Return the stages that compile the kernels of all layers."""
+        return [Stage(f'layer {layer.name}', layer.warm_up) for layer in self]
 
     def reconfigure(self, config: Config) -> None:
         """Give all layers new settings, also those that are switched off until the next clear."""

@@ -18,13 +18,13 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from functools import partial
 import logging
-import time
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_whole, check_kind
+from surfel_mapper.compilation import clock, run_stages, Stage
 from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters
 from surfel_mapper.errors import CloudFormatError, ConfigError, MapError
@@ -40,7 +40,6 @@ from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.inserter import Inserter, map_frame
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import MapOrigin
-from surfel_mapper.pipeline.reduction import WarmUpSteps
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.scan_queue import ScanQueue
@@ -98,8 +97,7 @@ class Mapper:
         self._guard = StampGuard(self.config.input.reset_after_s)
         self._clears_map = False
         settings = self.config.map
-        threads = settings.threads or 1
-        self.map = SurfelMap(settings.voxel_size_m, columns=settings.columns, threads=threads)
+        self.map = SurfelMap(settings.voxel_size_m, columns=settings.columns)
         self._origin = MapOrigin(self.config, self.map)
         self._poses = ScanPoses(self.config, self._drops, self._origin)
         self._inserter = Inserter(self.config, self.map, self._poses, self._drops)
@@ -305,8 +303,8 @@ class Mapper:
         Parameters
         ----------
         more_follows : bool
-            Whether more input comes at once, as from a bag. Then the two newest scans may be left
-            for later calls, while another thread (``map.threads``) reduces them. The map is the
+            Whether more input comes at once, as from a bag. Then the newest scan may be left for
+            a later call, while another thread (``map.threads``) reduces it. The map is the
             same to the bit. Call it once with False at the end.
 
         """
@@ -314,15 +312,15 @@ class Mapper:
             while self._queue.posed:
                 yield from self._insert(*self._queue.posed.popleft())
             self._clear_map()
-        ahead = self._inserter.scans_ahead(self.config)
+        ahead = int(self._inserter.runs_ahead(self.config))
         keeps = ahead if more_follows else 0
         while self._queue.fill_posed(1 + ahead, self.config.pose) > keeps:
             yield from self._insert(*self._queue.posed.popleft())
         if self._queue.posed:
-            start = time.perf_counter()
+            start = clock()
             for scan, pose in self._queue.posed:
                 self._inserter.begin(scan, pose, self.config)
-            self.counters.add_seconds('reduce', time.perf_counter() - start)
+            self.counters.add_seconds('reduce', clock() - start)
 
     def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> bool:
         """
@@ -565,32 +563,18 @@ class Mapper:
         self._poses.reconfigure(config)
         self.config = config
 
-    def warm_up(self, *, rare: bool = True) -> None:
-        """
-        Compile the kernels that mapping needs.
+    def warm_up(self) -> None:
+        """Compile the kernels that the settings need to map scans and to derive surfels."""
+        run_stages(self.warm_up_stages())
 
-        Parameters
-        ----------
-        rare : bool
-            Include those for types that scans rarely have: points of the other precision, 65536
-            points in a voxel. They take 8 s; without, the scan that needs them compiles them.
-
+    def warm_up_stages(self) -> list[Stage]:
         """
-        first_scan, every_scan, others = self.warm_up_steps()
-        for step in (*first_scan, *every_scan, *(others if rare else ())):
-            step()
+        Return the stages of ``warm_up``, for callers that have more to compile.
 
-    def warm_up_steps(self) -> WarmUpSteps:
+        They change nothing of the mapper. Kernels that few inputs need are compiled when they are
+        called first: for voxels of 65536 points of one scan, or after ``~/clear_polygon``.
         """
-        Return the steps of ``warm_up``, for callers that do not want to wait for all of them.
-
-        They change nothing of the mapper, so another thread may call them while scans are mapped;
-        a kernel that is needed earlier is compiled by the first call. Scans can be mapped after
-        the steps of the first list, with ``derives`` False until after those of the second.
-        """
-        steps = self._inserter.warm_up_steps(self.config)
-        steps.rare.append(regions.warm_up)
-        return steps
+        return self._inserter.warm_up_stages(self.config)
 
     def summary(self) -> dict[str, Any]:
         """Return counts, times and figures of the map, for files, reports and diagnostics."""

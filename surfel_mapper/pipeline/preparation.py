@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from surfel_mapper.compilation import Stage
 from surfel_mapper.config import Config, WindowConfig
 from surfel_mapper.counters import Laps
 from surfel_mapper.errors import (
@@ -131,13 +132,17 @@ class Preparation:
             chain.warm_up()
             self.chain, self._filters = chain, path
 
-    def warm_up(self, config: Config) -> None:
-        """Compile every kernel of preparation."""
-        self.chain.warm_up()
+    def warm_up_stages(self, config: Config) -> list[Stage]:
+        """Return the stages that compile the kernels of preparation, as far as it uses any."""
+        stages = []
+        if self.chain.filters:
+            dtype = np.float64 if config.deskew.enabled else np.float32
+            stages.append(Stage('filters', partial(self.chain.warm_up, dtype)))
         if config.deskew.enabled:
-            warm_up_deskewing()
+            stages.append(Stage('deskewing', warm_up_deskewing))
         if self._poses.registered is not None:
-            self._poses.registered.warm_up()
+            stages.append(Stage('registration', self._poses.registered.warm_up))
+        return stages
 
     def prepare(
         self,

@@ -3,68 +3,33 @@
 """
 Reduction of scans to the exact moments that enter the map and the window, and that leave it.
 
-With ``map.threads`` another thread deskews, filters and reduces the next two scans while the map
-takes the one before them. None of these reads anything of the map, so the order changes no bit.
-Work that was begun is used only for the same scan at the same pose; otherwise it is done again.
-The other thread decodes the scans too. If it is behind, this one decodes, instead of waiting.
+With two ``map.threads`` another thread deskews, filters and reduces the next scan while the map
+takes the one before it. It reads nothing of the map, so the order changes no bit. Work that was
+begun is used only for the same scan at the same pose. Otherwise it is done again.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
-from time import perf_counter, sleep
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.compilation import Stage
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
-from surfel_mapper.helpers import Job
-from surfel_mapper.kernels.lanes import FULL
 from surfel_mapper.mapping.channels import CHANNELS, summed_columns
-from surfel_mapper.mapping.moments import LEAST_SHARED, point_keys, ScanMoments
+from surfel_mapper.mapping.moments import point_keys, ScanMoments
 from surfel_mapper.mapping.reducer import within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.prepared import FilteredScan
 from surfel_mapper.scan import Scan
 from surfel_mapper.threads import pool
-
-Step = Callable[[], object]
-
-AHEAD = 2
-"""Scans that are begun ahead: after the first, the thread has work while the next is decoded."""
-
-LONG_WAIT_S = 0.0008
-"""
-Wait for the other thread after which this one decodes scans, s. Decoding 500,000 points takes 0.7
-ms; if it took longer than the wait, this thread would be the one behind.
-"""
-
-
-class WarmUpSteps(NamedTuple):
-    """
-    The steps that compile all kernels, in the order of need.
-
-    Attributes
-    ----------
-    first_scan : list of callable
-        Compile the kernels that insert a scan by the settings.
-    every_scan : list of callable
-        Compile those that remove a scan from the window, and derive the surfels that changed.
-    rare : list of callable
-        Compile all others: for points of another type, and voxels of 65536 points.
-
-    """
-
-    first_scan: list[Step]
-    every_scan: list[Step]
-    rare: list[Step]
 
 
 class Ahead(NamedTuple):
@@ -80,7 +45,7 @@ class Begun(NamedTuple):
     scan: Scan
     T_map_sensor: Transform
     config: Config
-    result: Job[Ahead]
+    result: Future[Ahead]
 
     def is_of(self, scan: Scan, T_map_sensor: Transform, config: Config) -> bool:
         """Return whether a scan is this one, at the same pose and with the same settings."""
@@ -100,20 +65,17 @@ class Reduction:
     threads : int
         With fewer than two no reduction is begun ahead of time.
 
-    Attributes
-    ----------
-    scans_ahead : int
-        Number of scans that may be begun before they are reduced; 0 without another thread.
-
     """
 
     def __init__(self, surfel_map: SurfelMap, threads: int) -> None:
         self._map = surfel_map
         self._pool = pool(threads)
-        self.scans_ahead = AHEAD if self._pool is not None else 0
-        self._begun: deque[Begun] = deque(maxlen=AHEAD)
-        self._waited_s = 0.0
-        self._decodes = False
+        self._begun: Begun | None = None
+
+    @property
+    def runs_ahead(self) -> bool:
+        """Whether another thread reduces the next scan."""
+        return self._pool is not None
 
     def begin(
         self,
@@ -125,23 +87,14 @@ class Reduction:
         """
         Begin to prepare and reduce a scan in the other thread, unless that was begun before.
 
-        ``prepare`` is called here, the function that it returns in the other thread. The results
-        of the last ``AHEAD`` scans are kept.
+        ``prepare`` is called here, the function that it returns in the other thread.
         """
-        if self._pool is None:
+        begun = self._begun
+        if self._pool is None or (begun and begun.is_of(scan, T_map_sensor, config)):
             return
-        if any(begun.is_of(scan, T_map_sensor, config) for begun in self._begun):
-            return
-        is_behind = bool(self._begun) and not self._begun[-1].result.is_done
-        self._decodes = is_behind and (self._decodes or self._waited_s > LONG_WAIT_S)
-        if self._decodes:
-            with suppress(Exception):  # the other thread tries again, and has it reported
-                _ = scan.points
         work = prepare(scan, T_map_sensor)
         result = self._pool.submit(run_ahead, work, T_map_sensor, self._map, config)
-        self._begun.append(Begun(scan, T_map_sensor, config, result))
-        if not self._decodes:
-            sleep(0.0)  # release Python's lock: else the job waits 0.3 ms, for our next kernel
+        self._begun = Begun(scan, T_map_sensor, config, result)
 
     def begun(
         self, scan: Scan, T_map_sensor: Transform, config: Config
@@ -149,21 +102,13 @@ class Reduction:
         """
         Return a function that waits for the points of a scan that was begun, or None.
 
-        Work that was begun before it, for another scan, pose or settings, is forgotten.
+        Work that was begun for another scan, pose or settings is forgotten.
         """
-        while self._begun and not self._begun[0].is_of(scan, T_map_sensor, config):
-            self._begun.popleft()
-        if not self._begun:
+        begun = self._begun
+        if begun is None or not begun.is_of(scan, T_map_sensor, config):
+            self._begun = None
             return None
-        return partial(self._wait_for, self._begun[0].result)
-
-    def _wait_for(self, result: Job[Ahead]) -> FilteredScan:
-        """Return the points of a scan that was begun, and note how long that took."""
-        start = perf_counter()
-        try:
-            return result.result().points
-        finally:
-            self._waited_s = perf_counter() - start
+        return lambda: begun.result.result().points
 
     def reduce(self, scan: Scan, T_map_sensor: Transform, config: Config) -> WindowedScan:
         """
@@ -175,8 +120,9 @@ class Reduction:
             If a voxel gets more than 2^23 points, or a point is out of the reach of the map.
 
         """
-        if self._begun:
-            ahead = self._begun.popleft().result.result()
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            ahead = begun.result.result()
             if ahead.points.filtered is scan:
                 if isinstance(ahead.windowed, Exception):
                     raise ahead.windowed
@@ -260,60 +206,41 @@ def standing_sensor(config: Config) -> npt.NDArray[np.float64] | None:
     return np.array(values[:3])
 
 
-def warm_up_steps(config: Config) -> WarmUpSteps:
-    """Return the steps that compile reduction, insertion and removal."""
-    expected: npt.DTypeLike = np.float32
-    other: npt.DTypeLike = np.float64
-    if config.deskew.enabled:  # which moves points in double precision
-        expected, other = other, expected
-    return WarmUpSteps(
-        first_scan=[partial(compile_adding, config, expected)],
-        every_scan=[
-            partial(compile_removing, config, expected),
-            partial(compile_deriving, config, expected),
-        ],
-        rare=[
-            partial(compile_wide_sums, config, expected),
-            partial(compile_adding, config, other),
-            partial(compile_removing, config, other),
-            partial(compile_wide_sums, config, other),
-        ],
-    )
+def warm_up_stages(config: Config) -> list[Stage]:
+    """Return the steps that compile reduction, insertion and removal, as far as they are used."""
+    stages = [
+        Stage('adding scans', partial(compile_adding, config)),
+        Stage('deriving surfels', partial(compile_deriving, config)),
+    ]
+    window, limits = config.window, config.map
+    if any(
+        (window.max_scans, window.max_age_s, window.max_distance_m, window.max_bytes)
+        + (limits.max_voxels, limits.max_bytes)
+    ):
+        stages.append(Stage('removing scans', partial(compile_removing, config)))
+    return stages
 
 
-def compile_adding(config: Config, dtype: npt.DTypeLike) -> SurfelMap:
-    """Compile reducing and adding points of a type, by the threads set; return the map of some."""
-    settings, threads = config.map, config.map.threads or 1
-    surfel_map = SurfelMap(settings.voxel_size_m, columns=settings.columns, threads=threads)
-    num = 1 if threads == 1 else LEAST_SHARED  # in voxels of their own
-    points = np.zeros((num, 3), dtype)
-    points[:, 0] = settings.voxel_size_m * np.arange(num)
-    columns = {name: np.zeros(num) for name in CHANNELS}
-    surfel_map.insert(surfel_map.reduce(points, columns=columns))  # add might warn of their unit
+def compile_adding(config: Config) -> SurfelMap:
+    """Compile reducing and adding points; return the map of one."""
+    surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
+    columns = {name: np.zeros(1) for name in CHANNELS}
+    surfel_map.insert(surfel_map.reduce(np.zeros((1, 3)), columns=columns))
     return surfel_map
 
 
-def compile_deriving(config: Config, dtype: npt.DTypeLike) -> None:
+def compile_deriving(config: Config) -> None:
     """Compile deriving surfels, of coarser maps too if they are published."""
-    surfel_map = compile_adding(config, dtype)
+    surfel_map = compile_adding(config)
     surfel_map.surfels_changed(since=0)
     if config.publish.levels:
         surfel_map.coarsen(1).surfels()
 
 
-def compile_removing(config: Config, dtype: npt.DTypeLike) -> None:
-    """Compile removing points of a type, the digest, and checks."""
+def compile_removing(config: Config) -> None:
+    """Compile removing points, and the digest."""
     surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
-    columns = {n: np.zeros(1) for n in CHANNELS}
-    moments = surfel_map.add(np.zeros((1, 3), dtype), columns=columns)
-    surfel_map.insert(replace(moments))  # a copy is checked
+    columns = {name: np.zeros(1) for name in CHANNELS}
+    moments = surfel_map.add(np.zeros((1, 3)), columns=columns)
     surfel_map.digest()
-    surfel_map.remove(moments)
-
-
-def compile_wide_sums(config: Config, dtype: npt.DTypeLike) -> None:
-    """Compile adding and removing voxels whose sums need 64 bits."""
-    surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
-    columns = {n: np.zeros(FULL + 1) for n in CHANNELS}
-    moments = surfel_map.add(np.zeros((FULL + 1, 3), dtype), columns=columns)
     surfel_map.remove(moments)

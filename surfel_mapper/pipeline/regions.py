@@ -116,8 +116,3 @@ class Prism:
         xy = np.ascontiguousarray(points[:, :2], np.float64)
         mark_inside(xy, np.array(self.corners, np.float64), inside)
         return inside
-
-
-def warm_up() -> None:
-    """Compile the kernel for polygons."""
-    Prism(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))).contains(np.zeros((1, 3)))

@@ -136,13 +136,12 @@ class RegisteredPoses:
         return self._tracker if self._part is None else self._part.tracker
 
     def warm_up(self) -> None:
-        """Compile the kernels, for both types that points may have."""
-        for dtype in (np.float32, np.float64):
-            points = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 3)).astype(dtype)
-            surfel_map = SurfelMap(self._config.map.voxel_size_m)
-            surfel_map.add(points)
-            cells = self._registration.cells(points)
-            self._registration.align(cells, surfel_map, [np.eye(4)], 1e3, 2.0)
+        """Compile the kernels."""
+        points = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 3))
+        surfel_map = SurfelMap(self._config.map.voxel_size_m)
+        surfel_map.add(points)
+        cells = self._registration.cells(points)
+        self._registration.align(cells, surfel_map, [np.eye(4)], 1e3, 2.0)
 
     def restart(self, T_fixed_body: Transform | None = None) -> None:
         """Go on from a pose, by default the one of registration.start."""

@@ -114,12 +114,6 @@ class WindowAligner:
         self._moments_at = moments_at
         self.reset()
 
-    def warm_up(self) -> None:
-        """Compile the kernels of alignment."""
-        points = np.eye(4, 3)
-        scan = Samples(points, points, np.ones(4), np.ones(4))
-        align_scans([scan, scan], np.array([np.eye(4), np.eye(4)]))
-
     def reset(self) -> None:
         """Drop the correction, as for an empty map."""
         self.T_map_fixed: Transform = np.eye(4)

@@ -31,7 +31,6 @@ from surfel_mapper.messages.images import (
     depth_scan,
     DepthImages,
     SceneImages,
-    warm_up,
 )
 from surfel_mapper.messages.pointcloud2 import parse_cloud
 from surfel_mapper.messages.poses import ODOMETRY, POSE, raw_poses, TF
@@ -140,8 +139,6 @@ class Inputs:
             self._subscribe_poses(TF, message, '/tf', POSES)
         if source in (ODOMETRY, POSE, 'registration') and not self._config.frames.base_to_sensor:
             self._subscribe_static()
-        if self._config.input.kind == 'depth':
-            warm_up()
         for topic in self.cloud_topics:
             self._subscribe_clouds(topic)
         for kind, topic in self._image_topics.items():

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from functools import partial
@@ -13,10 +12,11 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
+from surfel_mapper.compilation import run_stages, Stage
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
-from surfel_mapper.kernels.compiling import compilations
-from surfel_mapper.memory import lasting_objects, rare_collections
+from surfel_mapper.memory import lasting_objects
+from surfel_mapper.messages.images import warm_up as warm_up_depth
 from surfel_mapper.messages.pointcloud2 import warm_up as warm_up_decoding
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
@@ -78,20 +78,9 @@ class Session:
         self.thread = MappingThread(self.mapper, tasks.fail)
         self.inputs = Inputs(node, config, self.thread, tasks.fail)
         log, start = node.get_logger(), time.monotonic()
-        log.info('compiling kernels: about a second, the first time about ten seconds')
-        first_scan, every_scan, rare = self.mapper.warm_up_steps()
-        self._later: list[Callable[[], object]] = [partial(warm_up_outputs, config), *rare]
-        with rare_collections(), compilations() as compiled:
-            for step in (warm_up_decoding, *first_scan):
-                step()
-            if compiled and every_scan:
-                self.mapper.derives = False
-                self._later = [*every_scan, self._derive_from_now_on, *self._later]
-            else:  # the cache holds those too
-                for step in every_scan:
-                    step()
-        self._compiler = threading.Thread(target=self._compile, name='compiling', daemon=True)
-        self._is_closing = threading.Event()
+        log.info('loading kernels')
+        with lasting_objects():
+            run_stages(self.warm_up_stages())
         self.outputs = Outputs(node, self.mapper, self.thread)
         self.registration = registration_outputs(node, self.mapper, self.thread)
         self.services = Services(node, self.mapper, self.thread, self.outputs)
@@ -101,6 +90,15 @@ class Session:
         self._is_active = False
         self._viewer = self._opened_viewer()
         self.thread.start(self._on_update)
+
+    def warm_up_stages(self) -> list[Stage]:
+        """Return the stages that compile the kernels of input, mapping and default outputs."""
+        decoding = warm_up_depth if self.config.input.kind == 'depth' else warm_up_decoding
+        return [
+            Stage('decoding', decoding),
+            *self.mapper.warm_up_stages(),
+            Stage('messages', partial(warm_up_outputs, self.config)),
+        ]
 
     def activate(self) -> None:
         """Subscribe and start publishing; raises the errors of ``Inputs.subscribe``."""
@@ -112,8 +110,6 @@ class Session:
         with self._changing:
             self._is_active = True
             self._start_timers()
-        if self._compiler.ident is None:
-            self._compiler.start()
 
     def deactivate(self) -> None:
         """Unsubscribe, map the messages received so far, publish the map, and stop publishing."""
@@ -134,9 +130,6 @@ class Session:
 
     def close(self, *, save: bool) -> None:
         """Map the messages received so far, end the thread, save the map if asked, and log."""
-        self._is_closing.set()
-        if self._compiler.ident is not None:
-            self._compiler.join()
         self.thread.stop()
         with self.mapper.guarded('the end of the outputs'):
             self.outputs.close()
@@ -165,38 +158,9 @@ class Session:
         self._node.get_logger().info(f'the map is shown at {viewer.address}')
         return viewer
 
-    def _compile(self) -> None:
-        """Compile the kernels that the first scans do not need; run in a thread of its own."""
-        start = time.monotonic()
-        try:
-            with lasting_objects():
-                for step in self._later:
-                    if self._is_closing.is_set():
-                        return
-                    step()
-        except Exception as error:
-            self._tasks.fail(error)
-        else:
-            seconds = time.monotonic() - start
-            self._node.get_logger().info(f'all kernels ready after another {seconds:.1f} s')
-
-    def _derive_from_now_on(self) -> None:
-        """Publish surfels, whose kernels are compiled now; called in the compiling thread."""
-
-        def publish_all() -> None:
-            with self._changing:
-                self.mapper.derives = True
-                if self._is_active:
-                    self._start_timers()
-            self.outputs.expire()
-            self._node.get_logger().info('surfels are published from now on')
-
-        self.thread.post(publish_all)
-
     def _start_timers(self) -> None:
-        """Start publishing at rates, once surfels can be derived; called with the lock held."""
-        if self.mapper.derives:
-            self.outputs.start_timers(self.config)
+        """Start publishing at rates; called with the lock held."""
+        self.outputs.start_timers(self.config)
 
     def _on_update(self, update: Update) -> None:
         """Publish the changes of a scan; called in the mapping thread."""

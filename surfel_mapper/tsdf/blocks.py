@@ -565,7 +565,7 @@ class BlockMap(BlockArrays):
 
     def _make_room(self) -> None:
         """Enlarge the rows or the hash table, whichever is full."""
-        if not self._hash.lacks_row():
-            self._hash.grow()
-        elif not self._hash.give_rows(len(self.head)):
+        if self._hash.lacks_row(len(self.head)):
             self._grow()
+        else:
+            self._hash.grow()

@@ -29,7 +29,6 @@ REFERENCES = {
     'kernels/projection.py': 'kernels/test_projection.py',
     'kernels/quantisation.py': 'mapping/kernels/test_reduction.py',
     'kernels/selection.py': 'kernels/test_selection.py',
-    'kernels/sharing.py': 'kernels/test_sharing.py',
     'kernels/symmetric3.py': 'kernels/test_symmetric3.py',
     'kernels/voxel_grid.py': 'filters/test_grids.py',
     'layers/dynamic_objects/kernels/free_space.py': 'layers/test_free_space.py',

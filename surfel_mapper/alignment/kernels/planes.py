@@ -9,18 +9,18 @@ anew, most of it calls.
 
 import math
 
-from numba import njit
-
 from surfel_mapper.alignment.kernels.registration import MEAN, NORMAL, SPREAD, VARIANCE
+from surfel_mapper.kernels.compiling import kernel
 from surfel_mapper.kernels.quantisation import in_range, pack
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def continuation_keys(position, normal, low, voxel_index, limits, keys):
+@kernel(error_model='numpy')
+def continuation_keys(position, normal, eigenvalues, voxel_index, limits, keys):
     """
     Find the voxel behind the nearest face for each surfel near that face.
 
-    position, normal  (K, 3) float64; low (K,) float64, smallest eigenvalue, m^2
+    position, normal  (K, 3) float64
+    eigenvalues       (K, 3) float64, m^2, ascending
     voxel_index       (K, 3) int32
     limits            voxel size (m), variance of a range (m^2), reach in standard deviations
     keys              (K,) int64, out: key of the voxel behind, -1 if no face is near
@@ -34,7 +34,7 @@ def continuation_keys(position, normal, low, voxel_index, limits, keys):
                 axis = k
         inside_m = position[i, axis] - voxel_index[i, axis] * size_m
         to_face_m = min(inside_m, size_m - inside_m) * abs(normal[i, axis])
-        if not to_face_m < sigmas * math.sqrt(low[i] + noise_sq):  # also nan
+        if not to_face_m < sigmas * math.sqrt(eigenvalues[i, 0] + noise_sq):  # also nan
             continue
         side = -1 if inside_m < 0.5 * size_m else 1
         x = voxel_index[i, 0] + (side if axis == 0 else 0)
@@ -44,7 +44,7 @@ def continuation_keys(position, normal, low, voxel_index, limits, keys):
             keys[i] = pack(x, y, z)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def fill_planes(first, second, behind, limits, planes):
     """
     Write surfels as rows of planes; those that continue behind a face are merged with that part.

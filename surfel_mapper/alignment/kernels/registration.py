@@ -9,9 +9,9 @@ surface and its variance. Sums run in the order of the cells, so that equal scan
 
 import math
 
-from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel
 from surfel_mapper.kernels.quantisation import in_range, pack
 
 SIGMAS_SQ = 9.0
@@ -25,7 +25,7 @@ SPREAD = 7
 PLANE = 8
 
 
-@njit(cache=True, nogil=True)
+@kernel(error_model='numpy')
 def cell_keys(cells, pose, scale, bits, keys):
     """
     Compute the key of the voxel that each cell lies in.
@@ -51,7 +51,7 @@ def cell_keys(cells, pose, scale, bits, keys):
             keys[i] = -1
 
 
-@njit(cache=True, nogil=True)
+@kernel(error_model='numpy')
 def number_rows(found, number, known, num_known):
     """
     Assign numbers to the rows of a map in the order of first use; return the next number.
@@ -72,7 +72,7 @@ def number_rows(found, number, known, num_known):
     return num_known
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def sum_equations(cells, pose, place, planes, width_sq, hessian, gradient):
     """
     Sum the normal equations of a Gauss-Newton step.
@@ -148,17 +148,16 @@ def sum_equations(cells, pose, place, planes, width_sq, hessian, gradient):
         g3 += vx * distance
         g4 += vy * distance
         g5 += vz * distance
-    upper = (
-        (a00, a01, a02, b00, b01, b02),
-        (a01, a11, a12, b10, b11, b12),
-        (a02, a12, a22, b20, b21, b22),
-        (b00, b10, b20, c00, c01, c02),
-        (b01, b11, b21, c01, c11, c12),
-        (b02, b12, b22, c02, c12, c22),
-    )
-    sums = (g0, g1, g2, g3, g4, g5)
-    for i in range(6):
-        gradient[i] = sums[i]
-        for j in range(6):
-            hessian[i, j] = upper[i][j]
+    hessian[0, 0], hessian[0, 1], hessian[0, 2] = a00, a01, a02
+    hessian[1, 1], hessian[1, 2], hessian[2, 2] = a11, a12, a22
+    hessian[0, 3], hessian[0, 4], hessian[0, 5] = b00, b01, b02
+    hessian[1, 3], hessian[1, 4], hessian[1, 5] = b10, b11, b12
+    hessian[2, 3], hessian[2, 4], hessian[2, 5] = b20, b21, b22
+    hessian[3, 3], hessian[3, 4], hessian[3, 5] = c00, c01, c02
+    hessian[4, 4], hessian[4, 5], hessian[5, 5] = c11, c12, c22
+    for i in range(1, 6):
+        for j in range(i):
+            hessian[i, j] = hessian[j, i]
+    gradient[0], gradient[1], gradient[2] = g0, g1, g2
+    gradient[3], gradient[4], gradient[5] = g3, g4, g5
     return met, fit

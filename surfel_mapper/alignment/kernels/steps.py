@@ -10,8 +10,9 @@ the linear algebra of the machine.
 
 import math
 
-from numba import njit
 import numpy as np
+
+from surfel_mapper.kernels.compiling import kernel, part
 
 SWEEPS = 30
 """Limit of the sweeps of Jacobi's rotations; six are usual."""
@@ -20,7 +21,7 @@ SMALL = 1e-30
 """Squared sum of the entries beside the diagonal, relative to the trace, that counts as 0."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(error_model='numpy')
 def solve_step(hessian, gradient, least, step, values, vectors):
     """
     Solve normal equations in the directions that have enough information.
@@ -35,26 +36,25 @@ def solve_step(hessian, gradient, least, step, values, vectors):
 
     Returns the scale of rotations, m.
     """
-    step[:] = 0.0
-    values[:] = 0.0
-    vectors[:] = np.eye(6)
+    for i in range(6):
+        step[i] = values[i] = 0.0
+        for j in range(6):
+            vectors[i, j] = 1.0 if i == j else 0.0
     weight = hessian[0, 0] + hessian[1, 1] + hessian[2, 2]
     if not weight > 0.0:
         return 1.0
     radius = math.sqrt((hessian[3, 3] + hessian[4, 4] + hessian[5, 5]) / weight)
     if not radius > 0.0:
         radius = 1.0
-    scale = np.array([1.0, 1.0, 1.0, radius, radius, radius])
-    matrix = np.empty((6, 6))
+    scale, matrix = np.empty(6), np.empty((6, 6))
+    for i in range(6):
+        scale[i] = 1.0 if i < 3 else radius
     for i in range(6):
         for j in range(6):
             matrix[i, j] = hessian[i, j] / (weight * scale[i] * scale[j])
     diagonalise(matrix, vectors)
-    order = np.argsort(np.diag(matrix))
-    rows = vectors.copy()
+    sort_eigenvalues(matrix, values, vectors)
     for i in range(6):
-        values[i] = matrix[order[i], order[i]]
-        vectors[i] = rows[order[i]]
         if values[i] < least:
             continue
         along = 0.0
@@ -65,7 +65,20 @@ def solve_step(hessian, gradient, least, step, values, vectors):
     return radius
 
 
-@njit(cache=True, nogil=True)
+@part(error_model='numpy')
+def sort_eigenvalues(matrix, values, vectors):
+    """Write the diagonal (N,) of a matrix in ascending order; sort the rows of vectors alike."""
+    for i in range(len(values)):
+        values[i] = matrix[i, i]
+        k = i
+        while k > 0 and values[k - 1] > values[k]:
+            values[k - 1], values[k] = values[k], values[k - 1]
+            for j in range(len(values)):
+                vectors[k - 1, j], vectors[k, j] = vectors[k, j], vectors[k - 1, j]
+            k -= 1
+
+
+@part(error_model='numpy')
 def diagonalise(matrix, vectors):
     """
     Rotate a symmetric matrix until it is diagonal, in place (Jacobi 1846).
@@ -83,17 +96,16 @@ def diagonalise(matrix, vectors):
             for j in range(i):
                 beside += matrix[i, j] * matrix[i, j]
         if not beside > SMALL * trace * trace:
-            return
+            break
         for i in range(size - 1):
             for j in range(i + 1, size):
-                rotate(matrix, vectors, i, j)
+                if matrix[i, j] != 0.0:
+                    rotate(matrix, vectors, i, j)
 
 
-@njit(cache=True, nogil=True)
+@part(error_model='numpy')
 def rotate(matrix, vectors, i, j):
     """Rotate a symmetric matrix (N, N) so that its entry i, j is 0, and the rows of vectors."""
-    if matrix[i, j] == 0.0:
-        return
     cotangent = (matrix[j, j] - matrix[i, i]) / (2.0 * matrix[i, j])
     tangent = 1.0 / (abs(cotangent) + math.sqrt(cotangent * cotangent + 1.0))
     if cotangent < 0.0:
@@ -111,7 +123,7 @@ def rotate(matrix, vectors, i, j):
     matrix[i, j] = matrix[j, i] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel(error_model='numpy')
 def move_pose(pose, step, moved):
     """
     Move a pose by step[:3] and turn it in place by the rotation vector step[3:].
@@ -126,34 +138,33 @@ def move_pose(pose, step, moved):
     if angle > 1e-8:
         half = math.sin(0.5 * angle) / angle
         a, b = math.sin(angle) / angle, 2.0 * half * half
-    turn = np.array(
-        [
-            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
-            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
-            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
-        ]
-    )
-    for i in range(3):
-        for j in range(3):
-            moved[i, j] = (
-                turn[i, 0] * pose[0, j] + turn[i, 1] * pose[1, j] + turn[i, 2] * pose[2, j]
-            )
-        moved[i, 3] = pose[i, 3] + step[i]
-        moved[3, i] = 0.0
+    for j in range(4):
+        u, v, w = pose[0, j], pose[1, j], pose[2, j]
+        if j == 3:
+            moved[0, 3], moved[1, 3], moved[2, 3] = u + step[0], v + step[1], w + step[2]
+            continue
+        moved[0, j] = (
+            (1.0 - b * (y * y + z * z)) * u + (b * x * y - a * z) * v + (b * x * z + a * y) * w
+        )
+        moved[1, j] = (
+            (b * x * y + a * z) * u + (1.0 - b * (x * x + z * z)) * v + (b * y * z - a * x) * w
+        )
+        moved[2, j] = (
+            (b * x * z - a * y) * u + (b * y * z + a * x) * v + (1.0 - b * (x * x + y * y)) * w
+        )
+    moved[3, 0] = moved[3, 1] = moved[3, 2] = 0.0
     moved[3, 3] = 1.0
     orthonormalise(moved)
 
 
-@njit(cache=True, nogil=True)
+@part(error_model='numpy')
 def orthonormalise(pose):
     """Make the rotation of a pose (4, 4), which is off by rounding, orthonormal, in place."""
     for i in range(2):
-        for k in range(i):
-            along = 0.0
+        if i == 1:
+            along = pose[1, 0] * pose[0, 0] + pose[1, 1] * pose[0, 1] + pose[1, 2] * pose[0, 2]
             for j in range(3):
-                along += pose[i, j] * pose[k, j]
-            for j in range(3):
-                pose[i, j] -= along * pose[k, j]
+                pose[1, j] -= along * pose[0, j]
         norm = math.sqrt(pose[i, 0] ** 2 + pose[i, 1] ** 2 + pose[i, 2] ** 2)
         for j in range(3):
             pose[i, j] /= norm

@@ -24,7 +24,6 @@ from surfel_mapper.kernels.layout import (
     KEY,
     ROW,
     STAMPS,
-    UNUSED,
 )
 from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
 from surfel_mapper.kernels.quantisation import in_range, pack, unpack
@@ -194,7 +193,7 @@ def rows_changed_after(rows, stamps, used, stamp, changes, min_points):
     used        number of rows ever used
     stamp       uint32, of the latest change
     changes     int64, number of changes
-    min_points  0: emptied rows too, but none that was never used
+    min_points  0: emptied rows too
     """
     kept = np.empty(used, np.int32)
     ignored = EMPTIED if min_points < 1 else 0
@@ -203,8 +202,7 @@ def rows_changed_after(rows, stamps, used, stamp, changes, min_points):
         last = np.int64(stamps[row])
         age = (((stamp | EMPTIED) - last) & STAMPS) >> 1
         kept[num] = row
-        is_used = last != UNUSED or rows[row, KEY] != 0  # stamps repeat; emptied rows have -1
-        num += (age < changes) & (last & EMPTIED <= ignored) & is_used
+        num += (age < changes) & (last & EMPTIED <= ignored)
     if min_points > 1:
         num = keep_full(rows, kept, num, min_points)
     return kept[:num].copy()

@@ -25,7 +25,6 @@ from surfel_mapper.kernels.grouping import (
     home,
     number_runs,
 )
-from surfel_mapper.kernels.hashing import hash_key, stripe_of
 from surfel_mapper.kernels.lanes import (
     load_sums,
     plus_place,
@@ -156,14 +155,12 @@ def reason(x, y, z, range_sq):
 
 
 @kernel(error_model='numpy')
-def pack_moments(keys, sums, stripes, origin, voxel_size, moments):
+def pack_moments(keys, sums, origin, voxel_size, moments):
     """
     Write the moments of a scan; return the largest count.
 
     keys        (K,) int64, as reduce_points leaves them
     sums        (K, WORDS) int64
-    stripes     (S, 3) int64, out: the first voxel of each stripe, the one after its last, and its
-                number; S = 0: voxels stay in their order
     origin      (3,) float64, the sensor in the map frame, m; nan if unknown
     voxel_size  float64, m
     moments     key (K,) int64, count (K,) int32, total (K, 3) int32, product (K, 6) int64,
@@ -171,73 +168,41 @@ def pack_moments(keys, sums, stripes, origin, voxel_size, moments):
     """
     use_widest_vectors()
     key, count, total, product, view = moments
-    if len(stripes):
-        places = places_by_stripe(keys, stripes)
-        for row in range(U(len(places))):
-            key[U(places[row])] = keys[row]
-    else:
-        places = np.empty(0, np.int32)
-        key[:] = keys
+    for row in range(U(len(keys))):
+        key[row] = keys[row]
     look_back(key, origin, voxel_size, view)
-    return unpack_sums(sums, places, count, total, product)
+    return unpack_sums(sums, count, total, product)
 
 
 @part()
-def places_by_stripe(keys, stripes):
-    """
-    Return the places (K,) int32 of the voxels of a scan by stripe, each in the order of the scan.
-
-    keys, stripes  see pack_moments; their number is a power of two
-    """
-    num = U(len(keys))
-    stripe_bits = np.int64(64 - hash_shift(len(stripes)))
-    places, ends = np.empty(num, np.int32), np.zeros(len(stripes) + 1, np.int64)
-    for voxel in range(num):
-        stripe = stripe_of(hash_key(keys[voxel]), stripe_bits)
-        places[voxel] = stripe
-        ends[U(stripe + 1)] += 1
-    for stripe in range(len(stripes)):
-        ends[stripe + 1] += ends[stripe]
-        stripes[stripe, 0], stripes[stripe, 1] = ends[stripe], ends[stripe + 1]
-        stripes[stripe, 2] = stripe
-    for voxel in range(num):
-        stripe = U(places[voxel])
-        places[voxel] = ends[stripe]
-        ends[stripe] += 1
-    return places
-
-
-@part()
-def unpack_sums(sums, places, count, total, product):
+def unpack_sums(sums, count, total, product):
     """
     Unpack the sums of a scan, about the centres of the voxels; return the largest count.
 
     sums     (K, WORDS) int64, as reduce_points leaves them
-    places   (K,) int32, the row of the outputs for each; (0,): their order stays
     count    (K,) int32, out
     total    (K, 3) int32, out
     product  (K, 6) int64, out
     """
     largest = np.int64(0)
     for row in range(U(len(sums))):
-        at = U(places[row]) if len(places) else row
         num = sums[row, 0] >> COUNT_BITS
         half = HALF * num
         x = sums[row, 0] & ((1 << COUNT_BITS) - 1)
         y = sums[row, 1] & ((1 << HIGH_BITS) - 1)
         z = (sums[row, 1] >> HIGH_BITS) & ((1 << HIGH_BITS) - 1)
         largest = max(largest, num)
-        count[at] = num
-        total[at, 0] = x - half
-        total[at, 1] = y - half
-        total[at, 2] = z - half
+        count[row] = num
+        total[row, 0] = x - half
+        total[row, 1] = y - half
+        total[row, 2] = z - half
         # (x - h)(y - h) = xy - h (x + y - h), summed
-        product[at, 0] = sums[row, 2] - HALF * (x + x - half)
-        product[at, 1] = sums[row, 3] - HALF * (x + y - half)
-        product[at, 2] = sums[row, 4] - HALF * (x + z - half)
-        product[at, 3] = sums[row, 5] - HALF * (y + y - half)
-        product[at, 4] = sums[row, 6] - HALF * (y + z - half)
-        product[at, 5] = sums[row, 7] - HALF * (z + z - half)
+        product[row, 0] = sums[row, 2] - HALF * (x + x - half)
+        product[row, 1] = sums[row, 3] - HALF * (x + y - half)
+        product[row, 2] = sums[row, 4] - HALF * (x + z - half)
+        product[row, 3] = sums[row, 5] - HALF * (y + y - half)
+        product[row, 4] = sums[row, 6] - HALF * (y + z - half)
+        product[row, 5] = sums[row, 7] - HALF * (z + z - half)
     return largest
 
 

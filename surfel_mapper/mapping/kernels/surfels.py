@@ -17,7 +17,6 @@ from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.layout import KEY, PRODUCT
 from surfel_mapper.kernels.prefetch import LINE_BYTES, prefetch_to_write
 from surfel_mapper.kernels.quantisation import unpack
-from surfel_mapper.kernels.sharing import claim
 from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work
 from surfel_mapper.mapping.kernels.rows import (
     count_of,
@@ -30,9 +29,6 @@ from surfel_mapper.mapping.kernels.rows import (
 
 CHUNK = 128
 """Voxels processed at once: their moments stay in the first-level cache."""
-
-PIECE = 16 * CHUNK
-"""Voxels that a thread claims at once."""
 
 AHEAD = 16
 """Number of rows between the prefetch of a row and its use."""
@@ -56,9 +52,9 @@ MOMENTS = 13
 
 
 @kernel(error_model='numpy')
-def derive_surfels(rows, chosen, voxel_size, bits, outputs, claims):
+def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     """
-    Derive the surfels of some rows of the slab, in pieces that threads claim.
+    Derive the surfels of some rows of the slab.
 
     rows        (R, 12) int64
     chosen      (K,) int32 or int64, rows to derive; each holds at least one point
@@ -66,7 +62,6 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs, claims):
     bits        a voxel is 2^bits lattice units wide
     outputs     position (K, 3) float64 m, normal (K, 3), planarity (K,), curvature (K,),
                 eigenvalues (K, 3) m^2, num_points (K,) int64, voxel_index (K, 3) int32
-    claims      (1,) int64, pieces that were claimed
 
     A single point or identical points: eigenvalues 0; normal, planarity and curvature nan.
     """
@@ -78,25 +73,22 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs, claims):
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     vectors = position.ravel(), normal.ravel(), eigenvalues.ravel()
     written = vectors, (planarity, curvature), num_points, voxel_index.ravel()
-    first = claim(claims) * PIECE
-    while first < len(chosen):
-        for start in range(first, min(first + PIECE, len(chosen)), CHUNK):
-            num = min(CHUNK, len(chosen) - start)
-            end = start + num
-            most = gather(rows, chosen, start, num, keys, moments, written)
-            write_index(keys, moments, num, num_points[start:end], voxel_index[start:end])
-            center(moments, num, mean, scatter)
-            if most >= many:
-                center_exactly(rows, chosen, start, num, scatter)
-            place(mean, num, voxel_size, bits, voxel_index[start:end], position[start:end])
-            decompose_chunk(scatter, 0, num, work, values, normals)
-            derive_shape(values, num, moments, voxel_size / (1 << bits), shape)
-            turn(normals, num, moments, shape)
-            planarity[start:end] = shape[0, :num]
-            curvature[start:end] = shape[1, :num]
-            write_vectors(normals, num, normal[start:end])
-            write_vectors(values, num, eigenvalues[start:end])
-        first = claim(claims) * PIECE
+    for start in range(0, len(chosen), CHUNK):
+        num = min(CHUNK, len(chosen) - start)
+        end = start + num
+        most = gather(rows, chosen, start, num, keys, moments, written)
+        write_index(keys, moments, num, num_points[start:end], voxel_index[start:end])
+        center(moments, num, mean, scatter)
+        if most >= many:
+            center_exactly(rows, chosen, start, num, scatter)
+        place(mean, num, voxel_size, bits, voxel_index[start:end], position[start:end])
+        decompose_chunk(scatter, 0, num, work, values, normals)
+        derive_shape(values, num, moments, voxel_size / (1 << bits), shape)
+        turn(normals, num, moments, shape)
+        write_numbers(shape[0], num, planarity[start:end])
+        write_numbers(shape[1], num, curvature[start:end])
+        write_vectors(normals, num, normal[start:end])
+        write_vectors(values, num, eigenvalues[start:end])
 
 
 @kernel(error_model='numpy')
@@ -281,6 +273,13 @@ def turn(normals, num, moments, shape):
         normals[0, i] = nx * side
         normals[1, i] = ny * side
         normals[2, i] = nz * side
+
+
+@part()
+def write_numbers(numbers, num, out):
+    """Write the first numbers of a chunk, (CHUNK,), to (num,). A slice would compile much more."""
+    for i in range(num):
+        out[i] = numbers[i]
 
 
 @part()

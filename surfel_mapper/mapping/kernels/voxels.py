@@ -7,9 +7,6 @@ All are integer sums by voxel, so that a subtraction undoes an addition to the b
 Rows of the slab are visited in the order of the scan; hash bucket and row of later voxels are
 prefetched, which hides most of the cache misses.
 
-Threads share a scan whose voxels are in the order of their stripes (kernels/hashing.py): each has
-the voxels of a stripe, whose rows and part of the table no other thread changes.
-
 The stamps of rows are written in a loop of their own: among the accesses to rows they made adding
 1.2 times as long at 10^6 voxels, 4 MB of stamps.
 
@@ -20,18 +17,15 @@ sum becomes S + n d, the second moment M + d S^T + S d^T + n d d^T.
 Moments come from files, messages and callers too. Sums beyond the range of a voxel would overflow
 the integers of the map or give negative eigenvalues later, far from the cause; so moments that no
 points can have are found before they are added, in 20 us for 10,000 voxels.
-
-One module: all work on the moments of a scan and the rows of the same voxels.
 """
 
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, stay_apart, U
+from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.grouping import hash_shift, home
 from surfel_mapper.kernels.hashing import (
     DEPTH,
-    END_ROW,
     find_row,
     first_bucket,
     FREE_ROW,
@@ -39,15 +33,12 @@ from surfel_mapper.kernels.hashing import (
     insert_entry,
     is_full,
     likely_row,
-    LINE,
     LOW,
     makes_room,
     NEXT_ROW,
     POINTS,
     remove_entry,
     SEGMENT,
-    stripe_of,
-    STRIPING,
     VOXELS,
 )
 from surfel_mapper.kernels.layout import (
@@ -66,7 +57,6 @@ from surfel_mapper.kernels.layout import (
 )
 from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
 from surfel_mapper.kernels.quantisation import unpack
-from surfel_mapper.kernels.sharing import claim
 from surfel_mapper.mapping.kernels.rows import (
     add_to_row,
     count_of,
@@ -148,40 +138,25 @@ def find_rows(keys, rows, table, state, found):
 
 
 @kernel()
-def add_moments(moments, view_weight, rows, stamps, table, state, stamp, parts, claims, found):
+def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, found):
     """
-    Add the moments of some voxels of a scan, in parts that threads claim.
+    Add the moments of the voxels of a scan from start on; return the first that was not added.
 
     moments      keys (K,) int64, count (K,), total (K, 3), product (K, 6), view (K, 3)
     view_weight  0: the view is multiplied by the count; 1: it is a sum already
     stamps       (R,) uint32, out: the last change of each row
     stamp        uint32, of this change; see kernels/layout.py
-    parts        (P, 3) int64, in and out: the first voxel, the one after the last, and the stripe
-                 that counts points; no stripe twice. The first voxel moves to the first that was
-                 not added: slab, segments or directory have no room for it. Make room and
-                 continue from there.
-    claims       (1,) int64, parts that were claimed
+    start        int64, the first voxel to add
     found        (K,) int32, out: row of each voxel
+
+    Returns K if all were added. Otherwise slab, segments or directory have no room for a voxel:
+    make room and continue from there.
     """
-    number = claim(claims)
-    while number < len(parts):
-        part = parts[number, 0], parts[number, 1], parts[number, 2]
-        parts[number, 0] = add_part(
-            moments, view_weight, rows, stamps, table, state, stamp, part, found
-        )
-        number = claim(claims)
-
-
-@kernel()
-def add_part(moments, view_weight, rows, stamps, table, state, stamp, part, found):
-    """Add the moments of a part; return the first voxel that was not added, see add_moments."""
-    stay_apart()
     keys, count, _, _, _ = moments
-    start, stop, own = part
     words = words_of(moments)
     directory, buckets, held, _ = table
     flat = rows.ravel()
-    depth, stripe_bits = state[DEPTH], state[STRIPING]
+    depth, stop = state[DEPTH], len(keys)
     hashes, likely = np.zeros(RING, np.int64), np.empty(RING, np.int64)
     entries = np.empty(SEGMENT, np.int64)  # here: what fails later would leave the counts wrong
     num_points, num_new, done = np.int64(0), 0, stop
@@ -196,7 +171,7 @@ def add_part(moments, view_weight, rows, stamps, table, state, stamp, part, foun
         if row < 0:
             full = is_full(hashed, directory, held, depth)
             if not full or makes_room(hashed, table, state, entries):
-                row = take_row(flat, state, stripe_of(hashed, stripe_bits))
+                row = take_row(flat, state)
             if row < 0:
                 done = place
                 break
@@ -206,8 +181,8 @@ def add_part(moments, view_weight, rows, stamps, table, state, stamp, part, foun
         num_points += np.int64(count[voxel])
         change_row(words, view_weight, flat, first_word(row), voxel, 1)
         found[voxel] = row
-    state[POINTS + own * LINE] += num_points
-    state[VOXELS + own * LINE] += num_new
+    state[POINTS] += num_points
+    state[VOXELS] += num_new
     set_stamps(stamps, found[start:done], stamp)
     return done
 
@@ -223,17 +198,16 @@ def set_stamps(stamps, found, stamp):
 
 
 @njit(cache=True, nogil=True, inline='always')
-def take_row(flat, state, stripe):
-    """Return a free row of a stripe and prefetch a later one; -1 if there is none."""
-    head, following = U(FREE_ROW + stripe * LINE), U(NEXT_ROW + stripe * LINE)
-    row = state[head]
+def take_row(flat, state):
+    """Return a free row and prefetch a later one; -1 if there is none."""
+    row = state[FREE_ROW]
     if row >= 0:
         links = flat[first_word(row) + U(FREE)]
-        state[head] = (links & LOW) - 1
+        state[FREE_ROW] = (links & LOW) - 1
         prefetch_row(flat, max((links >> HIGH_BITS) - 1, 0))
-    elif state[following] < state[U(END_ROW + stripe * LINE)]:
-        row = state[following]
-        state[following] = row + 1
+    elif state[NEXT_ROW] * ROW < len(flat):
+        row = state[NEXT_ROW]
+        state[NEXT_ROW] = row + 1
     return row
 
 
@@ -247,69 +221,34 @@ def free_row(flat, at, following, later):
 
 @kernel()
 def remove_moments(
-    moments,
-    view_weight,
-    rows,
-    stamps,
-    table,
-    state,
-    stamp,
-    parts,
-    claims,
-    found,
-    min_points,
-    fallen,
-    ends,
+    moments, view_weight, rows, stamps, table, state, stamp, found, min_points, fallen
 ):
     """
-    Subtract moments, in parts that threads claim; free the rows that become empty.
+    Subtract moments, or nothing if a voxel does not hold its own; free the rows that get empty.
 
     stamps      (R,) uint32, out: the last change of each row
     stamp       uint32, of this change; see kernels/layout.py
-    parts       (P, 3) int64: the first voxel, the one after the last, and the stripe that counts
-                points; no stripe twice
-    claims      (1,) int64, parts that were claimed
     found       (K,) int32, in: row of each voxel, or a hint of it; out: the row
     min_points  smallest number of points of a surfel, at least 1
-    fallen      (K, 3) int32, out, from the first voxel of a part on: indices of the voxels that
-                held min_points before and hold fewer
-    ends        (P, 2) int64, out: the first voxel of a part that does not hold its moments, or
-                -1, and the number of its fallen voxels
+    fallen      (K, 3) int32, out: indices of the voxels that held min_points before and hold
+                fewer
 
-    Of a part with a voxel that does not hold its moments nothing is subtracted.
+    Returns the first voxel that does not hold its moments, or -1, and the number of fallen voxels.
 
     A row keeps its voxel as long as that holds points, so a hint is right unless the voxel was
     emptied since; a wrong one is replaced by a look-up. A voxel must hold at least as many points
     as are subtracted; if it holds no others, its sums must be equal. One pass that is undone on
     failure: a pass of checks before it would read every row from memory twice.
     """
-    number = claim(claims)
-    while number < len(parts):
-        part = parts[number, 0], parts[number, 1], parts[number, 2]
-        changed = rows, stamps, table, state
-        ends[number, 0], ends[number, 1] = remove_part(
-            moments, view_weight, *changed, stamp, part, found, min_points, fallen
-        )
-        number = claim(claims)
-
-
-@kernel()
-def remove_part(
-    moments, view_weight, rows, stamps, table, state, stamp, part, found, min_points, fallen
-):
-    """Subtract the moments of a part; return its ends, see remove_moments."""
-    stay_apart()
     keys, count, _, _, _ = moments
     words = words_of(moments)
     directory, buckets, num_held, _ = table
-    start, stop, own = part
-    depth, stripe_bits = state[DEPTH], state[STRIPING]
+    depth, num = state[DEPTH], U(len(keys))
     flat = rows.ravel()
-    emptied, hashes = np.empty(stop - start, np.int32), np.empty(stop - start, np.int64)
-    num_emptied, num_fallen = 0, start
+    emptied, hashes = np.empty(num, np.int32), np.empty(num, np.int64)
+    num_emptied, num_fallen = 0, 0
     num_points, missing = np.int64(0), np.int64(-1)
-    num = U(stop)
-    for place in range(U(start), num):
+    for place in range(num):
         if place + U(EARLY) < num:
             prefetch_row_early(flat, np.int64(found[place + U(EARLY)]))
             prefetch_row(flat, np.int64(found[place + U(AHEAD)]))
@@ -330,26 +269,24 @@ def remove_part(
             later = np.int64(-1)
             if num_emptied >= AHEAD:
                 later = np.int64(found[U(emptied[U(num_emptied - AHEAD)])])
-            hashed = hash_key(key)
-            first = U(FREE_ROW + stripe_of(hashed, stripe_bits) * LINE)
-            free_row(flat, at, state[first], later)
-            state[first] = row
-            emptied[U(num_emptied)], hashes[U(num_emptied)] = place, hashed
+            free_row(flat, at, state[FREE_ROW], later)
+            state[FREE_ROW] = row
+            emptied[U(num_emptied)], hashes[U(num_emptied)] = place, hash_key(key)
             num_emptied += 1
         else:
             change_row(words, view_weight, flat, at, place, -1)
         num_points += n
     if missing >= 0:
         for i in range(num_emptied - 1, -1, -1):
-            take_back_row(flat, state, np.int64(found[U(emptied[i])]), hashes[i])
-        put_back(keys, words, view_weight, flat, found, start, missing)
+            links = flat[first_word(found[U(emptied[i])]) + U(FREE)]
+            state[FREE_ROW] = (links & LOW) - 1
+        put_back(keys, words, view_weight, flat, found, missing)
         return missing, 0
-    state[POINTS + own * LINE] -= num_points
-    state[VOXELS + own * LINE] -= num_emptied
-    set_stamps(stamps, found[start:stop], stamp)
-    num = U(num_emptied)
-    for i in range(num):
-        if i + U(HASHED) < num:
+    state[POINTS] -= num_points
+    state[VOXELS] -= num_emptied
+    set_stamps(stamps, found, stamp)
+    for i in range(U(num_emptied)):
+        if i + U(HASHED) < U(num_emptied):
             prefetch(directory, hashes[i + U(HASHED)] >> (32 - depth))
             earlier, nearer = hashes[i + U(EARLIER)], hashes[i + U(NEARER)]
             prefetch_early(buckets, first_bucket(earlier, directory, depth))
@@ -357,7 +294,7 @@ def remove_part(
         row = np.int64(found[U(emptied[i])])
         remove_entry(hashes[i], row, directory, buckets, num_held, depth)
         stamps[U(row)] = stamp | EMPTIED
-    return missing, num_fallen - start
+    return missing, num_fallen
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -366,46 +303,10 @@ def is_voxel(flat, at, key):
     return (flat[at + U(KEY)] == key) & (count_of(flat, at) > 0)
 
 
-@kernel()
-def restore_moments(moments, view_weight, rows, stamps, table, state, stamp, part, found):
-    """
-    Add the moments of a part again that ``remove_moments`` subtracted, each voxel in its row.
-
-    The parameters are those of remove_moments, found as it left them. No other change may lie
-    between the two. Needs no memory.
-    """
-    keys, count, _, _, _ = moments
-    start, stop, own = part
-    words = words_of(moments)
-    directory, buckets, held, _ = table
-    flat = rows.ravel()
-    num_points, num_emptied = np.int64(0), 0
-    for place in range(stop - 1, start - 1, -1):
-        row, key = np.int64(found[place]), keys[place]
-        if count_of(flat, first_word(row)) == 0:
-            hashed = hash_key(key)
-            take_back_row(flat, state, row, hashed)
-            insert_entry(hashed, row, directory, buckets, held, state[DEPTH])
-            num_emptied += 1
-    put_back(keys, words, view_weight, flat, found, start, stop)
-    for place in range(start, stop):
-        num_points += np.int64(count[place])
-    set_stamps(stamps, found[start:stop], stamp)
-    state[POINTS + own * LINE] += num_points
-    state[VOXELS + own * LINE] += num_emptied
-
-
 @part()
-def take_back_row(flat, state, row, hashed):
-    """Take the row that was freed last from the chain of its stripe."""
-    links = flat[first_word(row) + U(FREE)]
-    state[FREE_ROW + stripe_of(hashed, state[STRIPING]) * LINE] = (links & LOW) - 1
-
-
-@part()
-def put_back(keys, words, view_weight, flat, found, start, stop):
-    """Add the moments of voxels that were subtracted to their rows (K,), also to emptied ones."""
-    for place in range(U(start), U(stop)):
+def put_back(keys, words, view_weight, flat, found, stop):
+    """Add the moments of the first voxels to their rows again, also to emptied ones."""
+    for place in range(U(stop)):
         at = first_word(found[place])
         if count_of(flat, at) == 0:
             clear_row(flat, at, keys[place])

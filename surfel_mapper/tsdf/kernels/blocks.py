@@ -12,7 +12,6 @@ import numpy as np
 
 from surfel_mapper.kernels.hashing import (
     DEPTH,
-    END_ROW,
     find_row,
     FREE_ROW,
     hash_key,
@@ -84,7 +83,7 @@ def place_blocks(keys, head, table, state, limit, start, rows):
             row = state[FREE_ROW]
             if row >= 0:
                 state[FREE_ROW] = head[row, KEY]
-            elif state[NEXT_ROW] < state[END_ROW]:
+            elif state[NEXT_ROW] < len(head):
                 row = state[NEXT_ROW]
                 state[NEXT_ROW] = row + 1
             else:
