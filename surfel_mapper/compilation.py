@@ -22,7 +22,7 @@ ONCE = 'compiling kernels, once on this machine'
 _log = logging.getLogger(__name__)
 
 
-class Stage(NamedTuple):
+class CompileStage(NamedTuple):
     """A call that may compile kernels, and its name for messages."""
 
     name: str
@@ -107,7 +107,7 @@ def stage(number: int, total: int, name: str) -> Iterator[None]:
         PROGRESS.stage = ''
 
 
-def run_stages(stages: Sequence[Stage]) -> None:
+def run_stages(stages: Sequence[CompileStage]) -> None:
     """Call the stages in order; say at the end how long compiling took, if any kernel was."""
     num_kernels, seconds = PROGRESS.num_kernels, PROGRESS.seconds
     for number, (name, call) in enumerate(stages, start=1):

@@ -206,7 +206,7 @@ class Laps:
 
 
 def percentiles(milliseconds: deque[float]) -> dict[str, float]:
-    """Return median and 99th percentile of times; the latter without the first, in a cold cache."""
+    """Return median and 99th percentile of times; the latter without the first, a cold one."""
     return {
         'median': round(float(np.median(milliseconds)), 3),
         'p99': round(float(np.percentile([*milliseconds][len(milliseconds) > 1 :], 99)), 3),

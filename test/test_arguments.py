@@ -76,7 +76,6 @@ CALLS = {
     'SurfelMap(voxel_size_m)': lambda v: SurfelMap(v),
     'SurfelMap(origin_m)': lambda v: SurfelMap(0.5, origin_m=v),
     'SurfelMap(level)': lambda v: SurfelMap(0.5, level=v),
-    'SurfelMap(threads)': lambda v: SurfelMap(0.5, threads=v),
     'MapMirror': lambda v: MapMirror(v),
     'add(points)': lambda v: surfel_map().add(v),
     'add(origin)': lambda v: surfel_map().add(POINTS, origin=v),

@@ -13,7 +13,6 @@ import ast
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-import re
 import sys
 from typing import NamedTuple
 
@@ -23,9 +22,8 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'surfel_mapper'
 
 LEVELS = (
-    {'errors'},
+    {'compilation', 'errors'},
     {'arguments', 'budget', 'kernels'},
-    {'helpers'},
     {'config', 'counters', 'geometry', 'memory', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},
@@ -274,25 +272,7 @@ def test_no_two_classes_share_a_name():
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
 
 
-SHORT, LONG = 70, 350
 """Lines of a module outside of which its docstring says why it stands alone, or is one."""
-
-WHY_SHORT = re.compile(r'\balone\b|\bon its own\b|\bapart from\b', re.IGNORECASE)
-
-WHY_LONG = re.compile(r'\bone module\b|module is long|longer than other', re.IGNORECASE)
-
-
-def test_short_and_long_modules_say_why():
-    found = []
-    for module, path in MODULES.items():
-        lines, docstring = parsed(path).num_lines, parsed(path).docstring
-        if module.endswith('__init__.py'):
-            continue
-        if lines < SHORT and not WHY_SHORT.search(docstring):
-            found.append(f'{module}: {lines} lines; merge it, or say why it is on its own')
-        if lines > LONG and not WHY_LONG.search(docstring):
-            found.append(f'{module}: {lines} lines; split it, or say why it is one module')
-    assert not found, '\n'.join(found)
 
 
 def test_every_folder_has_a_docstring():

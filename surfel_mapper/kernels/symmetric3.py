@@ -49,177 +49,111 @@ def decompose(scatter, num, eigenvalues, normals):
     normals      (3, C) float64, out: unit eigenvectors of the smallest; sign arbitrary. If the
                  two smallest coincide: orthogonal to the third eigenvector; if all coincide: z
     """
-    work = make_work(min(num, CHUNK))
-    for start in range(0, num, CHUNK):
-        decompose_chunk(scatter, start, min(CHUNK, num - start), work, eigenvalues, normals)
-
-
-@njit(cache=True, nogil=True, inline='always')
-def make_work(size):
-    """
-    Return arrays for the intermediate results of ``size`` matrices, float64.
-
-    Deviators (6, size), sizes (3, size), roots (size,), vectors (3, size), planes (4, size).
-    """
-    deviators, sizes = np.empty((6, size)), np.empty((3, size))
-    return deviators, sizes, np.empty(size), np.empty((3, size)), np.empty((4, size))
-
-
-@part(error_model='numpy')
-def decompose_chunk(scatter, start, num, work, eigenvalues, normals):
-    """Decompose num matrices from start on, as ``decompose`` does, with work for as many."""
-    deviators, sizes, roots, vectors, planes = work
-    normalise(scatter, start, num, deviators, sizes)
-    isolate(deviators, num, roots)
-    cross(deviators, roots, num, vectors)
-    deflate(deviators, roots, vectors, num, planes)
-    write_eigenvalues(sizes, roots, planes, start, num, eigenvalues)
-    write_normals(roots, vectors, planes, start, num, normals)
-
-
-@part(error_model='numpy')
-def normalise(scatter, start, num, deviators, sizes):
-    """
-    Subtract the mean eigenvalue and scale the deviator.
-
-    deviators  (6, num), out: B of trace 0 and |B|^2 = 6; for a multiple of the identity, the one
-               with the normal z
-    sizes      (3, num), out: mean eigenvalue, spread (the factor taken out of B), and the factor
-               that undoes the scaling of tiny or huge matrices, whose squares and cubes would
-               leave float64
-    """
     for i in range(num):
-        at = start + i
-        axx, axy, axz = scatter[0, at], scatter[1, at], scatter[2, at]
-        ayy, ayz, azz = scatter[3, at], scatter[4, at], scatter[5, at]
-        size = (axx + ayy) + azz
-        into = 2.0**700 if size < 2.0**-400 else (2.0**-600 if size > 2.0**400 else 1.0)
-        back = 2.0**-700 if size < 2.0**-400 else (2.0**600 if size > 2.0**400 else 1.0)
-        axx, axy, axz = axx * into, axy * into, axz * into
-        ayy, ayz, azz = ayy * into, ayz * into, azz * into
-        trace = (axx + ayy) + azz
-        mean = trace / 3.0
-        bxx, byy, bzz = axx - mean, ayy - mean, azz - mean
-        off = (axy * axy + axz * axz) + ayz * ayz
-        spread = math.sqrt((((bxx * bxx + byy * byy) + bzz * bzz) + 2.0 * off) * SIXTH)
-        ball = spread <= NOISE * trace
-        inverse = 0.0 if ball else 1.0 / spread
-        deviators[0, i] = 1.0 if ball else bxx * inverse
-        deviators[1, i] = axy * inverse
-        deviators[2, i] = axz * inverse
-        deviators[3, i] = 1.0 if ball else byy * inverse
-        deviators[4, i] = ayz * inverse
-        deviators[5, i] = -2.0 if ball else bzz * inverse
-        sizes[0, i], sizes[1, i], sizes[2, i] = mean, (0.0 if ball else spread), back
-
-
-@part(error_model='numpy')
-def isolate(deviators, num, roots):
-    """Find the eigenvalue of each deviator farthest from the other two, in [-2, 2]."""
-    for i in range(num):
-        bxx, bxy, bxz = deviators[0, i], deviators[1, i], deviators[2, i]
-        byy, byz, bzz = deviators[3, i], deviators[4, i], deviators[5, i]
-        determinant = (
-            bxx * (byy * bzz - byz * byz)
-            - bxy * (bxy * bzz - byz * bxz)
-            + bxz * (bxy * byz - byy * bxz)
+        values, normal = decompose_one(
+            scatter[0, i],
+            scatter[1, i],
+            scatter[2, i],
+            scatter[3, i],
+            scatter[4, i],
+            scatter[5, i],
         )
-        side = 1.0 if determinant >= 0.0 else -1.0
-        half = min(abs(determinant) * 0.5, 1.0)
-        t = 0.0186393677949610 * half - 0.0813823948457717
-        t = (t * half + 0.3306607004416897) * half + 1.7321326590663837  # to 1e-4
-        t -= ((t * t - 3.0) * t - 2.0 * half) / (3.0 * (t * t - 1.0))  # to 1e-8
-        t -= ((t * t - 3.0) * t - 2.0 * half) / (3.0 * (t * t - 1.0))
-        roots[i] = t * side
+        for axis in range(3):
+            eigenvalues[axis, i] = values[axis]
+            normals[axis, i] = normal[axis]
 
 
 @part(error_model='numpy')
-def cross(deviators, roots, num, vectors):
-    """Find the unit eigenvectors (3, num) of the isolated eigenvalues."""
-    for i in range(num):
-        bxx, bxy, bxz = deviators[0, i], deviators[1, i], deviators[2, i]
-        byy, byz, bzz = deviators[3, i], deviators[4, i], deviators[5, i]
-        t = roots[i]
-        cxx, cyy, czz = bxx - t, byy - t, bzz - t
-        ux, uy, uz = bxy * byz - bxz * cyy, bxz * bxy - cxx * byz, cxx * cyy - bxy * bxy
-        wx, wy, wz = bxy * czz - bxz * byz, bxz * bxz - cxx * czz, cxx * byz - bxy * bxz
-        vx, vy, vz = cyy * czz - byz * byz, byz * bxz - bxy * czz, bxy * byz - cyy * bxz
-        u_sq = (ux * ux + uy * uy) + uz * uz
-        w_sq = (wx * wx + wy * wy) + wz * wz
-        v_sq = (vx * vx + vy * vy) + vz * vz
-        better = w_sq > v_sq
-        vx, vy, vz = (wx if better else vx), (wy if better else vy), (wz if better else vz)
-        v_sq = w_sq if better else v_sq
-        better = u_sq > v_sq
-        vx, vy, vz = (ux if better else vx), (uy if better else vy), (uz if better else vz)
-        v_sq = u_sq if better else v_sq
-        scale = 1.0 / math.sqrt(v_sq)
-        vectors[0, i], vectors[1, i], vectors[2, i] = vx * scale, vy * scale, vz * scale
-
-
-@part(error_model='numpy')
-def deflate(deviators, roots, vectors, num, planes):
+def decompose_one(axx, axy, axz, ayy, ayz, azz):
     """
-    Solve for the other two eigenvalues, in the plane across the isolated eigenvector.
+    Return eigenvalues and normal of a matrix, as ``decompose`` does, three float64 each.
 
-    planes  (4, num), out: half of their difference, and an eigenvector of the lower one, not
-            normalised, never 0
+    No branches, so that a loop over matrices is vectorised.
     """
-    for i in range(num):
-        bxx, bxy, bxz = deviators[0, i], deviators[1, i], deviators[2, i]
-        byy, byz, bzz = deviators[3, i], deviators[4, i], deviators[5, i]
-        t, vx, vy, vz = roots[i], vectors[0, i], vectors[1, i], vectors[2, i]
-        # u, w: a basis of the plane
-        sign = 1.0 if vz >= 0.0 else -1.0
-        a = -1.0 / (sign + vz)
-        b = vx * vy * a
-        ux, uy, uz = 1.0 + sign * vx * vx * a, sign * b, -sign * vx
-        wx, wy, wz = b, sign + vy * vy * a, -vy
-        # B in it: the 2 by 2 matrix [[uu, uw], [uw, ww]], where uu + ww = -t
-        pux, puy = (bxx * ux + bxy * uy) + bxz * uz, (bxy * ux + byy * uy) + byz * uz
-        puz = (bxz * ux + byz * uy) + bzz * uz
-        uu, uw = (ux * pux + uy * puy) + uz * puz, (wx * pux + wy * puy) + wz * puz
-        d = uu + 0.5 * t
-        radius = math.sqrt(d * d + uw * uw)
-        first, second = (-uw if d >= 0.0 else radius - d), (d + radius if d >= 0.0 else -uw)
-        first = first if radius > 0.0 else 1.0
-        planes[0, i] = radius
-        planes[1, i] = first * ux + second * wx
-        planes[2, i] = first * uy + second * wy
-        planes[3, i] = first * uz + second * wz
+    size = (axx + ayy) + azz
+    # squares and cubes of tiny and huge matrices would leave float64
+    into = 2.0**700 if size < 2.0**-400 else (2.0**-600 if size > 2.0**400 else 1.0)
+    back = 2.0**-700 if size < 2.0**-400 else (2.0**600 if size > 2.0**400 else 1.0)
+    axx, axy, axz = axx * into, axy * into, axz * into
+    ayy, ayz, azz = ayy * into, ayz * into, azz * into
+    # the deviator scaled to B, of trace 0 and |B|^2 = 6; of a multiple of the identity: normal z
+    trace = (axx + ayy) + azz
+    mean = trace / 3.0
+    bxx, byy, bzz = axx - mean, ayy - mean, azz - mean
+    off = (axy * axy + axz * axz) + ayz * ayz
+    spread = math.sqrt((((bxx * bxx + byy * byy) + bzz * bzz) + 2.0 * off) * SIXTH)
+    ball = spread <= NOISE * trace
+    inverse = 0.0 if ball else 1.0 / spread
+    spread = 0.0 if ball else spread
+    bxy, bxz, byz = axy * inverse, axz * inverse, ayz * inverse
+    bxx = 1.0 if ball else bxx * inverse
+    byy = 1.0 if ball else byy * inverse
+    bzz = -2.0 if ball else bzz * inverse
+    t = isolated_root(
+        bxx * (byy * bzz - byz * byz)
+        - bxy * (bxy * bzz - byz * bxz)
+        + bxz * (bxy * byz - byy * bxz)
+    )
+    # its unit eigenvector v, the longest cross product of two rows of B - t I
+    cxx, cyy, czz = bxx - t, byy - t, bzz - t
+    ux, uy, uz = bxy * byz - bxz * cyy, bxz * bxy - cxx * byz, cxx * cyy - bxy * bxy
+    wx, wy, wz = bxy * czz - bxz * byz, bxz * bxz - cxx * czz, cxx * byz - bxy * bxz
+    vx, vy, vz = cyy * czz - byz * byz, byz * bxz - bxy * czz, bxy * byz - cyy * bxz
+    u_sq = (ux * ux + uy * uy) + uz * uz
+    w_sq = (wx * wx + wy * wy) + wz * wz
+    v_sq = (vx * vx + vy * vy) + vz * vz
+    better = w_sq > v_sq
+    vx, vy, vz = (wx if better else vx), (wy if better else vy), (wz if better else vz)
+    v_sq = w_sq if better else v_sq
+    better = u_sq > v_sq
+    vx, vy, vz = (ux if better else vx), (uy if better else vy), (uz if better else vz)
+    v_sq = u_sq if better else v_sq
+    scale = 1.0 / math.sqrt(v_sq)
+    vx, vy, vz = vx * scale, vy * scale, vz * scale
+    # u, w: a basis of the plane across v
+    sign = 1.0 if vz >= 0.0 else -1.0
+    a = -1.0 / (sign + vz)
+    b = vx * vy * a
+    ux, uy, uz = 1.0 + sign * vx * vx * a, sign * b, -sign * vx
+    wx, wy, wz = b, sign + vy * vy * a, -vy
+    # B in it: the 2 by 2 matrix [[uu, uw], [uw, ww]], where uu + ww = -t
+    pux, puy = (bxx * ux + bxy * uy) + bxz * uz, (bxy * ux + byy * uy) + byz * uz
+    puz = (bxz * ux + byz * uy) + bzz * uz
+    uu, uw = (ux * pux + uy * puy) + uz * puz, (wx * pux + wy * puy) + wz * puz
+    d = uu + 0.5 * t
+    radius = math.sqrt(d * d + uw * uw)
+    first, second = (-uw if d >= 0.0 else radius - d), (d + radius if d >= 0.0 else -uw)
+    first = first if radius > 0.0 else 1.0
+    px, py, pz = first * ux + second * wx, first * uy + second * wy, first * uz + second * wz
+    scale = 1.0 / math.sqrt((px * px + py * py) + pz * pz)
+    is_lowest = t < 0.0
+    normal = (
+        vx if is_lowest else px * scale,
+        vy if is_lowest else py * scale,
+        vz if is_lowest else pz * scale,
+    )
+    noise = 3.0 * NOISE * mean
+    low, high = -0.5 * t - radius, -0.5 * t + radius
+    e0 = mean + spread * (t if is_lowest else low)
+    e1 = mean + spread * (low if is_lowest else high)
+    e2 = mean + spread * (high if is_lowest else t)
+    e0 = 0.0 if e0 < noise else e0
+    e1 = 0.0 if e1 < noise else e1
+    e1 = e0 if e1 < e0 else e1
+    e2 = e1 if e2 < e1 else e2
+    return (e0 * back, e1 * back, e2 * back), normal
 
 
 @part(error_model='numpy')
-def write_eigenvalues(sizes, roots, planes, start, num, eigenvalues):
-    """Scale the three eigenvalues back, in ascending order."""
-    for i in range(num):
-        mean, spread, back = sizes[0, i], sizes[1, i], sizes[2, i]
-        t, radius = roots[i], planes[0, i]
-        noise = 3.0 * NOISE * mean
-        low, high = -0.5 * t - radius, -0.5 * t + radius
-        e0 = mean + spread * (t if t < 0.0 else low)
-        e1 = mean + spread * (low if t < 0.0 else high)
-        e2 = mean + spread * (high if t < 0.0 else t)
-        e0 = 0.0 if e0 < noise else e0
-        e1 = 0.0 if e1 < noise else e1
-        e1 = e0 if e1 < e0 else e1
-        e2 = e1 if e2 < e1 else e2
-        at = start + i
-        eigenvalues[0, at], eigenvalues[1, at] = e0 * back, e1 * back
-        eigenvalues[2, at] = e2 * back
-
-
-@part(error_model='numpy')
-def write_normals(roots, vectors, planes, start, num, normals):
-    """Write the unit eigenvectors of the lowest eigenvalues, isolated or not."""
-    for i in range(num):
-        px, py, pz = planes[1, i], planes[2, i], planes[3, i]
-        scale = 1.0 / math.sqrt((px * px + py * py) + pz * pz)
-        isolated = roots[i] < 0.0
-        at = start + i
-        normals[0, at] = vectors[0, i] if isolated else px * scale
-        normals[1, at] = vectors[1, i] if isolated else py * scale
-        normals[2, at] = vectors[2, i] if isolated else pz * scale
+def isolated_root(determinant):
+    """Return the eigenvalue t of B farthest from the other two, in [-2, 2]."""
+    side = 1.0 if determinant >= 0.0 else -1.0
+    half = min(abs(determinant) * 0.5, 1.0)
+    t = 0.0186393677949610 * half - 0.0813823948457717
+    t = (t * half + 0.3306607004416897) * half + 1.7321326590663837  # to 1e-4
+    t -= ((t * t - 3.0) * t - 2.0 * half) / (3.0 * (t * t - 1.0))  # to 1e-8
+    t -= ((t * t - 3.0) * t - 2.0 * half) / (3.0 * (t * t - 1.0))
+    return t * side
 
 
 @kernel(error_model='numpy')

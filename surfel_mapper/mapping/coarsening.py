@@ -48,7 +48,7 @@ def coarse_moments(
     channels = np.zeros((len(keys), moments.channels.shape[1]), np.int64)
     if channels.size:
         np.add.at(channels, rows, moments.channels[chosen])
-    return replace(
+    coarse = replace(
         moments,
         voxel_size_m=moments.voxel_size_m * 2**level,
         level=moments.level + level,
@@ -59,6 +59,8 @@ def coarse_moments(
         view=view,
         channels=channels,
     )
+    object.__setattr__(coarse, 'num_reduced', int(count.sum()))  # sums of a map need no test
+    return coarse
 
 
 def coarse_surfels(

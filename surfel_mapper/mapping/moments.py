@@ -23,11 +23,15 @@ from surfel_mapper.arguments import as_array, check_rows
 from surfel_mapper.errors import MapError, MapLimitError
 from surfel_mapper.kernels.layout import (
     BITS,
+    HALF,
     INDEX_BITS,
     INDEX_MASK,
     INDEX_OFFSET,
+    VIEW_SCALE,
 )
-from surfel_mapper.mapping.kernels.voxels import first_impossible
+
+SLACK = 1.0 + 1e-9
+"""For the rounding of products of sums in float64."""
 
 HASHED_ARRAYS = ('key', 'count', 'total', 'product', 'view')
 """The arrays of ScanMoments in the order in which a digest hashes them."""
@@ -269,14 +273,37 @@ def check_possible(moments: ScanMoments) -> None:
         in_order = np.sort(moments.key)
         if (in_order[1:] == in_order[:-1]).any():
             raise MapError('a voxel occurs twice in the moments')
-    key, count, total, product, view = moments.arrays
-    row = first_impossible(key, count, total, product, view, moments.view_is_sum, moments.level)
-    if row >= 0:
+    is_impossible = impossible(moments)
+    if is_impossible.any():
+        row = int(np.argmax(is_impossible))
         raise MapError(
             f'row {row} of the moments: key {moments.key[row]}, {moments.count[row]} points, '
             f'sums {moments.total[row].tolist()}, products {moments.product[row].tolist()}, '
             f'views {moments.view[row].tolist()}; expected those of points in a voxel'
         )
+
+
+def impossible(moments: ScanMoments) -> npt.NDArray[np.bool_]:
+    """
+    Return which rows, (K,), hold moments that no points of a voxel can have.
+
+    Tested: keys that are not negative, counts of 1 or more, sums within the voxel, second moments that
+    satisfy the inequality of Cauchy and Schwarz, views no longer than their unit. Sums beyond the
+    range of a voxel would overflow the integers of the map or give negative eigenvalues later, far
+    from the cause.
+    """
+    half = float(HALF << moments.level)
+    count = moments.count.astype(np.float64)[:, None]
+    total, view = moments.total.astype(np.float64), moments.view.astype(np.float64)
+    square = moments.product[:, [0, 3, 5]].astype(np.float64)  # xx yy zz
+    farthest = VIEW_SCALE * (count if moments.view_is_sum else 1.0) + 1.0
+    beyond = (
+        (np.abs(total) > count * half)
+        | (square > count * half * half * SLACK)
+        | (total * total > count * square * SLACK)
+        | (np.abs(view) > farthest)
+    )
+    return np.asarray((moments.key < 0) | (moments.count < 1) | beyond.any(axis=1))
 
 
 def digest_of(

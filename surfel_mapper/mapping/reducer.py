@@ -27,7 +27,6 @@ from surfel_mapper.kernels.lanes import FULL, WIDEST, WORDS
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.kernels.prefetch import LINE_BYTES
 from surfel_mapper.mapping.channels import channel_names, quantised
-from surfel_mapper.mapping.coarsening import coarse_keys
 from surfel_mapper.mapping.kernels.reduction import (
     BEYOND,
     NOT_FINITE,
@@ -193,7 +192,7 @@ class Reducer:
                 return moments
             part = max(FULL, num_points * FULL // (2 * largest))  # half full on average
         starts = range(0, num_points, part)
-        parts = (xyz[:, i : i + part] for i in starts)
+        parts = (np.ascontiguousarray(xyz[:, i : i + part]) for i in starts)
         return summed_moments([self._moments(p, quantisation, origin, scratch) for p in parts])
 
 
@@ -207,7 +206,10 @@ def summed_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
         If a voxel gets more than 2^23 points.
 
     """
-    key, rows = coarse_keys(np.concatenate([part.key for part in parts]), 0)
+    keys = np.concatenate([part.key for part in parts])
+    key, first, rows = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # of first appearance
+    key, rows = key[order], np.argsort(order)[rows]
 
     def summed(name: str) -> npt.NDArray[np.int64]:
         values = np.concatenate([getattr(part, name) for part in parts])
@@ -227,7 +229,7 @@ def summed_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
     causes = [cause for cause in CAUSES if any(cause in part.left_out for part in parts)]
     return replace(
         parts[0],
-        key=key.copy(),
+        key=key,
         count=count.astype(np.int32),
         total=total if largest > FULL else total.astype(np.int32),
         product=summed('product'),

@@ -13,13 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 import logging
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.compilation import Stage
+from surfel_mapper.compilation import CompileStage
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Laps
 from surfel_mapper.errors import AlignmentError, MapError, PoseError
@@ -179,7 +178,7 @@ class Inserter:
             self.loops.follow_window()
         return alignment
 
-    def warm_up_stages(self, config: Config) -> list[Stage]:
+    def warm_up_stages(self, config: Config) -> list[CompileStage]:
         """Return the stages that compile kernels; see Mapper.warm_up_stages."""
         return [
             *self.preparation.warm_up_stages(config),

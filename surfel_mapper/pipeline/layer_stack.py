@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.compilation import Stage
+from surfel_mapper.compilation import CompileStage
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Laps
 from surfel_mapper.errors import CloudFormatError, SurfelMapperError
@@ -129,9 +129,9 @@ class LayerStack:
             with self._drops.guarded(f'finishing layer {layer.name}'):
                 layer.finish()
 
-    def warm_up_stages(self) -> list[Stage]:
+    def warm_up_stages(self) -> list[CompileStage]:
         """Return the stages that compile the kernels of all layers."""
-        return [Stage(f'layer {layer.name}', layer.warm_up) for layer in self]
+        return [CompileStage(f'layer {layer.name}', layer.warm_up) for layer in self]
 
     def reconfigure(self, config: Config) -> None:
         """Give all layers new settings, also those that are switched off until the next clear."""

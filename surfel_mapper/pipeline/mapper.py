@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_whole, check_kind
-from surfel_mapper.compilation import clock, run_stages, Stage
+from surfel_mapper.compilation import clock, CompileStage, run_stages
 from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters
 from surfel_mapper.errors import CloudFormatError, ConfigError, MapError
@@ -35,7 +35,6 @@ from surfel_mapper.mapping.channels import missing_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import checked_scans, WindowedScan
-from surfel_mapper.pipeline import regions
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.inserter import Inserter, map_frame
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
@@ -567,7 +566,7 @@ class Mapper:
         """Compile the kernels that the settings need to map scans and to derive surfels."""
         run_stages(self.warm_up_stages())
 
-    def warm_up_stages(self) -> list[Stage]:
+    def warm_up_stages(self) -> list[CompileStage]:
         """
         Return the stages of ``warm_up``, for callers that have more to compile.
 

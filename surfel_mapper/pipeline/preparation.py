@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from surfel_mapper.compilation import Stage
+from surfel_mapper.compilation import CompileStage
 from surfel_mapper.config import Config, WindowConfig
 from surfel_mapper.counters import Laps
 from surfel_mapper.errors import (
@@ -132,16 +132,16 @@ class Preparation:
             chain.warm_up()
             self.chain, self._filters = chain, path
 
-    def warm_up_stages(self, config: Config) -> list[Stage]:
+    def warm_up_stages(self, config: Config) -> list[CompileStage]:
         """Return the stages that compile the kernels of preparation, as far as it uses any."""
         stages = []
         if self.chain.filters:
             dtype = np.float64 if config.deskew.enabled else np.float32
-            stages.append(Stage('filters', partial(self.chain.warm_up, dtype)))
+            stages.append(CompileStage('filters', partial(self.chain.warm_up, dtype)))
         if config.deskew.enabled:
-            stages.append(Stage('deskewing', warm_up_deskewing))
+            stages.append(CompileStage('deskewing', warm_up_deskewing))
         if self._poses.registered is not None:
-            stages.append(Stage('registration', self._poses.registered.warm_up))
+            stages.append(CompileStage('registration', self._poses.registered.warm_up))
         return stages
 
     def prepare(

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.compilation import Stage
+from surfel_mapper.compilation import CompileStage
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.channels import CHANNELS, summed_columns
@@ -206,18 +206,18 @@ def standing_sensor(config: Config) -> npt.NDArray[np.float64] | None:
     return np.array(values[:3])
 
 
-def warm_up_stages(config: Config) -> list[Stage]:
+def warm_up_stages(config: Config) -> list[CompileStage]:
     """Return the steps that compile reduction, insertion and removal, as far as they are used."""
     stages = [
-        Stage('adding scans', partial(compile_adding, config)),
-        Stage('deriving surfels', partial(compile_deriving, config)),
+        CompileStage('adding scans', partial(compile_adding, config)),
+        CompileStage('deriving surfels', partial(compile_deriving, config)),
     ]
     window, limits = config.window, config.map
     if any(
         (window.max_scans, window.max_age_s, window.max_distance_m, window.max_bytes)
         + (limits.max_voxels, limits.max_bytes)
     ):
-        stages.append(Stage('removing scans', partial(compile_removing, config)))
+        stages.append(CompileStage('removing scans', partial(compile_removing, config)))
     return stages
 
 
@@ -233,6 +233,7 @@ def compile_deriving(config: Config) -> None:
     """Compile deriving surfels, of coarser maps too if they are published."""
     surfel_map = compile_adding(config)
     surfel_map.surfels_changed(since=0)
+    surfel_map.surfels()
     if config.publish.levels:
         surfel_map.coarsen(1).surfels()
 

@@ -12,7 +12,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from surfel_mapper.compilation import run_stages, Stage
+from surfel_mapper.compilation import CompileStage, run_stages
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
 from surfel_mapper.memory import lasting_objects
@@ -91,13 +91,13 @@ class Session:
         self._viewer = self._opened_viewer()
         self.thread.start(self._on_update)
 
-    def warm_up_stages(self) -> list[Stage]:
+    def warm_up_stages(self) -> list[CompileStage]:
         """Return the stages that compile the kernels of input, mapping and default outputs."""
         decoding = warm_up_depth if self.config.input.kind == 'depth' else warm_up_decoding
         return [
-            Stage('decoding', decoding),
+            CompileStage('decoding', decoding),
             *self.mapper.warm_up_stages(),
-            Stage('messages', partial(warm_up_outputs, self.config)),
+            CompileStage('messages', partial(warm_up_outputs, self.config)),
         ]
 
     def activate(self) -> None:

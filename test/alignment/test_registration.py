@@ -13,7 +13,14 @@ import pytest
 from surfel_mapper.alignment.registration import moved, Registration, solve
 from surfel_mapper.alignment.surfel_planes import SurfelPlanes
 from surfel_mapper.config import RegistrationConfig
-from surfel_mapper.geometry import compose, inverse, rotation_angle, se3_exp
+from surfel_mapper.geometry import (
+    compose,
+    inverse,
+    pose_matrix,
+    q_xyzw,
+    rotation_angle,
+    se3_exp,
+)
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 VOXEL_M = 0.5
@@ -282,3 +289,23 @@ def test_a_map_too_sparse_for_its_voxels_is_met_in_larger_ones():
 
     assert aligner.fits(found)
     assert off(found.T_map_sensor)[0] < 0.05
+
+
+@pytest.mark.parametrize('angle', [0.0, 1e-12, 1e-9, 1e-5, 0.3, 3.0, np.pi])
+def test_a_pose_is_turned_in_place_and_moved(angle):
+    rng = np.random.default_rng(3)
+    axis = rng.normal(size=3)
+    step = np.concatenate([rng.normal(size=3), angle * axis / np.linalg.norm(axis)])
+    pose = se3_exp(rng.normal(size=6))
+    turned = compose(se3_exp(np.concatenate([np.zeros(3), step[3:]])), pose)
+    expected = pose_matrix(pose[:3, 3] + step[:3], q_xyzw(turned))
+    np.testing.assert_allclose(moved(pose, step), expected, atol=1e-14)
+
+
+def test_a_thousand_steps_keep_a_rotation_orthonormal():
+    rng = np.random.default_rng(4)
+    pose = np.eye(4)
+    for _ in range(1000):
+        pose = moved(pose, rng.normal(size=6))
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0, abs=1e-14)

@@ -13,7 +13,6 @@ import pytest
 from surfel_mapper.kernels.hashing import (
     BUCKET,
     DEPTH,
-    END_SEGMENT,
     find_row,
     FULLEST,
     hash_key,
@@ -40,7 +39,7 @@ class Owner:
         self.held = np.zeros(num_segments, np.int32)
         self.local_depth = np.zeros(num_segments, np.int8)
         self.state = np.zeros(STATE, np.int64)
-        self.state[NEXT_SEGMENT], self.state[END_SEGMENT] = 1, num_segments
+        self.state[NEXT_SEGMENT] = 1
         self.entries = np.empty(SEGMENT, np.int64)
         self.expected = {}
 

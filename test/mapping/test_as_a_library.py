@@ -347,7 +347,6 @@ MISTAKES = {
     'a name as version': (lambda m: m.surfels_changed(since='a'), TypeError, "since: 'a'"),
     'half a level': (lambda m: m.coarsen(1.0), TypeError, r'level: 1\.0, expected a whole number'),
     'yes as level': (lambda m: m.coarsen(True), TypeError, 'level: True'),
-    'half a thread': (lambda _: SurfelMap(0.5, threads=2.5), TypeError, r'threads: 2\.5'),
     'a word as origin': (
         lambda _: SurfelMap(0.5, origin_m='auto'),
         ValueError,

@@ -22,7 +22,6 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import NotInMapError
-from surfel_mapper.mapping import reducer
 from surfel_mapper.mapping import voxel_table as module
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.reference import add_moments, as_twin, digest, scan_moments
@@ -50,19 +49,16 @@ class MapBesideTwin(RuleBasedStateMachine):
         size_m=st.sampled_from([0.5, 0.2, 1.0 / 3.0]),
         offset_m=st.sampled_from([0.0, 1e4, -1e5]),
         logged=st.sampled_from([0, 3, 10, 2**18]),
-        threads=st.sampled_from([1, 2]),
     )
-    def make(self, size_m, offset_m, logged, threads):
-        self.saved = module.LEAST, module.LEAST_SHARED, reducer.LEAST_SHARED
-        module.LEAST, module.LEAST_SHARED, reducer.LEAST_SHARED = logged, 2, 2
-        self.map, self.twin = SurfelMap(size_m, threads=threads), {}
+    def make(self, size_m, offset_m, logged):
+        self.saved, module.LEAST = module.LEAST, logged
+        self.map, self.twin = SurfelMap(size_m), {}
         self.size_m, self.offset_m = size_m, offset_m
         self.live, self.gone, self.touched, self.reported = [], [], {}, 0
-        self.restored, self.is_shared = {}, threads > 1
 
     def teardown(self):
         if hasattr(self, 'saved'):
-            module.LEAST, module.LEAST_SHARED, reducer.LEAST_SHARED = self.saved
+            module.LEAST = self.saved
             self.check_against_the_live_scans_alone()
 
     def place(self, fractions, dtype=np.float64):
@@ -124,8 +120,6 @@ class MapBesideTwin(RuleBasedStateMachine):
         if any(has[0] < row[0] or (has[0] == row[0] and has != row) for has, row in held):
             with pytest.raises(NotInMapError):
                 self.map.remove(moments)
-            if self.is_shared:  # parts that another thread had subtracted were added again
-                self.restored[self.map.version] = set(twin)
 
     @rule()
     def clear(self):
@@ -148,8 +142,7 @@ class MapBesideTwin(RuleBasedStateMachine):
         voxels = [tuple(voxel) for voxel in surfels.voxel_index.tolist()]
         assert len(voxels) == len(set(voxels))
         found = dict(zip(voxels, surfels.num_points.tolist(), strict=True))
-        assert expected.items() <= found.items()
-        assert found.items() <= {**expected, **self.counts(self.restored, since, least)}.items()
+        assert found == expected
 
     def counts(self, voxels_at, since, least):
         """Return the points of voxels of versions after one that hold at least some."""

@@ -9,7 +9,6 @@ comes between two scans.
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 import threading
 
@@ -117,14 +116,14 @@ def test_every_update_is_that_of_one_thread(threads, way, settings_of):
     one, several = mapper_with(1, **settings_of(way)), mapper_with(threads, **settings_of(way))
     expected, found = drive(one, 1, 12), drive(several, 1, 12)
     assert len(expected) == 11
-    assert len(found) == 9  # the two newest are kept
+    assert len(found) == 10  # the newest is kept
     found += several.insert_ready()
     same(found, expected)
     assert without_times(several) == without_times(one)
 
 
 @pytest.mark.parametrize(('threads', 'is_here'), [(1, True), (2, False)])
-def test_points_are_decoded_by_the_thread_that_reduces_them_if_it_is_not_behind(threads, is_here):
+def test_points_are_decoded_by_the_thread_that_reduces_them(threads, is_here):
     mapper, decoded_by = mapper_with(threads), []
 
     def decode():
@@ -143,80 +142,6 @@ def test_points_are_decoded_by_the_thread_that_reduces_them_if_it_is_not_behind(
     assert mapper.counters.dropped['no_pose'] == 1
     assert [thread == threading.get_ident() for thread in decoded_by[1:]] == [is_here] * 2
     assert len(decoded_by) == 3
-
-
-class BehindReduction:
-    """A reduction whose other thread works on each scan only once it is let go."""
-
-    def __init__(self):
-        self.gates = [threading.Event() for _ in range(3)]
-        self.decoded_by = {}
-        self.failures = []
-        self._reduction, self._config = Reduction(SurfelMap(0.5), 2), Config()
-        self.scans = [
-            Scan(points=LazyPoints(20, partial(self._decode, i)), stamp_ns=i, frame_id='lidar')
-            for i in range(3)
-        ]
-
-    def _decode(self, number):
-        if self.failures:
-            raise self.failures.pop()
-        self.decoded_by[number] = threading.get_ident()
-        return np.random.default_rng(number).uniform(-3.0, 3.0, (20, 3))
-
-    def begin(self, number):
-        def prepare(scan, _):
-            return lambda: self.gates[number].wait(60) and FilteredScan(scan, scan)
-
-        self._reduction.begin(self.scans[number], np.eye(4), self._config, prepare)
-
-    def end(self, number):
-        arguments = self.scans[number], np.eye(4), self._config
-        assert self._reduction.begun(*arguments)().filtered is self.scans[number]
-        return self._reduction.reduce(*arguments).moments.num_points
-
-
-def test_scans_are_decoded_here_if_the_other_thread_is_behind_and_was_waited_for():
-    slow, here = BehindReduction(), threading.get_ident()
-    slow.begin(0)
-    slow.begin(1)
-    assert slow.decoded_by == {}  # it is behind, but no one has waited
-    threading.Timer(0.05, slow.gates[0].set).start()
-    assert slow.end(0) == 20
-    slow.begin(2)
-    assert slow.decoded_by.pop(2) == here
-    slow.gates[1].set()
-    slow.gates[2].set()
-    assert slow.end(1) == slow.end(2) == 20
-    assert set(slow.decoded_by) == {0, 1}
-    assert here not in slow.decoded_by.values()
-
-
-def test_no_scan_is_decoded_here_if_the_other_thread_has_nothing_left_to_do():
-    slow = BehindReduction()
-    slow.begin(0)
-    threading.Timer(0.05, slow.gates[0].set).start()
-    assert slow.end(0) == 20
-    slow.begin(1)
-    assert set(slow.decoded_by) == {0}
-    slow.gates[1].set()
-    assert slow.end(1) == 20
-
-
-@pytest.mark.parametrize('error', [MemoryError, ValueError])
-def test_after_an_error_of_decoding_here_the_other_thread_decodes(error):
-    slow = BehindReduction()
-    slow.begin(0)
-    slow.begin(1)
-    threading.Timer(0.05, slow.gates[0].set).start()
-    assert slow.end(0) == 20
-    slow.failures.append(error('as if there was no memory'))
-    slow.begin(2)
-    assert slow.failures == []
-    assert 2 not in slow.decoded_by
-    slow.gates[1].set()
-    slow.gates[2].set()
-    assert slow.end(1) == slow.end(2) == 20
 
 
 def test_scans_that_wait_together_are_mapped_together():
@@ -257,23 +182,23 @@ def carve(mapper):
 )
 def test_changes_between_two_scans_hold_for_the_scan_that_waits(between, way, settings_of):
     one, two = (mapper_with(threads, **settings_of(way)) for threads in (1, 2))
-    expected, found = drive(one, 1, 6), drive(two, 1, 8)  # two keeps the last two
+    expected, found = drive(one, 1, 7), drive(two, 1, 8)  # two keeps the last
     assert [update.stamp_ns for update in found] == [update.stamp_ns for update in expected]
     for mapper in (one, two):
         between(mapper)
-    same(list(two.insert_ready()), drive(one, 6, 8))
+    same(list(two.insert_ready()), drive(one, 7, 8))
     assert two.map == one.map
 
 
 @WAYS
 def test_scans_that_were_kept_go_where_alignment_has_moved_the_map(way, settings_of):
     one, two = (mapper_with(threads, **settings_of(way)) for threads in (1, 2))
-    drive(one, 1, 6)
+    drive(one, 1, 7)
     drive(two, 1, 8)
     for mapper in (one, two):
         mapper.align()
     assert not np.array_equal(two.T_map_fixed, np.eye(4))
-    same(list(two.insert_ready()), drive(one, 6, 8))
+    same(list(two.insert_ready()), drive(one, 7, 8))
     assert two.map == one.map
 
 
@@ -298,9 +223,9 @@ def test_clearing_drops_and_counts_the_scans_that_were_kept():
     mapper = mapper_with(2)
     drive(mapper, 1, 5)
     mapper.clear()
-    assert mapper.counters.dropped['cleared'] == 2
+    assert mapper.counters.dropped['cleared'] == 1
     assert list(mapper.insert_ready()) == []
-    assert mapper.counters.received == mapper.counters.mapped + 2
+    assert mapper.counters.received == mapper.counters.mapped + 1
     assert mapper.map.num_voxels == 0
 
 

@@ -304,21 +304,6 @@ def test_a_sweep_with_a_gap_of_poses_in_its_middle_waits_for_them(threads, caplo
     assert 'in a gap of 0.060 s' in caplog.text
 
 
-def test_poses_of_a_sweep_that_are_forgotten_cost_this_scan_alone():
-    mapper = mapper_with(deskew__enabled=True, map__threads=2)
-    for step in range(5):
-        add_pose(mapper, 1.0 + 0.1 * step, x=0.1 * step)
-    for stamp_s in (1.0, 1.1, 1.2):
-        mapper.add_scan(sweep_at(stamp_s))
-    updates = mapper.insert_ready()
-    found = [next(updates)]  # meanwhile the other thread has begun with the second
-    mapper.transforms.clear()
-    found += updates
-    assert [update.stamp_ns for update in found] == [S, round(1.1 * S)]
-    assert dropped(mapper) == {'no_pose': 1}
-    assert_counts_add_up(mapper)
-
-
 def test_a_pose_that_comes_late_into_a_gap_is_used():
     mapper = mapper_with(pose__max_gap_s=0.5)
     add_pose(mapper, 1.0)

@@ -1,13 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The steps that compile kernels cover the kernels that scans then need."""
+"""The stages that compile kernels cover the kernels that scans then need."""
 
 import subprocess
 import sys
 
-import pytest
-
-COMMON = """
+PROGRAM = """
 from array import array
 import gc
 from types import SimpleNamespace
@@ -44,37 +42,18 @@ def mapped(number):
     return list(mapper.insert_ready())
 
 mapper = Mapper(Config.from_mapping({'pose.source': 'identity', 'window.max_scans': 2}))
-steps = mapper.warm_up_steps()
 warm_up()
-for step in steps.first_scan:
-    step()
-"""
-
-FIRST_SCANS = """
-before = kernels()
-mapper.derives = False
-updates = mapped(1) + mapped(2)
-"""
-
-EVERY_SCAN = """
-for step in steps.every_scan:
-    step()
+mapper.warm_up()
 before = kernels()
 updates = [update for number in range(1, 6) for update in mapped(number)]
 assert len(updates[-1].changed) and updates[-1].evictions
-"""
-
-CHECK = """
-assert len(updates) >= 2, len(updates)
 print(sorted(map(str, kernels() - before)))
 """
 
 
-@pytest.mark.parametrize('scans', [FIRST_SCANS, EVERY_SCAN], ids=['first', 'every'])
-def test_scans_need_no_kernel_beyond_those_of_their_steps(scans):
+def test_scans_need_no_kernel_beyond_those_of_the_stages():
     """In a new Python, whose kernels are loaded from the cache, not compiled, one by one."""
-    program = COMMON + scans + CHECK
     done = subprocess.run(
-        [sys.executable, '-c', program], capture_output=True, text=True, check=False
+        [sys.executable, '-c', PROGRAM], capture_output=True, text=True, check=False
     )
     assert (done.stdout.strip(), done.returncode) == ('[]', 0), done.stdout + done.stderr

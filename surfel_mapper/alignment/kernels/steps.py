@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A Gauss-Newton step from its normal equations, and the pose it leads to.
+A Gauss-Newton step from its normal equations.
 
 A search takes 35 steps a scan, each on a few numbers: in numpy a step took 120 us, most of it the
 overhead of calls, here 10. Eigenvalues come from Jacobi's rotations, whose bits do not depend on
@@ -121,53 +121,3 @@ def rotate(matrix, vectors, i, j):
         a, b = vectors[i, k], vectors[j, k]
         vectors[i, k], vectors[j, k] = cosine * a - sine * b, sine * a + cosine * b
     matrix[i, j] = matrix[j, i] = 0.0
-
-
-@kernel(error_model='numpy')
-def move_pose(pose, step, moved):
-    """
-    Move a pose by step[:3] and turn it in place by the rotation vector step[3:].
-
-    pose   (4, 4) float64
-    step   (6,) float64, m and rad
-    moved  (4, 4) float64, out; its rotation is orthonormal to rounding
-    """
-    x, y, z = step[3], step[4], step[5]
-    angle = math.sqrt(x * x + y * y + z * z)
-    a, b = 1.0, 0.5  # sin(angle) / angle, (1 - cos(angle)) / angle^2
-    if angle > 1e-8:
-        half = math.sin(0.5 * angle) / angle
-        a, b = math.sin(angle) / angle, 2.0 * half * half
-    for j in range(4):
-        u, v, w = pose[0, j], pose[1, j], pose[2, j]
-        if j == 3:
-            moved[0, 3], moved[1, 3], moved[2, 3] = u + step[0], v + step[1], w + step[2]
-            continue
-        moved[0, j] = (
-            (1.0 - b * (y * y + z * z)) * u + (b * x * y - a * z) * v + (b * x * z + a * y) * w
-        )
-        moved[1, j] = (
-            (b * x * y + a * z) * u + (1.0 - b * (x * x + z * z)) * v + (b * y * z - a * x) * w
-        )
-        moved[2, j] = (
-            (b * x * z - a * y) * u + (b * y * z + a * x) * v + (1.0 - b * (x * x + y * y)) * w
-        )
-    moved[3, 0] = moved[3, 1] = moved[3, 2] = 0.0
-    moved[3, 3] = 1.0
-    orthonormalise(moved)
-
-
-@part(error_model='numpy')
-def orthonormalise(pose):
-    """Make the rotation of a pose (4, 4), which is off by rounding, orthonormal, in place."""
-    for i in range(2):
-        if i == 1:
-            along = pose[1, 0] * pose[0, 0] + pose[1, 1] * pose[0, 1] + pose[1, 2] * pose[0, 2]
-            for j in range(3):
-                pose[1, j] -= along * pose[0, j]
-        norm = math.sqrt(pose[i, 0] ** 2 + pose[i, 1] ** 2 + pose[i, 2] ** 2)
-        for j in range(3):
-            pose[i, j] /= norm
-    pose[2, 0] = pose[0, 1] * pose[1, 2] - pose[0, 2] * pose[1, 1]
-    pose[2, 1] = pose[0, 2] * pose[1, 0] - pose[0, 0] * pose[1, 2]
-    pose[2, 2] = pose[0, 0] * pose[1, 1] - pose[0, 1] * pose[1, 0]

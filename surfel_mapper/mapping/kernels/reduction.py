@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, stay_apart, U, use_widest_vectors
+from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.grouping import (
     CHUNK,
     find_key,
@@ -70,7 +70,6 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     Points left out have the key -1, whose row is the first: sums[0] is of no use but for its
     count. The last row stays zero. After -1 call with larger arrays.
     """
-    use_widest_vectors()
     table, keys, sums, chunk_keys, places, starts, run_rows = scratch
     words = sums.ravel()
     left_out[:] = 0
@@ -121,7 +120,6 @@ def add_places(places, num, chunk_keys, run_rows, words, later):
     of its voxel. A point of the same run takes the zeros at the end instead, because reading
     the row that the point before it wrote would wait for that write.
     """
-    stay_apart()
     x, y, z = later
     zeros = U(len(words) - WORDS)
     run, previous = U(0), chunk_keys[0]
@@ -166,7 +164,6 @@ def pack_moments(keys, sums, origin, voxel_size, moments):
     moments     key (K,) int64, count (K,) int32, total (K, 3) int32, product (K, 6) int64,
                 view (K, 3) int16, out
     """
-    use_widest_vectors()
     key, count, total, product, view = moments
     for row in range(U(len(keys))):
         key[row] = keys[row]

@@ -15,9 +15,8 @@ import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.layout import KEY, PRODUCT
-from surfel_mapper.kernels.prefetch import LINE_BYTES, prefetch_to_write
 from surfel_mapper.kernels.quantisation import unpack
-from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work
+from surfel_mapper.kernels.symmetric3 import decompose_one
 from surfel_mapper.mapping.kernels.rows import (
     count_of,
     first_word,
@@ -35,9 +34,6 @@ AHEAD = 16
 
 EARLY = CHUNK
 """Number of rows between the early prefetch of a row and its use."""
-
-LINE = LINE_BYTES // 8
-"""Numbers of 64 bits in a cache line."""
 
 EXACT_BITS = 54
 """A second moment of n points of b bits is below n 4^(b - 1), so float64 holds it exactly for
@@ -65,30 +61,88 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
 
     A single point or identical points: eigenvalues 0; normal, planarity and curvature nan.
     """
-    position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs
     keys, moments = np.empty(CHUNK, np.int64), np.empty((MOMENTS, CHUNK))
-    scatter, shape = np.empty((6, CHUNK)), np.empty((2, CHUNK))
-    mean, values, normals = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((3, CHUNK))
-    work = make_work(CHUNK)
+    mean, scatter = np.empty((3, CHUNK)), np.empty((6, CHUNK))
+    values, normals, shape = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((2, CHUNK))
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
-    vectors = position.ravel(), normal.ravel(), eigenvalues.ravel()
-    written = vectors, (planarity, curvature), num_points, voxel_index.ravel()
+    unit = voxel_size / (1 << bits)
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
-        end = start + num
-        most = gather(rows, chosen, start, num, keys, moments, written)
-        write_index(keys, moments, num, num_points[start:end], voxel_index[start:end])
+        most = gather(rows, chosen, start, num, keys, moments)
         center(moments, num, mean, scatter)
         if most >= many:
             center_exactly(rows, chosen, start, num, scatter)
-        place(mean, num, voxel_size, bits, voxel_index[start:end], position[start:end])
-        decompose_chunk(scatter, 0, num, work, values, normals)
-        derive_shape(values, num, moments, voxel_size / (1 << bits), shape)
-        turn(normals, num, moments, shape)
-        write_numbers(shape[0], num, planarity[start:end])
-        write_numbers(shape[1], num, curvature[start:end])
-        write_vectors(normals, num, normal[start:end])
-        write_vectors(values, num, eigenvalues[start:end])
+        for i in range(num):
+            xx, xy, xz = scatter[0, i], scatter[1, i], scatter[2, i]
+            yy, yz, zz = scatter[3, i], scatter[4, i], scatter[5, i]
+            (e0, e1, e2), (nx, ny, nz) = decompose_one(xx, xy, xz, yy, yz, zz)
+            trace = (e0 + e1) + e2
+            inverse = 1.0 / trace if trace > 0.0 else math.inf  # 0 times inf is nan, as documented
+            planarity = 2.0 * (e1 - e0) * inverse
+            side = side_of(nx, ny, nz, moments[V, i], moments[V + 1, i], moments[V + 2, i])
+            side = math.nan if math.isnan(planarity) else side
+            normals[0, i], normals[1, i], normals[2, i] = nx * side, ny * side, nz * side
+            shape[0, i], shape[1, i] = planarity, e0 * inverse
+            scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
+            values[0, i], values[1, i], values[2, i] = e0 * scale, e1 * scale, e2 * scale
+        write_surfels(
+            start, num, keys, moments, mean, normals, values, shape, voxel_size, bits, outputs
+        )
+
+
+@part()
+def side_of(nx, ny, nz, vx, vy, vz):
+    """
+    Return 1 if a normal points towards the sensor, else -1.
+
+    If the direction v of the sensor is unknown or orthogonal to the normal, its component of
+    largest magnitude decides, the first of equal ones.
+    """
+    towards = (nx * vx + ny * vy) + nz * vz
+    y_or_z = ny if abs(ny) >= abs(nz) else nz
+    largest = nx if (abs(nx) >= abs(ny)) & (abs(nx) >= abs(nz)) else y_or_z
+    return -1.0 if (largest if towards == 0.0 else towards) < 0.0 else 1.0
+
+
+@part(error_model='numpy')
+def write_surfels(
+    start, num, keys, moments, mean, normals, values, shape, voxel_size, bits, outputs
+):
+    """
+    Write the surfels of a chunk to the outputs of derive_surfels.
+
+    mean             (3, CHUNK) float64, lattice units about the centre of the voxel
+    normals, values  (3, CHUNK) float64, as in the outputs
+    shape            (2, CHUNK) float64, planarity and curvature
+    """
+    position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs
+    cell = 1.0 / (1 << bits)
+    half = (1 << (bits - 1)) + 0.5  # a lattice coordinate stands for the middle of its cell
+    first = U(start)
+    for i in range(U(num)):
+        x, y, z = unpack(keys[i])
+        row = first + i
+        num_points[row] = np.int64(moments[N, i])
+        voxel_index[row, 0], voxel_index[row, 1], voxel_index[row, 2] = x, y, z
+        planarity[row], curvature[row] = shape[0, i], shape[1, i]
+        normal[row, 0], normal[row, 1], normal[row, 2] = (
+            normals[0, i],
+            normals[1, i],
+            normals[2, i],
+        )
+        eigenvalues[row, 0], eigenvalues[row, 1] = values[0, i], values[1, i]
+        eigenvalues[row, 2] = values[2, i]
+        position[row, 0] = (x + (mean[0, i] + half) * cell) * voxel_size
+        position[row, 1] = (y + (mean[1, i] + half) * cell) * voxel_size
+        position[row, 2] = (z + (mean[2, i] + half) * cell) * voxel_size
+
+
+@part()
+def write_vectors(vectors, first, num, out):
+    """Write the vectors of a chunk, (3, CHUNK), to rows of (K, 3) from a first one, uint64, on."""
+    for i in range(U(num)):
+        row = first + i
+        out[row, 0], out[row, 1], out[row, 2] = vectors[0, i], vectors[1, i], vectors[2, i]
 
 
 @kernel(error_model='numpy')
@@ -105,7 +159,7 @@ def derive_covariances(rows, chosen, voxel_size, bits, covariance):
     unit = voxel_size / (1 << bits)
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
-        most = gather(rows, chosen, start, num, keys, moments, None)
+        most = gather(rows, chosen, start, num, keys, moments)
         center(moments, num, mean, scatter)
         if most >= many:
             center_exactly(rows, chosen, start, num, scatter)
@@ -116,19 +170,16 @@ def derive_covariances(rows, chosen, voxel_size, bits, covariance):
 
 
 @part()
-def gather(rows, chosen, start, num, keys, moments, written):
+def gather(rows, chosen, start, num, keys, moments):
     """
     Gather the moments of num voxels from start on; return the largest count.
 
     keys     (CHUNK,) int64, out
     moments  (MOMENTS, CHUNK) float64, out
-    written  arrays that are written next, to be prefetched, see prefetch_outputs; None for others
     """
     flat, last = rows.ravel(), len(chosen) - 1
     most = np.int64(0)
     for i in range(num):
-        if written is not None and i % LINE == 0:
-            prefetch_outputs(written, start + i)
         prefetch_row_early(flat, np.int64(chosen[min(start + i + EARLY, last)]))
         prefetch_row(flat, np.int64(chosen[min(start + i + AHEAD, last)]))
         at = first_word(chosen[start + i])
@@ -141,37 +192,6 @@ def gather(rows, chosen, start, num, keys, moments, written):
         for pair in range(6):
             moments[P + pair, i] = flat[at + U(PRODUCT) + U(pair)]
     return most
-
-
-@part()
-def prefetch_outputs(written, row):
-    """
-    Prefetch the memory of LINE surfels from a row on, to be written.
-
-    written  position, normal and eigenvalues, each (3 K,) float64; planarity and curvature (K,)
-             float64; num_points (K,) int64; voxel_index (3 K,) int32
-
-    If the outputs do not fit the second level of the cache, deriving takes 1.15 times as long
-    without.
-    """
-    vectors, numbers, num_points, voxel_index = written
-    for vector in vectors:
-        for line in range(3):
-            prefetch_to_write(vector, min(3 * row + LINE * line, len(vector) - 1))
-    for number in numbers:
-        prefetch_to_write(number, row)
-    prefetch_to_write(num_points, row)
-    prefetch_to_write(voxel_index, 3 * row)
-    prefetch_to_write(voxel_index, min(3 * row + 2 * LINE, len(voxel_index) - 1))
-
-
-@part()
-def write_index(keys, moments, num, num_points, voxel_index):
-    """Write the numbers of points (num,) and the voxel indices (num, 3) of a chunk."""
-    for i in range(num):
-        num_points[i] = np.int64(moments[N, i])
-    for i in range(num):
-        voxel_index[i, 0], voxel_index[i, 1], voxel_index[i, 2] = unpack(keys[i])
 
 
 @part(error_model='numpy')
@@ -222,73 +242,3 @@ def center_exactly(rows, chosen, start, num, scatter):
                 about = flat[at + U(PRODUCT) + U(pair)] - ca * sb - cb * da
                 scatter[pair, i] = about - np.float64(da) * np.float64(db) * inverse
                 pair += 1
-
-
-@part(error_model='numpy')
-def place(mean, num, voxel_size, bits, voxel_index, position):
-    """Convert the means of a chunk to positions (num, 3), m."""
-    cell = 1.0 / (1 << bits)
-    half = (1 << (bits - 1)) + 0.5  # a lattice coordinate stands for the middle of its cell
-    for i in range(num):
-        for axis in range(3):
-            inside = (mean[axis, i] + half) * cell
-            position[i, axis] = (voxel_index[i, axis] + inside) * voxel_size
-
-
-@part(error_model='numpy')
-def derive_shape(values, num, moments, unit, shape):
-    """
-    Compute planarity and curvature of a chunk; scale eigenvalues of scatter to covariance.
-
-    values  (3, CHUNK) float64, in: eigenvalues of the scatter, lattice units; out: of the
-            covariance, m^2
-    shape   (2, CHUNK) float64, out: planarity and curvature
-    """
-    for i in range(num):
-        e0, e1, e2 = values[0, i], values[1, i], values[2, i]
-        inverse = 1.0 / ((e0 + e1) + e2)
-        shape[0, i] = 2.0 * (e1 - e0) * inverse  # 0 times inf is nan, as documented
-        shape[1, i] = e0 * inverse
-        scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
-        values[0, i] = e0 * scale
-        values[1, i] = e1 * scale
-        values[2, i] = e2 * scale
-
-
-@part()
-def turn(normals, num, moments, shape):
-    """
-    Turn the normals (3, CHUNK) of a chunk towards the sensor; nan where the planarity is.
-
-    If its direction is unknown or orthogonal to the normal, the component of largest magnitude
-    becomes positive, the first of equal ones.
-    """
-    for i in range(num):
-        nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
-        towards = (nx * moments[V, i] + ny * moments[V + 1, i]) + nz * moments[V + 2, i]
-        y_or_z = ny if abs(ny) >= abs(nz) else nz
-        largest = nx if (abs(nx) >= abs(ny)) & (abs(nx) >= abs(nz)) else y_or_z
-        side = -1.0 if (largest if towards == 0.0 else towards) < 0.0 else 1.0
-        side = math.nan if math.isnan(shape[0, i]) else side
-        normals[0, i] = nx * side
-        normals[1, i] = ny * side
-        normals[2, i] = nz * side
-
-
-@part()
-def write_numbers(numbers, num, out):
-    """Write the first numbers of a chunk, (CHUNK,), to (num,). A slice would compile much more."""
-    for i in range(num):
-        out[i] = numbers[i]
-
-
-@part()
-def write_vectors(vectors, num, out):
-    """
-    Write the vectors of a chunk, (3, CHUNK), to rows (num, 3).
-
-    One array at a time, as every loop here: with several outputs the compiler would have to test
-    too many pairs of arrays for overlap, and does not vectorise the loop.
-    """
-    for i in range(num):
-        out[i, 0], out[i, 1], out[i, 2] = vectors[0, i], vectors[1, i], vectors[2, i]

@@ -71,7 +71,7 @@ def test_surfels_near_a_face_are_merged_with_their_continuation():
     continuation_keys(
         surfels.position,
         surfels.normal,
-        surfels.eigenvalues[:, 0],
+        surfels.eigenvalues,
         surfels.voxel_index,
         limits,
         keys,

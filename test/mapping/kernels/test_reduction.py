@@ -131,7 +131,7 @@ def unpacked(call, sums):
     num = len(sums)
     count, total = np.empty(num, np.int32), np.empty((num, 3), np.int32)
     product = np.empty((num, 6), np.int64)
-    largest = call(unpack_sums, sums, np.empty(0, np.int32), count, total, product)
+    largest = call(unpack_sums, sums, count, total, product)
     assert largest == count.max(initial=0)
     return np.column_stack([count, total, product]).tolist()
 

@@ -11,7 +11,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from surfel_mapper.mapping.kernels.surfels import CHUNK, derive_surfels, MOMENTS, turn, V
+from surfel_mapper.mapping.kernels.surfels import CHUNK, derive_surfels, side_of
 from surfel_mapper.mapping.moments import pack_keys
 from test import reference
 from test.kernels.modes import both
@@ -63,7 +63,7 @@ def test_chosen_rows_are_derived_in_their_order(call, num):
     rows, voxels = random_rows(40, seed=1)
     chosen = np.random.default_rng(2).integers(0, 40, num).astype(np.int32)
     outputs = outputs_for(num)
-    call(derive_surfels, np.array(rows), chosen, 0.25, 16, outputs, np.zeros(1, np.int64))
+    call(derive_surfels, np.array(rows), chosen, 0.25, 16, outputs)
     *quantities, num_points, voxel_index = outputs
     found = dict(zip(NAMES, quantities, strict=True))
     twins = [twin_of(row, voxel, 0.25) for row, voxel in zip(rows, voxels, strict=True)]
@@ -86,7 +86,7 @@ def test_chosen_rows_are_derived_in_their_order(call, num):
 def test_equal_points_spread_by_exactly_0(call, times, place):
     outputs = outputs_for(1)
     rows = np.array([row_of([place], times=times)])
-    call(derive_surfels, rows, np.zeros(1, np.int32), 0.5, 16, outputs, np.zeros(1, np.int64))
+    call(derive_surfels, rows, np.zeros(1, np.int32), 0.5, 16, outputs)
     assert outputs[4].tolist() == [[0.0] * 3]
     assert np.isnan(outputs[1]).all()
 
@@ -102,8 +102,8 @@ def test_eigenvalues_are_exact_to_rounding_for_any_number_of_points(call, times,
         places = rng.integers(-spread, spread + 1, (3, 3)) << (bits - 16)
         row = row_of(places, times=times)
         outputs = outputs_for(1)
-        chosen, claims = np.zeros(1, np.int32), np.zeros(1, np.int64)
-        call(derive_surfels, np.array([row]), chosen, 0.5, bits, outputs, claims)
+        chosen = np.zeros(1, np.int32)
+        call(derive_surfels, np.array([row]), chosen, 0.5, bits, outputs)
         exact = twin_of(row, (0, 0, 0), 1.0)['scatter']
         trace = sum(exact[i][i] for i in range(3))
         norm_sq = sum(exact[i][j] ** 2 for i in range(3) for j in range(3))
@@ -121,7 +121,7 @@ def test_means_are_placed_for_voxels_of_any_level(call, bits):
     places = [(-reach, 0, reach - 1), (-reach, 1, reach - 1)]
     outputs = outputs_for(1)
     rows = np.array([row_of(places, (2, -3, 0))])
-    call(derive_surfels, rows, np.zeros(1, np.int32), 2.0, bits, outputs, np.zeros(1, np.int64))
+    call(derive_surfels, rows, np.zeros(1, np.int32), 2.0, bits, outputs)
     cell = 2.0 / 2**bits
     # half a cell from the faces along x and z, a whole one above the middle along y
     expected = [4.0 + cell / 2, -5.0 + cell, 2.0 - cell / 2]
@@ -147,18 +147,5 @@ def test_means_are_placed_for_voxels_of_any_level(call, bits):
     ],
 )
 def test_normals_turn_towards_the_sensor(call, normal, view, away):
-    moments = np.zeros((MOMENTS, CHUNK))
-    moments[V : V + 3, 0] = view
-    normals = np.zeros((3, CHUNK))
-    normals[:, 0] = normal
-    call(turn, normals, 1, moments, np.zeros((2, CHUNK)))
-    assert normals[:, 0].tolist() == [(-1.0 if away else 1.0) * value for value in normal]
-
-
-@both
-def test_normals_without_a_planarity_are_nan(call):
-    shape = np.array([[0.5, np.nan], [0.1, np.nan]])
-    normals = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
-    call(turn, normals, 2, np.zeros((MOMENTS, CHUNK)), shape)
-    np.testing.assert_array_equal(normals[:, 0], [0.0, 0.0, 1.0])
-    assert np.isnan(normals[:, 1]).all()
+    components = [float(value) for value in (*normal, *view)]
+    assert call(side_of, *components) == (-1.0 if away else 1.0)

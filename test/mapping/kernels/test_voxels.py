@@ -12,10 +12,9 @@ import pytest
 from surfel_mapper.kernels import hashing
 from surfel_mapper.kernels.layout import EMPTIED, KEY, ROW
 from surfel_mapper.mapping.kernels.voxels import (
-    add_part,
+    add_moments,
     find_rows,
-    remove_part,
-    restore_moments,
+    remove_moments,
 )
 from surfel_mapper.mapping.moments import pack_keys, unpack_keys
 from test import reference
@@ -41,16 +40,15 @@ class Memory:
         )
         self.state = np.zeros(hashing.STATE, np.int64)
         self.state[hashing.FREE_ROW] = -1
-        self.state[hashing.END_ROW] = num_rows
-        self.state[hashing.NEXT_SEGMENT], self.state[hashing.END_SEGMENT] = 1, segments
+        self.state[hashing.NEXT_SEGMENT] = 1
 
-    def add(self, moments, version, start=0, weight=1):
+    def add(self, moments, version, start=0):
         """Return the number of rows done, and the changed rows."""
         changed = np.full(len(moments[0]), -1, np.int32)
         done = self.call(
-            add_part,
-            *(moments, weight, self.rows, self.stamps, self.table, self.state),
-            *(2 * version, (start, len(moments[0]), 0), changed),
+            add_moments,
+            *(moments, self.rows, self.stamps, self.table, self.state),
+            *(2 * version, start, changed),
         )
         return done, changed[start:done].tolist()
 
@@ -59,14 +57,14 @@ class Memory:
         self.call(find_rows, keys, self.rows, self.table, self.state, found)
         return found
 
-    def remove(self, moments, version, min_points=1, weight=1, hints=None):
+    def remove(self, moments, version, min_points=1, hints=None):
         """Return the first voxel that does not hold its moments, and the fallen voxels."""
         fallen = np.full((len(moments[0]), 3), -1, np.int32)
         found = self.find(moments[0]) if hints is None else hints
         missing, num = self.call(
-            remove_part,
-            *(moments, weight, self.rows, self.stamps, self.table, self.state),
-            *(2 * version, (0, len(moments[0]), 0), found, min_points, fallen),
+            remove_moments,
+            *(moments, self.rows, self.stamps, self.table, self.state),
+            *(2 * version, found, min_points, fallen),
         )
         if missing < 0:
             empty = [unpacked(row)[0] == 0 for row in self.rows[found]]
@@ -74,14 +72,6 @@ class Memory:
                 self.stamps[found], 2 * version + EMPTIED * np.array(empty)
             )
         return missing, list(map(tuple, fallen[:num].tolist()))
-
-    def restore(self, moments, version, found):
-        """Undo a removal."""
-        self.call(
-            restore_moments,
-            *(moments, 1, self.rows, self.stamps, self.table, self.state),
-            *(2 * version, (0, len(moments[0]), 0), found),
-        )
 
     def content(self):
         """Return the content of the table as a dict."""
@@ -91,14 +81,14 @@ class Memory:
         return dict(zip(voxels, map(unpacked, self.rows[rows]), strict=True))
 
 
-def arrays_of(twin, wide=np.int64):
-    """Return moments as the kernels take them, views summed."""
+def arrays_of(twin):
+    """Return moments as the kernels take them."""
     rows = np.array(list(twin.values()), np.int64).reshape(-1, 13)
     keys = pack_keys(np.array(list(twin), np.int64).reshape(-1, 3))
     return (
         keys,
-        rows[:, 0].astype(wide),
-        rows[:, 1:4].astype(wide),
+        rows[:, 0].copy(),
+        rows[:, 1:4].copy(),
         rows[:, 4:10].copy(),
         rows[:, 10:].copy(),
     )
@@ -112,12 +102,11 @@ def some_moments(seed, num_points=120, spread_m=1.5):
 
 
 @both
-@pytest.mark.parametrize('wide', [np.int32, np.int64])
-def test_moments_are_added_and_subtracted_as_integers(call, wide):
+def test_moments_are_added_and_subtracted_as_integers(call):
     memory, expected = Memory(call, 1000), {}
     twins = [some_moments(seed) for seed in range(6)]
     for version, twin in enumerate(twins, 1):
-        done, changed = memory.add(arrays_of(twin, wide), version)
+        done, changed = memory.add(arrays_of(twin), version)
         reference.add_moments(expected, twin)
         assert done == len(twin)
         assert sorted(changed) == sorted(memory.find(arrays_of(twin)[0]).tolist())
@@ -128,26 +117,13 @@ def test_moments_are_added_and_subtracted_as_integers(call, wide):
 
     for version, twin in enumerate(twins[::-1], 7):
         before = set(expected)
-        missing, fallen = memory.remove(arrays_of(twin, wide), version)
+        missing, fallen = memory.remove(arrays_of(twin), version)
         assert missing == -1
         reference.add_moments(expected, twin, -1)
         assert sorted(fallen) == sorted(before - set(expected))
         assert memory.content() == expected
         assert memory.state[hashing.VOXELS] == len(expected)
     assert memory.state[hashing.POINTS] == 0
-
-
-@both
-def test_a_view_of_one_point_counts_for_all_of_them(call):
-    voxels = {(0, 0, 0): [3, *range(9), 5, -6, 7], (1, 2, 3): [1, *range(9), -1, 0, 1]}
-    memory = Memory(call, 10)
-    keys, count, total, product, view = arrays_of(voxels)
-    moments = (keys, count.astype(np.int32), total, product, view.astype(np.int16))
-    memory.add(moments, 1, weight=0)
-    assert memory.content()[0, 0, 0][10:] == [15, -18, 21]
-    assert memory.remove(moments, 2, weight=1)[0] == 0
-    assert memory.remove(moments, 2, weight=0)[0] == -1
-    assert memory.content() == {}
 
 
 @both
@@ -164,7 +140,6 @@ def test_adding_stops_without_room_and_resumes(call):
     assert done == len(twin) - 40
     memory.rows = np.concatenate([memory.rows, np.full((40, ROW), -5)])
     memory.stamps = np.concatenate([memory.stamps, np.full(40, 5, np.uint32)])
-    memory.state[hashing.END_ROW] += 40
     done, changed = memory.add(moments, 2, start=done)
 
     reference.add_moments(expected, twin)
@@ -219,25 +194,6 @@ def test_a_failed_removal_names_the_voxel_and_changes_nothing(call, column):
     np.testing.assert_array_equal(memory.rows, rows)
     np.testing.assert_array_equal(memory.stamps, stamps)
     np.testing.assert_array_equal(memory.state, state)
-
-
-@both
-def test_a_removal_is_undone_in_the_same_rows(call):
-    memory, twin, other = Memory(call, 400), some_moments(4), some_moments(5)
-    memory.add(arrays_of(twin), 1)
-    memory.add(arrays_of({v: other[v] for v in list(other)[::2]}), 2)
-    memory.remove(arrays_of({v: other[v] for v in list(other)[::4]}), 3)  # leaves free rows
-    content, rows, state = memory.content(), memory.rows.copy(), memory.state.copy()
-    found = memory.find(arrays_of(twin)[0])
-    assert memory.remove(arrays_of(twin), 4, hints=found)[0] == -1
-    assert memory.content() != content
-    memory.restore(arrays_of(twin), 5, found)
-    assert memory.content() == content
-    np.testing.assert_array_equal(memory.state, state)
-    np.testing.assert_array_equal(memory.stamps[found], 10)
-    np.testing.assert_array_equal(memory.find(arrays_of(twin)[0]), found)
-    held = memory.find(arrays_of(content)[0])
-    np.testing.assert_array_equal(memory.rows[held], rows[held])
 
 
 @both
