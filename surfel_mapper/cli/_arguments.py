@@ -9,12 +9,8 @@ On its own because no verb imports another.
 from __future__ import annotations
 
 import argparse
-from difflib import get_close_matches
 import math
 import re
-from typing import NoReturn
-
-from surfel_mapper.errors import one_line
 
 CUT, APART, INTERRUPTED = 3, 4, 130
 """
@@ -28,39 +24,6 @@ DIGITS = re.compile('[0-9]{1,18}')
 
 class UsageError(Exception):
     """Options that do not go together; exit code 2."""
-
-
-class Parser(argparse.ArgumentParser):
-    """Parser that names the nearest option or verb for one that does not exist."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print usage and message, with the nearest known words, and exit with 2."""
-        found = re.match(r"argument VERB: invalid choice: '([^']*)'", message)
-        if found:
-            actions = (a for a in self._actions if isinstance(a, argparse._SubParsersAction))
-            verbs = [verb for action in actions for verb in action.choices]
-            message = (
-                f'no verb {found[1]!r}{nearest(found[1], verbs) or ";"} verbs: {", ".join(verbs)}'
-            )
-        found = re.search(r": invalid choice: '([^']*)' \(choose from (.*)\)$", message)
-        if found:
-            message += nearest(found[1], re.findall(r"[^', ]+", found[2]))
-        super().error(one_line(message))
-
-    def refuse_unknown(self, words: list[str]) -> NoReturn:
-        """Exit with 2 for words that are no arguments, naming the nearest option of each."""
-        known = [option for action in self._actions for option in action.option_strings]
-        options = [word.partition('=')[0] for word in words if word.startswith('-')]
-        if not options:
-            self.error(f'too many arguments: {" ".join(words)}')
-        self.error('; '.join(f'no option {word}{nearest(word, known)}' for word in options))
-
-
-def nearest(word: str, known: list[str]) -> str:
-    """Return a question with the nearest known word; empty if none is near."""
-    bare = {each.lstrip('-'): each for each in known}  # dashes alone would look alike
-    close = get_close_matches(word.lstrip('-'), bare, n=1)
-    return f', did you mean {bare[close[0]]}?' if close else ''
 
 
 def real(text: str) -> float:

@@ -8,10 +8,10 @@ A verb is a module of this folder with SUMMARY and EXAMPLE (str), ``add_argument
 loads no ROS. A verb prints its result on stdout and everything else on stderr. Arguments after
 --ros-args are ``args.ros_args``. Modules with a leading underscore are shared by verbs.
 
-Exit code 0: done; 1: refused, with a message; 2: usage; 3: done, but the bag is cut off, with
---strict; 4: done, but some scans have no certain place on the map, or their surroundings seem to
-move along; 130: interrupted, by Ctrl-C or SIGTERM alike, as a replay writes its map after both. A
-page of ``view`` and the node end with 0 then.
+Exit code 0: done; 1: refused, with a message; 2: usage, also of no verb at all; 3: done, but the
+bag is cut off, with --strict; 4: done, but some scans have no certain place on the map, or their
+surroundings seem to move along; 130: interrupted, by Ctrl-C or SIGTERM alike, as a replay writes
+its map after both. A page of ``view`` and the node end with 0 then.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ import sys
 from types import ModuleType
 
 import surfel_mapper
-from surfel_mapper.cli._arguments import Parser, UsageError
+from surfel_mapper.cli._arguments import UsageError
+from surfel_mapper.cli._parser import Parser
 from surfel_mapper.cli._progress import interrupted_by_sigterm
 from surfel_mapper.errors import LineFormatter, one_line, SurfelMapperError
 
@@ -62,9 +63,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     replace_closed_streams()
     arguments, ros_args = without_ros_args(sys.argv[1:] if argv is None else argv)
-    args, unknown = parser_of(arguments).parse_known_args(arguments)
-    if unknown:
-        args.parser.refuse_unknown(unknown)
+    parser = parser_of(arguments)
+    if not arguments:  # wrong usage: a script with an empty variable must not seem to succeed
+        parser.print_help(sys.stderr)
+        parser.exit(2)
+    args, surplus = parser.parse_known_args(arguments)
+    if surplus:
+        args.parser.error(f'too many arguments: {" ".join(surplus)}')
     args.ros_args = ros_args
     handler = logging.StreamHandler()
     handler.setFormatter(LineFormatter(f'surfel-mapper {args.verb}: %(message)s'))
