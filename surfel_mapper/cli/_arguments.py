@@ -9,8 +9,11 @@ On its own because no verb imports another.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterable, Sequence
 import math
 import re
+
+from surfel_mapper.cli._parser import nearest
 
 CUT, APART, INTERRUPTED = 3, 4, 130
 """
@@ -78,6 +81,54 @@ def seconds(text: str) -> float:
     if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f'{text!r}, expected seconds, zero or more')
     return value
+
+
+def add_overwrite(parser: argparse._ActionsContainer) -> None:
+    """Declare the option to write where files are."""
+    parser.add_argument(
+        '--overwrite',
+        action='store_true',
+        help='replace files that exist; without it a directory must be new or empty',
+    )
+
+
+def add_formats(
+    parser: argparse._ActionsContainer,
+    names: Sequence[str],
+    default: Sequence[str],
+    known_formats: Callable[[], Iterable[str]] | None = None,
+) -> None:
+    """
+    Declare the option for the formats to write; None if it is not used.
+
+    Parameters
+    ----------
+    parser : ArgumentParser or group of one
+        Receives the option.
+    names, default : sequence of str
+        Formats that the help lists, and those that are written without the option.
+    known_formats : callable, optional
+        Returns all formats, if packages that are not loaded for the help add some.
+
+    """
+
+    def formats(text: str) -> tuple[str, ...]:
+        chosen = tuple(text.split(','))
+        known = list(names if known_formats is None else known_formats())
+        for name in chosen:
+            if name not in known:
+                raise argparse.ArgumentTypeError(
+                    f'{name!r}, expected some of {", ".join(known)}, separated by commas'
+                    f'{nearest(name, known)}'
+                )
+        return chosen
+
+    parser.add_argument(
+        '--formats',
+        type=formats,
+        metavar='LIST',
+        help=f'comma-separated, of {", ".join(names)} ({",".join(default)})',
+    )
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:

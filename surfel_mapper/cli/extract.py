@@ -10,6 +10,7 @@ voxels are half as large as those of the map.
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 import json
 from pathlib import Path
 import sys
@@ -18,8 +19,10 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.cli._arguments import real
+from surfel_mapper.cli._arguments import add_formats, add_overwrite, real
+from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._verbosity import add_verbosity
 
 if TYPE_CHECKING:
     from surfel_mapper.models.multi_model import MultiModel
@@ -32,6 +35,9 @@ MAPS = ('.npz', '.parquet')
 
 FORMATS = ('json', 'obj', 'parquet', 'dxf', 'step')
 
+DEFAULT = ('json', 'obj')
+"""Formats without --formats."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -41,15 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='CLOUD|MAP',
         help='.ply, .pcd, .bin, .las, .laz; or a map: .npz, .parquet, output of a replay',
     )
-    parser.add_argument('--output', type=Path, required=True, metavar='DIR', help='directory')
     parser.add_argument(
-        '--formats',
-        nargs='+',
-        choices=FORMATS,
-        default=('json', 'obj'),
-        metavar='FORMAT',
-        help=f'of {", ".join(FORMATS)}; default json obj',
+        '-o', '--output', type=Path, required=True, metavar='DIR', help='directory to write to'
     )
+    add_overwrite(parser)
+    add_formats(parser, FORMATS, DEFAULT)
     parser.add_argument(
         '--voxel-size', type=real, metavar='M', help='m (0.04; for a map half its voxel size)'
     )
@@ -77,13 +79,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=('X', 'Y', 'Z'),
         help='position of the sensor; default: the origin, or above the middle of a map',
     )
+    add_open(parser, 'models.png')
     parser.add_argument('--json', action='store_true', help='print the figures as JSON')
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Fit models, write the files, report."""
     from surfel_mapper.config import ModelsConfig
-    from surfel_mapper.files.atomic import make_directory
+    from surfel_mapper.files.atomic import check_free, make_directory
     from surfel_mapper.files.model_files import write_models
     from surfel_mapper.kernels.compiling import before_compiling
     from surfel_mapper.layers.drawings import PointsPicture
@@ -91,7 +95,8 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.models import evaluate, fit
     from surfel_mapper.viz.drawings import draw_points
 
-    with before_compiling(announce):
+    check_free(args.output, args.overwrite)
+    with nullcontext() if args.quiet else before_compiling(announce):
         points, voxel_size_m, viewpoint, origin_m = read(args)
         config = ModelsConfig(
             voxel_size_m=voxel_size_m,
@@ -101,13 +106,15 @@ def run(args: argparse.Namespace) -> int:
         )
         model = fit(points, config, viewpoint)
     make_directory(args.output)
-    write_models(args.output, model.translated(origin_m), args.formats)
+    write_models(args.output, model.translated(origin_m), args.formats or DEFAULT)
     picture = PointsPicture(
         file_name='models.png', panels=panels_of(points, model), viewpoint=viewpoint
     )
     draw_points(args.output / picture.file_name, picture)
     content = figures(model, evaluate(model, points), len(points))
     show_lines(json.dumps(content) if args.json else report(content))
+    if args.open:
+        open_file(args.output / picture.file_name)
     return 0
 
 

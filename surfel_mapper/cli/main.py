@@ -29,6 +29,7 @@ import surfel_mapper
 from surfel_mapper.cli._arguments import UsageError
 from surfel_mapper.cli._parser import Parser
 from surfel_mapper.cli._progress import interrupted_by_sigterm
+from surfel_mapper.cli._verbosity import set_log_level
 from surfel_mapper.errors import LineFormatter, one_line, SurfelMapperError
 
 VERBS = (
@@ -74,6 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     handler = logging.StreamHandler()
     handler.setFormatter(LineFormatter(f'surfel-mapper {args.verb}: %(message)s'))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    set_log_level(args)
     try:
         ends_early = interrupted_by_sigterm(ends_process=argv is None)
         with nullcontext() if args.verb in WITH_SIGNALS else ends_early:

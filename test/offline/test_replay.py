@@ -216,7 +216,8 @@ def test_the_default_output_can_be_read_back(bag, tmp_path, capsys, caplog):
     assert main(['evaluate', str(out), '--truth', str(out / 'map.npz')]) == 0
     assert 'equal to the bit' in capsys.readouterr().out
     for path in (out, out / 'map.npz'):
-        assert main(['extract', str(path), '--output', str(tmp_path / 'models')]) == 0
+        models = ['--output', str(tmp_path / 'models'), '--overwrite']
+        assert main(['extract', str(path), *models]) == 0
     assert main(['extract', str(out / 'map.ply'), '--output', str(tmp_path / 'models')]) == 1
     assert 'surfels of a map, not points of a cloud' in capsys.readouterr().err
 
