@@ -62,6 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         The arguments; those of the process without.
 
     """
+    if '_ARGCOMPLETE' in os.environ:
+        complete()
     replace_closed_streams()
     arguments, ros_args = without_ros_args(sys.argv[1:] if argv is None else argv)
     parser = parser_of(arguments)
@@ -97,6 +99,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f'surfel-mapper {args.verb}: interrupted', file=sys.stderr)
         return 130
+
+
+def complete() -> None:
+    """Print the words that may follow those in COMP_LINE to a shell that asks for them; exit."""
+    import argcomplete
+
+    argcomplete.autocomplete(parser_of([]), always_complete_options=False)
 
 
 def replace_closed_streams() -> None:
