@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from contextlib import nullcontext
 import json
+import logging
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
@@ -29,9 +30,11 @@ if TYPE_CHECKING:
 
 SUMMARY = 'Find planes, curved surfaces and Gaussians in a cloud or a map.'
 
-EXAMPLE = 'surfel-mapper extract scan.pcd --voxel-size 0.02 --output models/'
+EXAMPLE = 'surfel-mapper extract scan.pcd --voxel-size 0.02 --formats json,obj -o models/ --open'
 
 MAPS = ('.npz', '.parquet')
+
+_log = logging.getLogger(__name__)
 
 FORMATS = ('json', 'obj', 'parquet', 'dxf', 'step')
 
@@ -98,6 +101,7 @@ def run(args: argparse.Namespace) -> int:
     check_free(args.output, args.overwrite)
     with nullcontext() if args.quiet else before_compiling(announce):
         points, voxel_size_m, viewpoint, origin_m = read(args)
+        _log.info('%s: %d points, voxels of %g m', args.cloud, len(points), voxel_size_m)
         config = ModelsConfig(
             voxel_size_m=voxel_size_m,
             profile=args.profile,

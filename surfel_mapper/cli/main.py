@@ -22,6 +22,7 @@ from contextlib import nullcontext
 from importlib import import_module
 import logging
 import os
+import platform
 import sys
 from types import ModuleType
 
@@ -49,6 +50,8 @@ VERBS = (
 WITH_SIGNALS = ('node', 'view')
 """Verbs that handle SIGTERM themselves."""
 
+_log = logging.getLogger('surfel_mapper.cli')  # __name__ is __main__ with `python -m`
+
 EPILOG = 'surfel-mapper VERB --help shows the options of a verb and an example.'
 
 
@@ -65,19 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if '_ARGCOMPLETE' in os.environ:
         complete()
     replace_closed_streams()
-    arguments, ros_args = without_ros_args(sys.argv[1:] if argv is None else argv)
-    parser = parser_of(arguments)
-    if not arguments:  # wrong usage: a script with an empty variable must not seem to succeed
-        parser.print_help(sys.stderr)
-        parser.exit(2)
-    args, surplus = parser.parse_known_args(arguments)
-    if surplus:
-        args.parser.error(f'too many arguments: {" ".join(surplus)}')
-    args.ros_args = ros_args
-    handler = logging.StreamHandler()
-    handler.setFormatter(LineFormatter(f'surfel-mapper {args.verb}: %(message)s'))
-    logging.basicConfig(handlers=[handler], level=logging.WARNING)
-    set_log_level(args)
+    args = parsed(sys.argv[1:] if argv is None else argv)
+    start_logging(args)
     try:
         ends_early = interrupted_by_sigterm(ends_process=argv is None)
         with nullcontext() if args.verb in WITH_SIGNALS else ends_early:
@@ -99,6 +91,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f'surfel-mapper {args.verb}: interrupted', file=sys.stderr)
         return 130
+
+
+def parsed(argv: Sequence[str]) -> argparse.Namespace:
+    """Return the arguments of a verb; exit with 2 if they are wrong, or there are none."""
+    arguments, ros_args = without_ros_args(argv)
+    parser = parser_of(arguments)
+    if not arguments:  # wrong usage: a script with an empty variable must not seem to succeed
+        parser.print_help(sys.stderr)
+        parser.exit(2)
+    args, surplus = parser.parse_known_args(arguments)
+    if surplus:
+        args.parser.error(f'too many arguments: {" ".join(surplus)}')
+    args.ros_args = ros_args
+    return args
+
+
+def start_logging(args: argparse.Namespace) -> None:
+    """Log to stderr, as much as the arguments ask for; begin with the version."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(LineFormatter(f'surfel-mapper {args.verb}: %(message)s'))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    set_log_level(args)
+    python = platform.python_version()
+    _log.info('surfel_mapper %s, Python %s', surfel_mapper.__version__, python)
 
 
 def complete() -> None:

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 SUMMARY = 'Map a bag, or a folder of scans, and write the map, a picture and figures.'
 
-EXAMPLE = 'surfel-mapper replay street.mcap --topic /points --config vehicle.yaml --output street/'
+EXAMPLE = 'surfel-mapper replay street.mcap --config my.yaml --voxel-size 0.2 -o street/ --open'
 
 ONE_PROCESS = ('window', 'align', 'poses_out', 'truth', 'view', 'rrd', 'formats')
 """Options that ask for the whole map, or all scans in order, in one process."""
