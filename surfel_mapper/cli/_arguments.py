@@ -96,7 +96,7 @@ def add_formats(
     parser: argparse._ActionsContainer,
     names: Sequence[str],
     default: Sequence[str],
-    known_formats: Callable[[], Iterable[str]] | None = None,
+    all_formats: Callable[[], Iterable[str]] | None = None,
 ) -> None:
     """
     Declare the option for the formats to write; None if it is not used.
@@ -107,19 +107,19 @@ def add_formats(
         Receives the option.
     names, default : sequence of str
         Formats that the help lists, and those that are written without the option.
-    known_formats : callable, optional
+    all_formats : callable, optional
         Returns all formats, if packages that are not loaded for the help add some.
 
     """
 
     def formats(text: str) -> tuple[str, ...]:
         chosen = tuple(text.split(','))
-        known = list(names if known_formats is None else known_formats())
+        accepted = list(names if all_formats is None else all_formats())
         for name in chosen:
-            if name not in known:
+            if name not in accepted:
                 raise argparse.ArgumentTypeError(
-                    f'{name!r}, expected some of {", ".join(known)}, separated by commas'
-                    f'{nearest(name, known)}'
+                    f'{name!r}, expected some of {", ".join(accepted)}, separated by commas'
+                    f'{nearest(name, accepted)}'
                 )
         return chosen
 

@@ -52,7 +52,10 @@ WITH_SIGNALS = ('node', 'view')
 
 _log = logging.getLogger('surfel_mapper.cli')  # __name__ is __main__ with `python -m`
 
-EPILOG = 'surfel-mapper VERB --help shows the options of a verb and an example.'
+EPILOG = (
+    'surfel-mapper VERB --help shows the options of a verb and an example. Tab completes them '
+    'after `eval "$(register-python-argcomplete surfel-mapper)"`.'
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
