@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from pathlib import Path
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -64,9 +65,11 @@ def run(args: argparse.Namespace) -> int:
     """Simulate and record a drive, and report the counts."""
     from tqdm import tqdm
 
+    from surfel_mapper.files.atomic import check_free
     from surfel_mapper.scan import Scan
     from surfel_mapper.simulation import record
 
+    check_free(Path(args.output), args.overwrite)  # the writer would name the full path
     try:
         simulation = simulation_of(args)
     except ConfigError as error:  # the options are its only settings
