@@ -33,6 +33,7 @@ REQUIRED = [
     'rosbags>=0.11.7,<0.12',
     'PyYAML>=6.0',  # settings
     'tqdm>=4.66',  # progress on a terminal
+    'argcomplete>=3.1',  # Tab completes verbs, options and settings; ros2 itself needs it
     'matplotlib>=3.6',  # map.png
     'pillow>=10',  # images packed as JPEG and PNG; a tenth of opencv, and matplotlib brings it
 ]

@@ -45,7 +45,7 @@ def main() -> int:
             "`pip install '.[ros]'` installs it on Linux on x86_64."
         )
         say('3. The bag is mapped, without ROS.')
-        call('replay', bag, '--config', SETTINGS, '--window', '--output', offline)
+        call('replay', bag, '--config', SETTINGS, '--window', '--output', offline, '--overwrite')
         print_files(offline)
         return 0
     say('2. The node maps the bag while it is played, as it would on a robot.')
@@ -57,7 +57,7 @@ def main() -> int:
         mapped = save_map()
 
     say('3. The bag is mapped once more, by itself.')
-    call('replay', bag, '--config', SETTINGS, '--window', '--output', offline)
+    call('replay', bag, '--config', SETTINGS, '--window', '--output', offline, '--overwrite')
     summary = json.loads((offline / 'summary.json').read_text(encoding='utf-8'))
 
     say('4. Are the maps equal?')

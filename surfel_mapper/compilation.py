@@ -31,7 +31,7 @@ class CompileStage(NamedTuple):
 
 class Progress:
     """
-    What this process has compiled, and compiles now.
+    State of the compilations of this process.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Progress:
 
 
 PROGRESS = Progress()
-"""That of this process."""
+"""State of this process."""
 
 
 def clock() -> float:

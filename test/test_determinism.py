@@ -66,6 +66,7 @@ def replayed(bag, directory, *, interpreted=False, **settings):
     config = directory / 'config.yaml'
     config.write_text(json.dumps({**SETTINGS, **settings}))
     command = ['replay', bag, '--window', '--config', config, '--output', directory / 'map']
+    command.append('--overwrite')
     command = [*map(str, command)]
     if interpreted:
         done = subprocess.run(

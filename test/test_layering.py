@@ -46,6 +46,7 @@ PACKAGE_LEVEL = LEVEL['offline']
 """The package itself exports names of up to this level."""
 
 HOMES = {
+    'argcomplete': ('cli/main',),
     'backports': ('bags/',),  # zstd
     'bond': ('ros/',),
     'builtin_interfaces': ('ros/',),

@@ -24,7 +24,7 @@ import numpy as np
 from surfel_mapper.bags._rosbags import jazzy_types, latched_profile, new_writer
 from surfel_mapper.bags.paths import is_storage, METADATA
 from surfel_mapper.errors import BagError
-from surfel_mapper.files.atomic import sync_directory
+from surfel_mapper.files.atomic import sync_directory, use_of
 from surfel_mapper.messages.pointcloud2 import CloudBytes
 from surfel_mapper.messages.poses import StampedPose
 
@@ -51,8 +51,8 @@ class BagWriter:
     storage : str
         mcap or sqlite3.
     overwrite : bool
-        Whether to replace a bag, or an empty directory, of that name. A directory with other
-        files is never replaced.
+        Whether to replace a bag of that name. An empty directory is replaced in any case, one
+        with other files never.
 
     Attributes
     ----------
@@ -275,10 +275,11 @@ class BagWriter:
 
     def _check_free(self) -> None:
         """Raise BagError if the path exists and may not be replaced."""
-        if not self.path.exists() and not self.path.is_symlink():
+        use = use_of(self.path)
+        if not use:
             return
         if not self.overwrite:
-            raise BagError(f'{self.path}: exists; name another directory or overwrite it')
+            raise BagError(f'{self.path}: {use}')
         if self.path.is_symlink() or not self.path.is_dir():
             raise BagError(f'{self.path}: not a directory, so not a bag to overwrite')
         if not (self.path / METADATA).exists() and any(self.path.iterdir()):

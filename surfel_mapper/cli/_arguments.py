@@ -9,12 +9,11 @@ On its own because no verb imports another.
 from __future__ import annotations
 
 import argparse
-from difflib import get_close_matches
+from collections.abc import Callable, Iterable, Sequence
 import math
 import re
-from typing import NoReturn
 
-from surfel_mapper.errors import one_line
+from surfel_mapper.cli._parser import nearest
 
 CUT, APART, INTERRUPTED = 3, 4, 130
 """
@@ -28,39 +27,6 @@ DIGITS = re.compile('[0-9]{1,18}')
 
 class UsageError(Exception):
     """Options that do not go together; exit code 2."""
-
-
-class Parser(argparse.ArgumentParser):
-    """Parser that names the nearest option or verb for one that does not exist."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print usage and message, with the nearest known words, and exit with 2."""
-        found = re.match(r"argument VERB: invalid choice: '([^']*)'", message)
-        if found:
-            actions = (a for a in self._actions if isinstance(a, argparse._SubParsersAction))
-            verbs = [verb for action in actions for verb in action.choices]
-            message = (
-                f'no verb {found[1]!r}{nearest(found[1], verbs) or ";"} verbs: {", ".join(verbs)}'
-            )
-        found = re.search(r": invalid choice: '([^']*)' \(choose from (.*)\)$", message)
-        if found:
-            message += nearest(found[1], re.findall(r"[^', ]+", found[2]))
-        super().error(one_line(message))
-
-    def refuse_unknown(self, words: list[str]) -> NoReturn:
-        """Exit with 2 for words that are no arguments, naming the nearest option of each."""
-        known = [option for action in self._actions for option in action.option_strings]
-        options = [word.partition('=')[0] for word in words if word.startswith('-')]
-        if not options:
-            self.error(f'too many arguments: {" ".join(words)}')
-        self.error('; '.join(f'no option {word}{nearest(word, known)}' for word in options))
-
-
-def nearest(word: str, known: list[str]) -> str:
-    """Return a question with the nearest known word; empty if none is near."""
-    bare = {each.lstrip('-'): each for each in known}  # dashes alone would look alike
-    close = get_close_matches(word.lstrip('-'), bare, n=1)
-    return f', did you mean {bare[close[0]]}?' if close else ''
 
 
 def real(text: str) -> float:
@@ -115,6 +81,54 @@ def seconds(text: str) -> float:
     if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f'{text!r}, expected seconds, zero or more')
     return value
+
+
+def add_overwrite(parser: argparse._ActionsContainer) -> None:
+    """Declare the option to write where files are."""
+    parser.add_argument(
+        '--overwrite',
+        action='store_true',
+        help='replace files that exist; without it a directory must be new or empty',
+    )
+
+
+def add_formats(
+    parser: argparse._ActionsContainer,
+    names: Sequence[str],
+    default: Sequence[str],
+    all_formats: Callable[[], Iterable[str]] | None = None,
+) -> None:
+    """
+    Declare the option for the formats to write; None if it is not used.
+
+    Parameters
+    ----------
+    parser : ArgumentParser or group of one
+        Receives the option.
+    names, default : sequence of str
+        Formats that the help lists, and those that are written without the option.
+    all_formats : callable, optional
+        Returns all formats, if packages that are not loaded for the help add some.
+
+    """
+
+    def formats(text: str) -> tuple[str, ...]:
+        chosen = tuple(text.split(','))
+        accepted = list(names if all_formats is None else all_formats())
+        for name in chosen:
+            if name not in accepted:
+                raise argparse.ArgumentTypeError(
+                    f'{name!r}, expected some of {", ".join(accepted)}, separated by commas'
+                    f'{nearest(name, accepted)}'
+                )
+        return chosen
+
+    parser.add_argument(
+        '--formats',
+        type=formats,
+        metavar='LIST',
+        help=f'comma-separated, of {", ".join(names)} ({",".join(default)})',
+    )
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:

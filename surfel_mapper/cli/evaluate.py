@@ -16,6 +16,7 @@ from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import positive_float, positive_int
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._verbosity import add_verbosity
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import finite_or_none
 
@@ -84,6 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='move the map onto the truth first, if frames differ (trajectories always move)',
     )
     add('--json', action='store_true', help='print as JSON')
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
@@ -18,19 +19,27 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.cli._arguments import real
+from surfel_mapper.cli._arguments import add_formats, add_overwrite, real
+from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._verbosity import add_verbosity
+from surfel_mapper.compilation import stage
 
 if TYPE_CHECKING:
     from surfel_mapper.models.multi_model import MultiModel
 
 SUMMARY = 'Find planes, curved surfaces and Gaussians in a cloud or a map.'
 
-EXAMPLE = 'surfel-mapper extract scan.pcd --voxel-size 0.02 --output models/'
+EXAMPLE = 'surfel-mapper extract scan.pcd --voxel-size 0.02 --formats json,obj -o models/ --open'
 
 MAPS = ('.npz', '.parquet')
 
+_log = logging.getLogger(__name__)
+
 FORMATS = ('json', 'obj', 'parquet', 'dxf', 'step')
+
+DEFAULT = ('json', 'obj')
+"""Formats without --formats."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,15 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='CLOUD|MAP',
         help='.ply, .pcd, .bin, .las, .laz; or a map: .npz, .parquet, output of a replay',
     )
-    parser.add_argument('--output', type=Path, required=True, metavar='DIR', help='directory')
     parser.add_argument(
-        '--formats',
-        nargs='+',
-        choices=FORMATS,
-        default=('json', 'obj'),
-        metavar='FORMAT',
-        help=f'of {", ".join(FORMATS)}; default json obj',
+        '-o', '--output', type=Path, required=True, metavar='DIR', help='directory to write to'
     )
+    add_overwrite(parser)
+    add_formats(parser, FORMATS, DEFAULT)
     parser.add_argument(
         '--voxel-size', type=real, metavar='M', help='m (0.04; for a map half its voxel size)'
     )
@@ -77,48 +82,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=('X', 'Y', 'Z'),
         help='position of the sensor; default: the origin, or above the middle of a map',
     )
+    add_open(parser, 'models.png')
     parser.add_argument('--json', action='store_true', help='print the figures as JSON')
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Fit models, write the files, report."""
     from surfel_mapper.config import ModelsConfig
-    from surfel_mapper.files.atomic import make_directory
+    from surfel_mapper.files.atomic import check_free, make_directory
     from surfel_mapper.files.model_files import write_models
-    from surfel_mapper.kernels.compiling import before_compiling
     from surfel_mapper.layers.drawings import PointsPicture
     from surfel_mapper.layers.models.pictures import panels_of
     from surfel_mapper.models import evaluate, fit
     from surfel_mapper.viz.drawings import draw_points
 
-    with before_compiling(announce):
+    check_free(args.output, args.overwrite)
+    with stage(1, 2, 'reading'):
         points, voxel_size_m, viewpoint, origin_m = read(args)
-        config = ModelsConfig(
-            voxel_size_m=voxel_size_m,
-            profile=args.profile,
-            noise_m=args.noise,
-            noise_per_range_sq=args.noise_per_range_sq,
-        )
+    _log.info('%s: %d points, voxels of %g m', args.cloud, len(points), voxel_size_m)
+    config = ModelsConfig(
+        voxel_size_m=voxel_size_m,
+        profile=args.profile,
+        noise_m=args.noise,
+        noise_per_range_sq=args.noise_per_range_sq,
+    )
+    with stage(2, 2, 'fitting'):
         model = fit(points, config, viewpoint)
     make_directory(args.output)
-    write_models(args.output, model.translated(origin_m), args.formats)
+    write_models(args.output, model.translated(origin_m), args.formats or DEFAULT)
     picture = PointsPicture(
         file_name='models.png', panels=panels_of(points, model), viewpoint=viewpoint
     )
     draw_points(args.output / picture.file_name, picture)
     content = figures(model, evaluate(model, points), len(points))
     show_lines(json.dumps(content) if args.json else report(content))
+    if args.open:
+        open_file(args.output / picture.file_name)
     return 0
-
-
-def announce() -> None:
-    """Say on stderr why the first fit takes long."""
-    print(
-        'surfel-mapper extract: compiling kernels, about two minutes of processor time, once per '
-        'machine',
-        file=sys.stderr,
-        flush=True,
-    )
 
 
 def read(

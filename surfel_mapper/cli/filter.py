@@ -10,7 +10,10 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from surfel_mapper.cli._arguments import add_overwrite
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._settings import add_settings, configured
+from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
 
 if TYPE_CHECKING:
     from surfel_mapper.offline.filtering import FilteredClouds
@@ -33,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='clouds (.ply, .pcd, .bin), folders of them, or bags',
     )
     parser.add_argument(
+        '-o',
         '--output',
         required=True,
         type=Path,
@@ -46,27 +50,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest='topics',
         help='of a bag: filter the clouds of this topic only; may be repeated',
     )
-    parser.add_argument(
-        '--config',
-        type=Path,
-        metavar='FILE',
-        help='configuration whose frames.base_to_sensor is the pose of the sensor on the robot',
+    add_settings(
+        parser,
+        'configuration whose frames.base_to_sensor is the pose of the sensor on the robot',
+        maps=False,
     )
-    parser.add_argument('--overwrite', action='store_true', help='replace existing outputs')
+    add_overwrite(parser)
     parser.add_argument('--json', action='store_true', help='print the report as JSON')
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Filter, report."""
-    from surfel_mapper.cli._progress import progress
-    from surfel_mapper.config import load_config
     from surfel_mapper.filters.chain import Chain
     from surfel_mapper.geometry import pose_matrix
     from surfel_mapper.offline.filtering import filter_clouds
 
     chain = Chain.load(args.chain)
-    mount = load_config(args.config).frames.mount_of('')
-    with progress('filter', 'scan') as show:
+    mount = configured(args).frames.mount_of('')
+    with shown_progress(args, 'scan') as show:
         done = filter_clouds(
             chain,
             args.inputs,

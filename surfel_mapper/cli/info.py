@@ -19,7 +19,7 @@ from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import CUT
 from surfel_mapper.cli._output import printable, show_lines
-from surfel_mapper.cli._progress import progress
+from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
 from surfel_mapper.errors import escaped
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--strict', action='store_true', help='exit with 3 if the bag is cut off or damaged'
     )
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     with BagReader(args.bag) as reader:
         total = reader.topics.num_messages(surveyed_topics(reader))
         read = itertools.count(1)
-        with progress('info', 'message') as show:
+        with shown_progress(args, 'message') as show:
             found = survey(reader, lambda: show(next(read), total))
         made = offers(found)
         content = {**as_mapping(reader, found, made), 'replay': chosen(args.bag)}

@@ -8,10 +8,10 @@ A verb is a module of this folder with SUMMARY and EXAMPLE (str), ``add_argument
 loads no ROS. A verb prints its result on stdout and everything else on stderr. Arguments after
 --ros-args are ``args.ros_args``. Modules with a leading underscore are shared by verbs.
 
-Exit code 0: done; 1: refused, with a message; 2: usage; 3: done, but the bag is cut off, with
---strict; 4: done, but some scans have no certain place on the map, or their surroundings seem to
-move along; 130: interrupted, by Ctrl-C or SIGTERM alike, as a replay writes its map after both. A
-page of ``view`` and the node end with 0 then.
+Exit code 0: done; 1: refused, with a message; 2: usage, also of no verb at all; 3: done, but the
+bag is cut off, with --strict; 4: done, but some scans have no certain place on the map, or their
+surroundings seem to move along; 130: interrupted, by Ctrl-C or SIGTERM alike, as a replay writes
+its map after both. A page of ``view`` and the node end with 0 then.
 """
 
 from __future__ import annotations
@@ -22,12 +22,15 @@ from contextlib import nullcontext
 from importlib import import_module
 import logging
 import os
+import platform
 import sys
 from types import ModuleType
 
 import surfel_mapper
-from surfel_mapper.cli._arguments import Parser, UsageError
+from surfel_mapper.cli._arguments import UsageError
+from surfel_mapper.cli._parser import Parser
 from surfel_mapper.cli._progress import interrupted_by_sigterm
+from surfel_mapper.cli._verbosity import set_log_level
 from surfel_mapper.errors import LineFormatter, one_line, SurfelMapperError
 
 VERBS = (
@@ -47,7 +50,12 @@ VERBS = (
 WITH_SIGNALS = ('node', 'view')
 """Verbs that handle SIGTERM themselves."""
 
-EPILOG = 'surfel-mapper VERB --help shows the options of a verb and an example.'
+_log = logging.getLogger('surfel_mapper.cli')  # __name__ is __main__ with `python -m`
+
+EPILOG = (
+    'surfel-mapper VERB --help shows the options of a verb and an example. Tab completes them '
+    'after `eval "$(register-python-argcomplete surfel-mapper)"`.'
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -60,15 +68,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         The arguments; those of the process without.
 
     """
+    if '_ARGCOMPLETE' in os.environ:
+        complete()
     replace_closed_streams()
-    arguments, ros_args = without_ros_args(sys.argv[1:] if argv is None else argv)
-    args, unknown = parser_of(arguments).parse_known_args(arguments)
-    if unknown:
-        args.parser.refuse_unknown(unknown)
-    args.ros_args = ros_args
-    handler = logging.StreamHandler()
-    handler.setFormatter(LineFormatter(f'surfel-mapper {args.verb}: %(message)s'))
-    logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    args = parsed(sys.argv[1:] if argv is None else argv)
+    start_logging(args)
     try:
         ends_early = interrupted_by_sigterm(ends_process=argv is None)
         with nullcontext() if args.verb in WITH_SIGNALS else ends_early:
@@ -90,6 +94,37 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f'surfel-mapper {args.verb}: interrupted', file=sys.stderr)
         return 130
+
+
+def parsed(argv: Sequence[str]) -> argparse.Namespace:
+    """Return the arguments of a verb; exit with 2 if they are wrong, or there are none."""
+    arguments, ros_args = without_ros_args(argv)
+    parser = parser_of(arguments)
+    if not arguments:  # wrong usage: a script with an empty variable must not seem to succeed
+        parser.print_help(sys.stderr)
+        parser.exit(2)
+    args, surplus = parser.parse_known_args(arguments)
+    if surplus:
+        args.parser.error(f'too many arguments: {" ".join(surplus)}')
+    args.ros_args = ros_args
+    return args
+
+
+def start_logging(args: argparse.Namespace) -> None:
+    """Log to stderr, as much as the arguments ask for; begin with the version."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(LineFormatter(f'surfel-mapper {args.verb}: %(message)s'))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    set_log_level(args)
+    python = platform.python_version()
+    _log.info('surfel_mapper %s, Python %s', surfel_mapper.__version__, python)
+
+
+def complete() -> None:
+    """Print the words that may follow those in COMP_LINE to a shell that asks for them; exit."""
+    import argcomplete
+
+    argcomplete.autocomplete(parser_of([]), always_complete_options=False)
 
 
 def replace_closed_streams() -> None:

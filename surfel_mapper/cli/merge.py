@@ -12,11 +12,17 @@ import argparse
 import json
 from pathlib import Path
 import time
+from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import add_workers, positive_int
+from surfel_mapper.cli._arguments import add_overwrite, add_workers, positive_int
+from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._verbosity import add_verbosity
 from surfel_mapper.errors import escaped
 from surfel_mapper.offline.summary import rounded
+
+if TYPE_CHECKING:
+    from surfel_mapper.cluster.tiles import TiledMap
 
 SUMMARY = 'Merge finished maps of one frame into one, tile by tile, exactly.'
 
@@ -33,7 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='DIR',
         help='output of a replay or a merge, or a file of it, map.npz or map.parquet',
     )
-    add('--output', type=Path, required=True, metavar='DIR', help='directory to write to')
+    add('-o', '--output', type=Path, required=True, metavar='DIR', help='directory to write to')
+    add_overwrite(parser)
     add(
         '--min-points',
         type=positive_int,
@@ -41,7 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='N',
         help='points that a voxel needs to count as a surfel, for the figures (%(default)s)',
     )
+    add_open(parser, 'map.png')
     add('--json', action='store_true', help='print the summary as JSON')
+    add_verbosity(parser)
     add_workers(parser)
 
 
@@ -49,8 +58,10 @@ def run(args: argparse.Namespace) -> int:
     """Merge and report."""
     from surfel_mapper.cluster.executors import open_executor
     from surfel_mapper.cluster.tiles import merge_maps
-    from surfel_mapper.files.atomic import write_json
+    from surfel_mapper.files.atomic import check_free, write_json
+    from surfel_mapper.viz.picture import draw_map
 
+    check_free(args.output, args.overwrite)
     began = time.perf_counter()
     with open_executor(args.workers, args.scheduler) as executor:
         tiled = merge_maps(args.maps, executor, args.output, args.min_points)
@@ -61,13 +72,20 @@ def run(args: argparse.Namespace) -> int:
         'seconds': time.perf_counter() - began,
         'peak_memory_mb': {'merging': tiled.peak_bytes // 10**6},
     }
+    picture = args.output / 'map.png'
+    title = f'{len(args.maps)} maps: {rounded(tiled.points)} points, {tiled.surfels:,} surfels'
+    draw_map(tiled.drawn, picture, title, origin_m=summary['origin_m'])
     write_json(args.output / 'summary.json', summary)
-    if args.json:
-        print(json.dumps(summary))
-        return 0
-    show_lines(
-        f'{len(args.maps)} maps   points {rounded(tiled.points)}   '
-        f'surfels {tiled.surfels}   tiles {tiled.tiles}   {summary["seconds"]:.1f} s\n'
-        f'digest {tiled.digest}\n{escaped(str(tiled.directory))}'
-    )
+    show_lines(json.dumps(summary) if args.json else report(tiled, summary, picture))
+    if args.open:
+        open_file(picture)
     return 0
+
+
+def report(tiled: TiledMap, summary: dict[str, Any], picture: Path) -> str:
+    """Return the summary as lines of text."""
+    return (
+        f'{len(summary["maps"])} maps   points {rounded(tiled.points)}   '
+        f'surfels {tiled.surfels}   tiles {tiled.tiles}   {summary["seconds"]:.1f} s\n'
+        f'digest {tiled.digest}\n{escaped(f"{tiled.directory}   {picture}")}'
+    )

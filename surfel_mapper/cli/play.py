@@ -14,6 +14,7 @@ from pathlib import Path
 
 from surfel_mapper.cli._arguments import positive_float, seconds
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._verbosity import add_verbosity
 from surfel_mapper.errors import escaped
 
 SUMMARY = 'Publish the messages of a bag over DDS at the pace of their record times.'
@@ -50,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='longest wait for subscribers, s (%(default)s)',
     )
     add('--json', action='store_true', help='report as JSON')
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:

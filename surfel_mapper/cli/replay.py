@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import (
+    add_formats,
+    add_overwrite,
     add_workers,
     APART,
     CUT,
@@ -29,8 +31,11 @@ from surfel_mapper.cli._arguments import (
     seconds,
     UsageError,
 )
+from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import printable, show_lines
-from surfel_mapper.cli._progress import progress, stopped_by_interrupt
+from surfel_mapper.cli._progress import stopped_by_interrupt
+from surfel_mapper.cli._settings import add_settings, configured
+from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
 from surfel_mapper.errors import MapError
 from surfel_mapper.layers import formats as layer_formats
 from surfel_mapper.offline.outputs import (
@@ -48,7 +53,7 @@ if TYPE_CHECKING:
 
 SUMMARY = 'Map a bag, or a folder of scans, and write the map, a picture and figures.'
 
-EXAMPLE = 'surfel-mapper replay street.mcap --topic /points --config vehicle.yaml --output street/'
+EXAMPLE = 'surfel-mapper replay street.mcap --config my.yaml --voxel-size 0.2 -o street/ --open'
 
 ONE_PROCESS = ('window', 'align', 'poses_out', 'truth', 'view', 'rrd', 'formats')
 """Options that ask for the whole map, or all scans in order, in one process."""
@@ -65,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='rosbag2 directory, .mcap, .db3, ROS 1 .bag; directory or file of .ply, .pcd, .bin, '
         '.las, .laz scans; .pcap of an Ouster lidar',
     )
-    add('--config', type=Path, metavar='FILE', help='YAML file of settings')
+    add_settings(parser, 'YAML file of settings')
     add(
         '--filters',
         metavar='FILE',
@@ -75,6 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_input_arguments(parser)
     add_output_arguments(parser)
     add_workers(parser)
+    add_verbosity(parser)
 
 
 def add_input_arguments(parser: argparse.ArgumentParser) -> None:
@@ -130,15 +136,12 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options for output."""
-    add = parser.add_argument_group('output').add_argument
-    add('--output', type=Path, metavar='DIR', help='directory to write to (BAG_surfels)')
-    add(
-        '--formats',
-        type=formats,
-        metavar='LIST',
-        help=f'comma-separated; of the map: {", ".join(MAP_FORMATS)} (ply,npz); of layers: '
-        f'{", ".join(layer_formats())}',
-    )
+    group = parser.add_argument_group('output')
+    add = group.add_argument
+    add('-o', '--output', type=Path, metavar='DIR', help='directory to write to (BAG_surfels)')
+    add_overwrite(group)
+    names = (*MAP_FORMATS, *layer_formats())
+    add_formats(group, names, ReplayOptions().formats, known_formats)
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
     add(
         '--truth',
@@ -148,6 +151,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add('--view', action='store_true', help='show the map in rerun while it grows')
     add('--rrd', type=Path, metavar='FILE', help='write the content of --view to a file')
+    add_open(group, 'report.html')
     add('--json', action='store_true', help='print the summary as JSON')
     add('--strict', action='store_true', help='exit with 3 if the bag is cut off or damaged')
 
@@ -166,16 +170,6 @@ def mount(text: str) -> tuple[str, tuple[float, ...]]:
     return topic, numbers
 
 
-def formats(text: str) -> tuple[str, ...]:
-    """Return the formats of a list with commas."""
-    names = tuple(text.split(','))
-    known = known_formats()
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise argparse.ArgumentTypeError(f'{unknown[0]!r}, expected some of {", ".join(known)}')
-    return names
-
-
 def run(args: argparse.Namespace) -> int:
     """Map one recording or many, and report."""
     if (args.poses_from == 'file') != (args.poses is not None) and args.poses_from is not None:
@@ -186,7 +180,7 @@ def run(args: argparse.Namespace) -> int:
         )
     is_many = len(args.bags) > 1 or args.workers is not None or args.scheduler is not None
     with stopped_by_interrupt() as stopped:
-        with progress('replay', 'recorded second' if is_many else 'scan') as show:
+        with shown_progress(args, 'recorded second' if is_many else 'scan') as show:
             options = {'progress': show, 'stopped': stopped}
             try:
                 result = replay_many(args, options) if is_many else replay_one(args, options)
@@ -201,6 +195,8 @@ def run(args: argparse.Namespace) -> int:
             return INTERRUPTED
         if stopped():  # while files were written
             raise KeyboardInterrupt
+    if args.open:
+        open_file(next(path for path in result.written if path.name == 'report.html'))
     if uncertain := uncertain_text(summary):
         show_lines(f'surfel-mapper: {uncertain}', to_stderr=True)
         return APART
@@ -217,9 +213,10 @@ def replay_one(args: argparse.Namespace, options: dict[str, Any]) -> Any:
         truth=args.truth,
         view=args.view,
         rrd=args.rrd,
+        overwrite=args.overwrite,
     )
     request = request_of(args, args.bags[0])
-    config = configured(args)
+    config = with_filters(args)
     others = {'--poses-out': args.poses_out, '--rrd': args.rrd}
     check_distinct(request.path, args.output, replay_options.formats, others)
     return replay(request, output=args.output, config=config, options=replay_options, **options)
@@ -235,7 +232,7 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
             f'--{given[0].replace("_", "-")}: not with several bags, --workers or --scheduler, '
             'where no process holds the whole map'
         )
-    config = configured(args).replace(ALL_SCANS)
+    config = with_filters(args).replace(ALL_SCANS)
     output = output_directory(args.bags[0], args.output)
     from surfel_mapper.cluster.replay import replay_bags
 
@@ -246,15 +243,14 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
         workers=args.workers,
         scheduler=args.scheduler,
         align=args.align,
+        overwrite=args.overwrite,
         **options,
     )
 
 
-def configured(args: argparse.Namespace) -> Config:
-    """Return the configuration that the arguments ask for."""
-    from surfel_mapper.config import load_config
-
-    config = load_config(args.config)
+def with_filters(args: argparse.Namespace) -> Config:
+    """Return the configuration that the arguments ask for, with its filters."""
+    config = configured(args)
     return config if args.filters is None else config.replace({'filters': args.filters})
 
 

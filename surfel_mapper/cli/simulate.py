@@ -6,12 +6,21 @@ from __future__ import annotations
 
 import argparse
 import json
+from pathlib import Path
 import sys
 import time
 from typing import TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import positive_float, positive_int, real, UsageError, whole
+from surfel_mapper.cli._arguments import (
+    add_overwrite,
+    positive_float,
+    positive_int,
+    real,
+    UsageError,
+    whole,
+)
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._verbosity import add_verbosity
 from surfel_mapper.errors import ConfigError, escaped
 from surfel_mapper.offline.summary import rounded
 
@@ -30,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments; the defaults of the lidar are those of simulation.Lidar."""
     add = parser.add_argument
     add('world', choices=['street'], help='a street canyon, turned and tilted off the grid')
-    add('--output', required=True, metavar='DIR', help='bag directory; new, or with --overwrite')
-    add('--overwrite', action='store_true', help='replace an existing bag')
+    add('-o', '--output', required=True, metavar='DIR', help='directory of the bag')
+    add_overwrite(parser)
     add('--storage', choices=['mcap', 'sqlite3'], default='mcap', help='format (%(default)s)')
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
@@ -49,22 +58,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--seed', type=whole, default=0, metavar='N', help='of street and noise (%(default)s)')
     add('--rolling', action='store_true', help='the vehicle moves while the lidar turns')
     add('--json', action='store_true', help='report as JSON')
+    add_verbosity(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate and record a drive, and report the counts."""
     from tqdm import tqdm
 
+    from surfel_mapper.files.atomic import check_free
     from surfel_mapper.scan import Scan
     from surfel_mapper.simulation import record
 
+    check_free(Path(args.output), args.overwrite)  # the writer would name the full path
     try:
         simulation = simulation_of(args)
     except ConfigError as error:  # the options are its only settings
         raise UsageError(str(error)) from error
     returns = 0
     begin = time.perf_counter()
-    bar = tqdm(total=simulation.num_scans, unit='scan', disable=not sys.stderr.isatty())
+    bar = tqdm(
+        total=simulation.num_scans, unit='scan', disable=args.quiet or not sys.stderr.isatty()
+    )
 
     def count(scan: Scan) -> None:
         nonlocal returns

@@ -13,14 +13,15 @@ import argparse
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-import os
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import finite, positive_int, UsageError
+from surfel_mapper.cli._arguments import add_overwrite, finite, positive_int, UsageError
+from surfel_mapper.cli._display import has_display
 from surfel_mapper.cli._output import show_lines
-from surfel_mapper.cli._progress import progress
+from surfel_mapper.cli._settings import add_settings, configured
+from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
 from surfel_mapper.errors import escaped
 
 if TYPE_CHECKING:
@@ -37,9 +38,6 @@ COLOURS = ('normal', 'height', 'planarity', 'intensity', 'rgb', 'age', 'label')
 
 LAST_PORT = 65_534
 """Last port of a page: the one after it is the last of TCP."""
-
-DISPLAYS = ('DISPLAY', 'WAYLAND_DISPLAY')
-"""Variables of the environment that name a display."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='most discs; far parts of larger maps are shown as coarser maps (250000)',
     )
     add('--min-points', type=positive_int, default=5, metavar='N', help='minimum per surfel (5)')
-    add('--config', type=Path, metavar='FILE', help='settings for a bag; with its window')
+    add_settings(parser, 'settings for a bag; with its window')
     add(
         '--live',
         nargs='?',
@@ -91,6 +89,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='N',
         help=f'of the page, at most {LAST_PORT}; its data use the next one (free ones)',
     )
+    add_overwrite(parser)
+    add_verbosity(parser)
 
 
 def page_port(text: str) -> int:
@@ -111,13 +111,17 @@ def run(args: argparse.Namespace) -> int:
 
 def shown(args: argparse.Namespace) -> int:
     """Show a live node, a recording, or the contents of files; return 0."""
+    from surfel_mapper.files.atomic import check_free
     from surfel_mapper.viz.contents import is_shown
 
     if bool(args.what) == (args.live is not None):
         raise UsageError('expected WHAT to show, or --live')
+    for path in filter(None, (args.rrd, args.glb)):
+        check_free(path, args.overwrite)
     if args.live is not None:
         if args.glb is not None:
             raise UsageError('--glb writes what files hold, not a live node')
+        refuse_settings(args)
         show_live(args)
         return 0
     many = len(args.what) > 1
@@ -132,8 +136,15 @@ def shown(args: argparse.Namespace) -> int:
             with ended_by_interrupt(scene):
                 scene.wait()
         return 0
+    refuse_settings(args)
     show_files(args)
     return 0
+
+
+def refuse_settings(args: argparse.Namespace) -> None:
+    """Raise UsageError for settings, which a map or a node already has."""
+    if args.config is not None or args.settings:
+        raise UsageError('--config, --set and --voxel-size: expected a recording, to be mapped')
 
 
 def show_files(args: argparse.Namespace) -> None:
@@ -193,8 +204,7 @@ def opened(args: argparse.Namespace) -> Scene:
 
     if args.rrd is not None:
         return Scene.to_file(args.rrd)
-    has_display = sys.platform != 'linux' or any(map(os.environ.get, DISPLAYS))
-    if has_display and not args.browser:
+    if has_display() and not args.browser:
         return Scene.to_window()
     return Scene.to_browser(args.port, WHOLE if args.live is None else LIVE)
 
@@ -243,16 +253,15 @@ def show_live(args: argparse.Namespace) -> None:
 
 def show_recording(path: Path, args: argparse.Namespace, scene: Scene) -> None:
     """Map a bag or a folder of scans while it is shown."""
-    from surfel_mapper.config import load_config
     from surfel_mapper.offline.recording import open_recording
     from surfel_mapper.offline.replay import started_mapper
     from surfel_mapper.offline.request import Request
     from surfel_mapper.viz.viewer import Viewer
 
-    with open_recording(Request(path=path), load_config(args.config)) as recording:
+    with open_recording(Request(path=path), configured(args)) as recording:
         mapper = started_mapper(recording.config)
         viewer = Viewer(mapper, scene, args.color)
-        with progress('view', 'scan') as report:
+        with shown_progress(args, 'scan') as report:
             for number, update in enumerate(recording.replay(mapper), start=1):
                 viewer.add(update)
                 report(number, recording.num_scans)

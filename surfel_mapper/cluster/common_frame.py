@@ -160,7 +160,7 @@ def register(task: tuple[Request, Config, Path, bool | None]) -> Registered:
         replace(request, poses_from='registration'),
         output=directory,
         config=config,
-        options=ReplayOptions(formats=('npz',), align=align),
+        options=ReplayOptions(formats=('npz',), align=align, overwrite=True),
     )
     stamps_ns, poses = beyond_the_end(found.trajectory.stamps_ns, found.trajectory.of_body)
     write_tum(directory / POSES, stamps_ns, poses)

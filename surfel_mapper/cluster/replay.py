@@ -19,6 +19,7 @@ from typing import Any, TYPE_CHECKING
 from surfel_mapper.cluster.executors import never, open_executor, start_forkserver
 from surfel_mapper.config import AUTO
 from surfel_mapper.errors import BagError, ConfigError, MapError
+from surfel_mapper.files.atomic import check_free
 from surfel_mapper.offline.request import Request
 
 if TYPE_CHECKING:
@@ -58,13 +59,14 @@ def replay_bags(
     workers: int | None = None,
     scheduler: str | None = None,
     align: bool | None = None,
+    overwrite: bool = False,
     progress: Callable[[int, int], object] = lambda done, total: None,
     stopped: Callable[[], bool] = never,
 ) -> ShelfResult:
     """
     Map recordings into one map in tiles and write it, with a picture, a report and a summary.
 
-    The same as ``surfel-mapper replay`` with several bags or with ``--workers``; eight parameters
+    The same as ``surfel-mapper replay`` with several bags or with ``--workers``; nine parameters
     because the first three suffice for most calls.
 
     Parameters
@@ -81,6 +83,8 @@ def replay_bags(
         Address of a Dask scheduler instead.
     align : bool, optional
         As ``ReplayOptions.align``, for each recording that is registered; False: no loops.
+    overwrite : bool
+        As ``ReplayOptions.overwrite``.
     progress : callable
         Called with the seconds of recordings that are mapped, and all.
     stopped : callable
@@ -103,6 +107,7 @@ def replay_bags(
     """
     began = time.perf_counter()
     check_origin(config)
+    check_free(output, overwrite)
     if workers is not None and scheduler is None:
         start_forkserver()  # they load their modules while this process loads its own
     found = surveyed(requests, config)

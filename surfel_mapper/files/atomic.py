@@ -71,6 +71,26 @@ def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO
         raise
 
 
+def check_free(path: Path, overwrite: bool) -> None:
+    """Raise FileFormatError if a path is in use, and may not be overwritten."""
+    if not overwrite and (use := use_of(path)):
+        raise FileFormatError(f'{path}: {use}')
+
+
+def use_of(path: Path) -> str:
+    """Return how a path is in use, and the ways out; empty for a new path or empty directory."""
+    if not os.path.lexists(path):
+        return ''
+    if not path.is_dir():
+        return 'exists; expected a new name, or --overwrite (in Python: overwrite=True)'
+    if not any(path.iterdir()):
+        return ''
+    return (
+        'has files in it; expected a new or empty directory, or --overwrite (in Python: '
+        'overwrite=True)'
+    )
+
+
 def make_directory(directory: Path) -> None:
     """
     Make a directory and its parents, unless they exist.

@@ -139,7 +139,7 @@ def _prepare_cache() -> None:
         _discard_stale(cache, own)
 
 
-class _Reporter(_event.Listener):  # type: ignore[misc]
+class _Reporter(_event.Listener):
     """Reports compilations, not loads from the cache; see compilation.py."""
 
     def on_start(self, event: _event.Event) -> None:

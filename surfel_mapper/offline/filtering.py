@@ -24,7 +24,7 @@ from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.counters import Counters
 from surfel_mapper.errors import BagError, CloudFormatError, FileFormatError, FilterError
 from surfel_mapper.files import pcd, ply
-from surfel_mapper.files.atomic import make_directory
+from surfel_mapper.files.atomic import check_free, make_directory
 from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.columns import as_fields
@@ -94,7 +94,7 @@ def filter_clouds(
     T_base_sensor : (4, 4) float64, optional
         Pose of the sensor on the robot, for filters that need it.
     overwrite : bool
-        Whether outputs may exist.
+        Whether outputs may be replaced; without it, a directory must be new or empty.
     show : callable
         Called with the scans done and the scans expected.
 
@@ -116,10 +116,10 @@ def filter_clouds(
                 f'{target}; filter them one after the other, into several directories'
             )
         sources[target] = source
-        if target.exists() and not overwrite:
-            raise FileFormatError(f'{target}: exists; choose another output, or overwrite it')
+    check_free(Path(output), overwrite)
     chain.warm_up()
     for source, target in pairs:
+        log.info('%s is filtered into %s', source, target)
         make_directory(target.parent)
         if is_bag(source):
             work.filter_bag(source, target, overwrite)

@@ -78,6 +78,8 @@ class ReplayOptions:
         Show the map in rerun while it grows.
     rrd : Path, optional
         File for the same, for rerun to open.
+    overwrite : bool
+        Replace files that exist; without it, the output must be a new or an empty directory.
 
     """
 
@@ -88,6 +90,7 @@ class ReplayOptions:
     truth: Path | None = None
     view: bool = False
     rrd: Path | None = None
+    overwrite: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +142,7 @@ def replay(
     config : Config, str or Path, optional
         The configuration, or its YAML file; without, the defaults.
     options : ReplayOptions, optional
-        Window, alignment, formats, truth, viewer.
+        Window, alignment, formats, truth, viewer, and whether to overwrite files.
     progress : callable
         Called with the numbers of scans received and expected after every mapped scan.
     stopped : callable
@@ -157,7 +160,7 @@ def replay(
     ConfigError
         If a setting or an option is wrong.
     FileFormatError
-        If a file cannot be read or written.
+        If a file cannot be read or written, or the output exists and may not be overwritten.
     MapError
         If it was stopped before any scan was mapped.
 
@@ -179,6 +182,7 @@ def replay(
     check_outputs(directory, options)
     keep_freed_memory()  # saves 2 ms for each cloud of 4 MB
     with no_empty_directory(directory), open_recording(request, settings) as recording:
+        _log.info('%s: poses from %s', request.path, recording.describe()['poses_from'])
         mapper = started_mapper(with_loops(recording.config, options, directory))
         history = History()
         with listeners(directory, options, mapper) as listening:
@@ -190,6 +194,7 @@ def replay(
             with write_first(partial(write_maps, directory, options.formats, mapper, trajectory)):
                 aligned = align(mapper, options)
             replay_s = clock() - start_s
+            _log.info('mapped %d scans in %.1f s', mapper.counters.mapped, replay_s)
             trajectory.follow_alignment(mapper)
             write_maps(directory, options.formats, mapper, trajectory, window=options.window)
             mapper.finish_layers()
@@ -210,6 +215,7 @@ def replay(
     if options.poses_out is not None:
         trajectory.write(options.poses_out)
     written = write_files(directory, options.formats, mapper, trajectory, summary, history)
+    _log.info('wrote %s', ', '.join(map(str, written)))
     return ReplayResult(mapper, trajectory, summary, written)
 
 
@@ -285,12 +291,15 @@ def started_mapper(config: Config) -> Mapper:
 
 def check_outputs(directory: Path, options: ReplayOptions) -> None:
     """Raise if an output cannot be written, shown or compared, before the first scan."""
+    from surfel_mapper.files.atomic import check_free
     from surfel_mapper.offline.outputs import check_formats, check_writable
 
+    check_free(directory, options.overwrite)
     check_formats(options.formats, directory)
     for path in (options.poses_out, options.rrd):
         if path is not None:
             check_writable(path)
+            check_free(path, options.overwrite)
     if options.view or options.rrd is not None:
         from surfel_mapper.viz.server import import_rerun
 

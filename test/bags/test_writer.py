@@ -94,7 +94,7 @@ def test_an_error_leaves_no_files(error, tmp_path):
 def test_a_bag_is_replaced_only_on_request_and_only_at_the_end(tmp_path):
     path = tmp_path / 'bag'
     write_some(path)
-    with pytest.raises(BagError, match='exists; name another directory'):
+    with pytest.raises(BagError, match='has files in it; expected a new or empty directory'):
         BagWriter(path)
     with BagWriter(path, overwrite=True) as bag:
         bag.write('/text', 'std_msgs/msg/String', 1, b'\x00\x01\x00\x00\x01\x00\x00\x00\x00')
@@ -144,12 +144,12 @@ def test_the_old_bag_comes_back_if_the_new_one_does_not_get_its_name(tmp_path, m
     assert_is_the_old_bag(tmp_path / 'bag')
 
 
-def test_an_empty_directory_is_filled_on_request(tmp_path):
+@pytest.mark.parametrize('overwrite', [False, True])
+def test_an_empty_directory_becomes_the_bag(tmp_path, overwrite):
     (tmp_path / 'bag').mkdir()
-    with pytest.raises(BagError, match='exists'):
-        BagWriter(tmp_path / 'bag')
-    write_some(tmp_path / 'bag', overwrite=True)
+    write_some(tmp_path / 'bag', overwrite=overwrite)
     assert (tmp_path / 'bag' / 'metadata.yaml').exists()
+    assert [entry.name for entry in tmp_path.iterdir()] == ['bag']
 
 
 def test_paths_that_are_not_bags_are_never_overwritten(tmp_path):
@@ -168,7 +168,7 @@ def test_paths_that_are_not_bags_are_never_overwritten(tmp_path):
 
 def test_a_bag_that_appears_while_writing_is_kept(tmp_path):
     path = tmp_path / 'bag'
-    with pytest.raises(BagError, match='exists'), BagWriter(path):
+    with pytest.raises(BagError, match='has files in it'), BagWriter(path):
         write_some(path)
     with BagReader(path) as reader:
         assert len(list(reader.topics)) == 3

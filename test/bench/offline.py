@@ -126,7 +126,14 @@ def command(bag: Path, config: Path) -> None:
     subprocess.run(
         [
             *(sys.executable, '-m', 'surfel_mapper.cli.main', 'replay', str(bag)),
-            *('--config', str(config), '--output', str(config.parent / 'out'), '--json'),
+            *(
+                '--config',
+                str(config),
+                '--output',
+                str(config.parent / 'out'),
+                '--overwrite',
+                '--json',
+            ),
         ],
         check=True,
         stdout=subprocess.DEVNULL,

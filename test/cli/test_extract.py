@@ -26,7 +26,7 @@ def write_cloud(path, points):
 
 def test_a_cloud_becomes_models_and_a_picture(tmp_path, capsys):
     write_cloud(tmp_path / 'room.ply', room(160, 120)[0])
-    place = ['--viewpoint', *map(str, VIEW), '--voxel-size', '0.03']
+    place = ['--viewpoint', *map(str, VIEW), '--voxel-size', '0.03', '--overwrite']
     arguments = [str(tmp_path / 'room.ply'), '--output', str(tmp_path / 'out'), *place]
     assert main(['extract', *arguments, '--json']) == 0
     found = json.loads(capsys.readouterr().out)
@@ -68,6 +68,7 @@ def test_a_map_becomes_models_of_its_surfels(tmp_path, capsys):
 def test_compiling_is_announced_once_on_stderr(tmp_path, capsys, monkeypatch):
     write_cloud(tmp_path / 'none.ply', np.empty((0, 3), np.float32))
     arguments = ['extract', str(tmp_path / 'none.ply'), '--output', str(tmp_path / 'out')]
+    arguments.append('--overwrite')
     assert main(arguments) == 0  # whatever is compiled for it
     capsys.readouterr()
     assert main(arguments) == 0
@@ -99,7 +100,7 @@ def test_a_file_that_is_no_cloud_is_refused_by_name(tmp_path, capsys, name):
 
 def test_an_unknown_ending_is_refused_with_the_known_ones(tmp_path, capsys):
     (tmp_path / 'notes.md').touch()
-    assert main(['extract', str(tmp_path / 'notes.md'), '--output', str(tmp_path)]) == 1
+    assert main(['extract', str(tmp_path / 'notes.md'), '--output', str(tmp_path / 'out')]) == 1
     said = capsys.readouterr().err
     assert (
         'a cloud ending in .ply, .pcd, .bin, .las, .laz, or a map ending in .npz, .parquet' in said

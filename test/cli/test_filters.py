@@ -79,5 +79,5 @@ def test_a_replay_filters_and_reports_it(bag, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith('1 random_sampling: 27 k points in, ') for line in lines)
 
-    assert main([*arguments[:-1], f'{chain}#output']) == 1
+    assert main([*arguments[:-1], f'{chain}#output', '--overwrite']) == 1
     assert "no key 'output' there; keys: input" in capsys.readouterr().err

@@ -35,6 +35,19 @@ def test_help_lists_every_verb_with_its_summary(capsys):
         assert f'{verb} {import_module(f"surfel_mapper.cli.{verb}").SUMMARY}' in text
 
 
+def test_no_arguments_list_every_verb_with_its_summary(capsys):
+    assert usage_code() == 2
+    text = ' '.join(capsys.readouterr().err.split())
+    for verb in VERBS:
+        assert f'{verb} {import_module(f"surfel_mapper.cli.{verb}").SUMMARY}' in text
+
+
+@pytest.mark.parametrize('verb', VERBS)
+def test_a_misspelt_option_is_refused_before_arguments_are_missed(verb, capsys):
+    assert usage_code(verb, '--hepl') == 2
+    assert 'no option --hepl, did you mean --help?' in capsys.readouterr().err
+
+
 def test_every_module_that_is_a_verb_is_listed():
     folder = Path(surfel_mapper.__file__).parent / 'cli'
     names = [path.stem for path in folder.glob('*.py') if path.stem != '__init__']
@@ -75,6 +88,12 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
         (('replay', 'a', '--poses-from', 'identiy'), ', did you mean identity?'),
         (('replay', 'a', '--seconds', '3'), 'error: no option --seconds\n'),
         (('info', 'a', '--jsn'), 'no option --jsn, did you mean --json?'),
+        (('--versoin',), 'no option --versoin, did you mean --version?'),
+        (('extract', 'a', '--ouptut', 'b'), 'no option --ouptut, did you mean --output?'),
+        (('extract', '--voxl-size=0.2'), 'no option --voxl-size, did you mean --voxel-size?'),
+        (('simulate', '--sede', '3', 'street'), 'no option --sede, did you mean --seed?'),
+        (('merge', 'a', '-output=b'), 'no option -output, did you mean --output?'),
+        (('replay', 'a', '--po', 'b'), 'ambiguous option: --po could match --pose-topic, '),
         (('info', 'a', 'b'), 'too many arguments: b'),
         (('merge', 'a', '--output', 'b', '--workers', '0'), 'a whole number of 1 or more'),
         (('view', 'a', '--at', '1', '2', 'nan'), "--at: 'nan', expected a finite number"),

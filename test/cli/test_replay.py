@@ -75,7 +75,7 @@ def test_json_prints_the_summary_alone(bag, tmp_path, capsys):
 def test_the_default_output_is_named_after_the_bag(bag, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for path in (bag, bag / 'drive.mcap'):
-        assert main(['replay', str(path)]) == 0
+        assert main(['replay', str(path), '--overwrite']) == 0
 
     assert [path.name for path in tmp_path.iterdir()] == ['drive_surfels']
 
@@ -84,7 +84,7 @@ def test_all_scans_stay_unless_the_window_is_asked_for(bag, tmp_path):
     config = settings_file(tmp_path, 'window: {max_scans: 2}')
     for options, left in (([], NUM_SCANS), (['--window'], 2)):
         arguments = ['replay', str(bag), '--config', config, '--output', str(tmp_path / 'out')]
-        assert main([*arguments, *options]) == 0
+        assert main([*arguments, '--overwrite', *options]) == 0
         assert summary_of(tmp_path / 'out')['window_scans'] == left
 
 
@@ -92,7 +92,7 @@ def test_topics_can_be_named(tmp_path, capsys):
     entries = drive()
     entries.cloud('/other', entries[-1][2] + 1, np.ones((9, 3)))
     path = str(write_rosbag2(tmp_path / 'two', entries))
-    output = ['--output', str(tmp_path / 'out')]
+    output = ['--output', str(tmp_path / 'out'), '--overwrite']
 
     assert main(['replay', path, *output]) == 1
     assert 'PointCloud2 topics: /other, /points' in capsys.readouterr().err
@@ -143,7 +143,7 @@ def test_a_damaged_bag_leaves_an_earlier_result_whole(tmp_path, capsys):
 
     cut(bag / 'drive.db3', 0.02)
 
-    assert main(['replay', str(bag), '--output', str(output)]) == 1
+    assert main(['replay', str(bag), '--output', str(output), '--overwrite']) == 1
     assert 'drive' in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in output.iterdir()} == before
 
@@ -206,7 +206,7 @@ def test_figures_that_do_not_exist_are_null(tmp_path, capsys):
     assert 'drift - m and - deg in 100 m' in (output / 'report.html').read_text()
     errors = summary_of(output)['pose_errors']
     assert errors['drift_m_per_100m'] is errors['drift_deg_per_100m'] is None
-    assert main([*arguments, '--poses-from', 'identity', '--json']) == 0
+    assert main([*arguments, '--poses-from', 'identity', '--json', '--overwrite']) == 0
     assert strict_json(capsys.readouterr().out)['pose_errors'] == errors
 
 
@@ -254,7 +254,8 @@ def test_a_real_bag_maps_whole_and_alike_with_transforms_and_odometry(name, data
 
     summaries = []
     for options in ([], ['--config', config]):
-        assert main(['replay', str(bag), '--output', str(tmp_path / 'out'), *options]) == 0
+        arguments = ['replay', str(bag), '--output', str(tmp_path / 'out'), '--overwrite']
+        assert main([*arguments, *options]) == 0
         summaries.append(summary_of(tmp_path / 'out'))
 
     for summary in summaries:

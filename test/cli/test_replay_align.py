@@ -46,7 +46,7 @@ def replayed(bag, settings, tmp_path, *options):
     output = tmp_path / 'out'
     poses = tmp_path / 'poses.tum'
     arguments = ['--config', settings, '--output', str(output), '--poses-out', str(poses)]
-    assert main(['replay', str(bag), *arguments, *options]) == 0
+    assert main(['replay', str(bag), *arguments, '--overwrite', *options]) == 0
     path = read_trajectory(poses)
     transforms = [pose_matrix(xyz, q) for xyz, q in zip(path.xyz, path.q_xyzw, strict=True)]
     return json.loads((output / 'summary.json').read_text()), np.array(transforms)

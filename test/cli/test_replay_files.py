@@ -109,7 +109,7 @@ def test_a_second_replay_replaces_all(bag, output, tmp_path):
     shutil.copytree(output, tmp_path / 'again')
     arguments = ['--formats', ALL, '--output', str(tmp_path / 'again'), '--duration', '0.3']
 
-    assert main(['replay', str(bag), *arguments]) == 0
+    assert main(['replay', str(bag), *arguments, '--overwrite']) == 0
 
     before, after = contents(output), contents(tmp_path / 'again')
     assert before.keys() == after.keys()
@@ -251,7 +251,7 @@ def test_a_cut_bag_is_mapped_as_far_as_it_goes_and_strict_says_so(tmp_path, caps
         path = write_rosbag2(tmp_path / 'drive', drive(), kind)
         (file,) = names(path)
     cut(file, 0.7)
-    arguments = ['replay', str(path), '--json', '--output', str(tmp_path / 'out')]
+    arguments = ['replay', str(path), '--json', '--output', str(tmp_path / 'out'), '--overwrite']
 
     assert main(arguments) == 0
     plain = json.loads(capsys.readouterr().out)
@@ -272,7 +272,7 @@ from test.cli.small_disk import filled
 from test.cli.test_replay_files import contents
 
 disk, bag = Path(sys.argv[1]), sys.argv[2]
-arguments = ['replay', bag, '--output', str(disk / 'earlier'), '--json']
+arguments = ['replay', bag, '--output', str(disk / 'earlier'), '--json', '--overwrite']
 assert main([*arguments, '--formats', sys.argv[3], '--duration', '0.3']) == 0
 before = contents(disk)
 for name in sys.argv[3].split(','):

@@ -97,7 +97,7 @@ def test_ctrl_c_before_the_first_shard_is_done_leaves_the_earlier_map(
 
     monkeypatch.setattr(SerialExecutor, 'run', pressing)
     monkeypatch.setattr(shards, 'LONGEST_S', 3.0)
-    assert main(['replay', *bags, '--output', str(tmp_path), *TF]) == 130
+    assert main(['replay', *bags, '--output', str(tmp_path), '--overwrite', *TF]) == 130
 
     assert 'interrupted' in capsys.readouterr().err
     assert before == {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
@@ -161,7 +161,7 @@ def test_an_output_that_holds_something_else_is_left_alone(bags, tmp_path, capsy
     (tmp_path / 'map').mkdir()
     (tmp_path / 'map' / 'thesis.txt').write_text('mine')
 
-    assert main(['replay', *bags, '--output', str(tmp_path), *TF]) == 1
+    assert main(['replay', *bags, '--output', str(tmp_path), '--overwrite', *TF]) == 1
 
     assert 'holds something else' in capsys.readouterr().err
     assert (tmp_path / 'map' / 'thesis.txt').read_text() == 'mine'
@@ -191,7 +191,7 @@ def test_a_bag_that_ends_too_early_is_mapped_as_far_as_it_goes(bags, tmp_path, c
     arguments = ['replay', str(bag), str(bag), '--output', str(tmp_path / 'out'), *TF]
 
     assert main(arguments) == 0
-    assert main([*arguments, '--strict']) == 3
+    assert main([*arguments, '--strict', '--overwrite']) == 3
 
     summary = summary_of(tmp_path / 'out')
     assert 20 < summary['scans']['mapped'] < 2 * 60
@@ -224,6 +224,7 @@ from test.cli.small_disk import filled
 
 disk, bag = Path(sys.argv[1]), sys.argv[2]
 arguments = ['replay', bag, bag, '--pose-topic', '/tf', '--output', str(disk / 'out'), '--json']
+arguments.append('--overwrite')
 assert main([*arguments, '--duration', '0.5']) == 0
 before = dataset_digest(disk / 'out' / 'map')
 free = len(list((disk / 'out').iterdir()))

@@ -215,9 +215,10 @@ def test_the_default_output_can_be_read_back(bag, tmp_path, capsys, caplog):
 
     assert main(['evaluate', str(out), '--truth', str(out / 'map.npz')]) == 0
     assert 'equal to the bit' in capsys.readouterr().out
+    models = ['--output', str(tmp_path / 'models'), '--overwrite']
     for path in (out, out / 'map.npz'):
-        assert main(['extract', str(path), '--output', str(tmp_path / 'models')]) == 0
-    assert main(['extract', str(out / 'map.ply'), '--output', str(tmp_path / 'models')]) == 1
+        assert main(['extract', str(path), *models]) == 0
+    assert main(['extract', str(out / 'map.ply'), *models]) == 1
     assert 'surfels of a map, not points of a cloud' in capsys.readouterr().err
 
     assert main(['merge', str(out), '--output', str(tmp_path / 'one'), '--json']) == 0

@@ -55,7 +55,8 @@ def test_a_saved_map_is_merged_extracted_evaluated_and_loaded(saved, name, tmp_p
 
 def test_merging_a_saved_map_with_itself_warns(saved, tmp_path, caplog):
     directory, _ = saved
-    assert main(['merge', str(directory), str(directory), '--output', str(tmp_path)]) == 0
+    output = str(tmp_path / 'sum')
+    assert main(['merge', str(directory), str(directory), '--output', output]) == 0
     assert '3 of its 3 scans have stamps of scans in' in caplog.text
 
 

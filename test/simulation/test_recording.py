@@ -151,7 +151,7 @@ def test_existing_bag_is_kept_and_an_interrupted_recording_leaves_nothing(tmp_pa
     simulation = small_simulation()
     record(simulation, tmp_path / 'street')
     before = read(tmp_path / 'street')
-    with pytest.raises(BagError, match='street: exists'):
+    with pytest.raises(BagError, match='street: has files in it'):
         record(simulation, tmp_path / 'street')
 
     def interrupt(scan):

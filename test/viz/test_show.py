@@ -57,7 +57,7 @@ def shown(tmp_path, *arguments):
     from rerun import chunk as reader
 
     file = tmp_path / 'shown.rrd'
-    assert main(['view', *map(str, arguments), '--rrd', str(file)]) == 0
+    assert main(['view', *map(str, arguments), '--rrd', str(file), '--overwrite']) == 0
     found = {}
     for chunk in reader.RrdReader(str(file)).stream().to_chunks():
         batch = chunk.to_record_batch()
