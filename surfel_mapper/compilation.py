@@ -62,7 +62,8 @@ class Progress:
             is_first, is_new = self._announced is None, self._announced != self.stage
             self._announced = self.stage
         if is_new and (self.stage or is_first):
-            _log.log(logging.WARNING if is_first else logging.INFO, self.text)
+            is_shown = _log.isEnabledFor(logging.INFO) or not is_first
+            _log.log(logging.INFO if is_shown else logging.WARNING, self.text)
 
     def end(self) -> None:
         """Note the end of what ``begin`` reported."""
@@ -99,7 +100,14 @@ def clock() -> float:
 
 @contextmanager
 def stage(number: int, total: int, name: str) -> Iterator[None]:
-    """Announce kernels that are compiled in a with-block as stage ``number`` of ``total``."""
+    """
+    Announce kernels that are compiled in a with-block as stage ``number`` of ``total``.
+
+    In the block of another stage nothing changes.
+    """
+    if PROGRESS.stage:
+        yield
+        return
     PROGRESS.stage = f'{number} of {total} ({name})'
     try:
         yield
@@ -113,5 +121,6 @@ def run_stages(stages: Sequence[CompileStage]) -> None:
     for number, (name, call) in enumerate(stages, start=1):
         with stage(number, len(stages), name):
             call()
-    if num := PROGRESS.num_kernels - num_kernels:
+    num = PROGRESS.num_kernels - num_kernels
+    if num and not PROGRESS.stage:
         _log.info('%d kernels compiled in %.1f s', num, PROGRESS.seconds - seconds)

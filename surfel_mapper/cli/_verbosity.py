@@ -15,6 +15,9 @@ import logging
 
 from surfel_mapper.cli._progress import progress
 
+COMPILATION_LOG = logging.getLogger('surfel_mapper.compilation')
+"""Says that kernels compile, which takes long: shown unless --quiet is given."""
+
 LEVELS = (logging.NOTSET, logging.INFO, logging.DEBUG)
 """Levels of our loggers by the number of -v; without one, warnings, as the root logger has it."""
 
@@ -36,6 +39,8 @@ def set_log_level(args: argparse.Namespace) -> None:
     """Set the level of the loggers of this package from the arguments; others keep theirs."""
     number = getattr(args, 'verbose', 0)  # the node logs by ROS, and has no such option
     logging.getLogger('surfel_mapper').setLevel(LEVELS[min(number, len(LEVELS) - 1)])
+    is_quiet = getattr(args, 'quiet', False)
+    COMPILATION_LOG.setLevel(logging.WARNING if is_quiet else logging.INFO)
 
 
 @contextmanager

@@ -13,7 +13,6 @@ import argparse
 import json
 import logging
 from pathlib import Path
-import sys
 from typing import Any, TYPE_CHECKING
 
 import numpy as np

@@ -45,6 +45,7 @@ VERBS = (
     'merge',
     'view',
     'evaluate',
+    'compile',
 )
 
 WITH_SIGNALS = ('node', 'view')

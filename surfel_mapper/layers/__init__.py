@@ -9,7 +9,15 @@ not.
 
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.layers.registry import enabled, formats, load, names, register, unregister
+from surfel_mapper.layers.registry import (
+    enabled,
+    formats,
+    load,
+    names,
+    register,
+    switches,
+    unregister,
+)
 
 if TYPE_CHECKING:
     from surfel_mapper.layers.layer import (
@@ -35,6 +43,7 @@ __all__ = [
     'load',
     'names',
     'register',
+    'switches',
     'unregister',
 ]
 

@@ -77,6 +77,11 @@ def names() -> tuple[str, ...]:
     return tuple(_REGISTERED)
 
 
+def switches() -> tuple[str, ...]:
+    """Return the settings that switch layers on."""
+    return tuple(layer.switch for layer in _REGISTERED.values() if layer.switch)
+
+
 def formats() -> dict[str, RegisteredLayer]:
     """Return the formats that users may ask for, with the layer that writes each."""
     return {name: layer for layer in _REGISTERED.values() for name in layer.formats}

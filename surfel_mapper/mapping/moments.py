@@ -288,8 +288,8 @@ def impossible(moments: ScanMoments) -> npt.NDArray[np.bool_]:
     Return which rows, (K,), hold moments that no points of a voxel can have.
 
     Tested: keys that are not negative, counts of 1 or more, sums within the voxel, second moments
-    that satisfy the inequality of Cauchy and Schwarz, views no longer than their unit. Others would
-    overflow the integers of the map or give negative eigenvalues later, far from the cause.
+    that satisfy the inequality of Cauchy and Schwarz, views no longer than their unit. Others
+    would overflow the integers of the map or give negative eigenvalues later, far from the cause.
     """
     half = float(HALF << moments.level)
     count = moments.count.astype(np.float64)[:, None]

@@ -29,9 +29,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.filters.columns import as_fields
 from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.surfel_columns import surfel_columns
-from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.map_cloud import moment_cloud, voxel_columns
 from surfel_mapper.messages.markers import marker_array
 from surfel_mapper.messages.pointcloud2 import from_columns
@@ -287,20 +285,3 @@ class Outputs:
         )
         self._markers.publish(marker_array(markers))
         self._published[self._markers] = surfel_map.version
-
-
-def warm_up(config: Config) -> None:
-    """Compile the kernels of the outputs, and load their libraries by running them once."""
-    surfel_map = SurfelMap(config.map.voxel_size_m)
-    scan = Scan(
-        points=np.ones((1, 3), np.float64 if config.deskew.enabled else np.float32),
-        stamp_ns=0,
-        frame_id='',
-    )
-    moments = surfel_map.add(scan.points)
-    surfels = surfel_map.surfels()
-    scan_with_normals(scan, np.eye(4), surfel_map, 1)
-    windowed = WindowedScan(moments=moments, stamp_ns=0, T_map_sensor=np.eye(4))
-    colors = disc_colors('age', surfels, [windowed])
-    surfel_markers(surfels, config.map.voxel_size_m, colors, stamp_ns=0, frame_id='')
-    moment_cloud(surfels, surfel_map.moments(), NO_VOXELS)

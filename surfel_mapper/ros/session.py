@@ -7,26 +7,23 @@ from __future__ import annotations
 from collections import deque
 from concurrent.futures import CancelledError
 from contextlib import suppress
-from functools import partial
 import threading
 import time
 from typing import TYPE_CHECKING
 
-from surfel_mapper.compilation import CompileStage, run_stages
+from surfel_mapper.compilation import run_stages
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
 from surfel_mapper.memory import lasting_objects
-from surfel_mapper.messages.images import warm_up as warm_up_depth
-from surfel_mapper.messages.pointcloud2 import warm_up as warm_up_decoding
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
+from surfel_mapper.pipeline.warm_up import node_stages
 from surfel_mapper.ros.base_node import BaseNode
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.main_thread import TaskQueue
 from surfel_mapper.ros.map_files import save_map
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.outputs import Outputs
-from surfel_mapper.ros.outputs import warm_up as warm_up_outputs
 from surfel_mapper.ros.pose_outputs import registration_outputs
 from surfel_mapper.ros.services import Services
 
@@ -80,7 +77,7 @@ class Session:
         log, start = node.get_logger(), time.monotonic()
         log.info('loading kernels')
         with lasting_objects():
-            run_stages(self.warm_up_stages())
+            run_stages(node_stages(self.mapper))
         self.outputs = Outputs(node, self.mapper, self.thread)
         self.registration = registration_outputs(node, self.mapper, self.thread)
         self.services = Services(node, self.mapper, self.thread, self.outputs)
@@ -90,15 +87,6 @@ class Session:
         self._is_active = False
         self._viewer = self._opened_viewer()
         self.thread.start(self._on_update)
-
-    def warm_up_stages(self) -> list[CompileStage]:
-        """Return the stages that compile the kernels of input, mapping and default outputs."""
-        decoding = warm_up_depth if self.config.input.kind == 'depth' else warm_up_decoding
-        return [
-            CompileStage('decoding', decoding),
-            *self.mapper.warm_up_stages(),
-            CompileStage('messages', partial(warm_up_outputs, self.config)),
-        ]
 
     def activate(self) -> None:
         """Subscribe and start publishing; raises the errors of ``Inputs.subscribe``."""
