@@ -147,8 +147,9 @@ def node(*ros_args: object) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def play(running: subprocess.Popen[bytes], bag: Path) -> dict[str, dict[str, int]]:
-    """Play the bag once the node has compiled and subscribed; return the messages sent."""
-    words = command('play', bag, '--wait-for', '/points', '/odom', '--timeout', 600, '--json')
+    """Play the bag as fast as the node maps it, once it is ready; return the messages sent."""
+    paced = ['--paced-by', '/surfel_mapper/changed', '--timeout', 1800]
+    words = command('play', bag, '--wait-for', '/points', '/odom', *paced, '--json')
     with subprocess.Popen(words, stdout=subprocess.PIPE) as playing:
         while playing.poll() is None:
             if running.poll() is not None:

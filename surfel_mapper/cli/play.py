@@ -44,11 +44,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='wait for a subscriber of each of these before playing',
     )
     add(
+        '--paced-by',
+        metavar='T',
+        help='publish a cloud only once the clouds before it are answered on this topic, such as '
+        '/surfel_mapper/changed, so that a slow node drops none',
+    )
+    add(
         '--timeout',
         type=seconds,
         default=60.0,
         metavar='S',
-        help='longest wait for subscribers, s (%(default)s)',
+        help='longest wait for subscribers and for an answer, s (%(default)s)',
     )
     add('--json', action='store_true', help='report as JSON')
     add_verbosity(parser)
@@ -69,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
             loop=args.loop,
             clock=args.clock,
             wait_for=args.wait_for,
+            paced_by=args.paced_by,
             timeout_s=args.timeout,
             ros_args=args.ros_args,
         )

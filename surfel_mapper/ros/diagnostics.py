@@ -26,6 +26,7 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from std_msgs.msg import Header
 
+from surfel_mapper.compilation import PROGRESS
 from surfel_mapper.config import Config
 from surfel_mapper.pipeline.reduction import standing_sensor
 from surfel_mapper.ros.base_node import CountedPublisher, steady_timer
@@ -69,8 +70,10 @@ class Diagnostics:
     def _on_timer(self) -> None:
         """Request a report from the mapping thread, or report that it does not answer."""
         session, now_s = self._session, time.monotonic()
-        if session is None:
-            self._publish(OK, self._node.state, {'state': self._node.state})
+        if session is None or PROGRESS.is_active:
+            text = PROGRESS.text if PROGRESS.is_active else self._node.state
+            self._asked_s = None if PROGRESS.is_active else self._asked_s
+            self._publish(OK, text, {'state': self._node.state, 'compiling': PROGRESS.stage})
             return
         if self._asked_s is None:
             self._asked_s = now_s

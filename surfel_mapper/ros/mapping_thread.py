@@ -7,6 +7,9 @@ Callbacks only append to the queue, so messages are taken from the middleware as
 queues overwrite old messages silently, while drops from this queue are counted. Poses overtake
 clouds. They are small, and a backlog of clouds would otherwise be mapped before the poses that it
 needs, although these have arrived.
+
+A kernel that is compiled only now, for a rare input, must cost no cloud: the queue is then bounded
+by bytes, until it is as short again as its usual bound in clouds.
 """
 
 from __future__ import annotations
@@ -19,7 +22,9 @@ from itertools import chain
 import threading
 from typing import Any, NamedTuple, TypeVar
 
+from surfel_mapper.compilation import PROGRESS
 from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.memory import machine_bytes
 from surfel_mapper.messages.cdr import frame_name
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import StampedPose
@@ -36,6 +41,9 @@ MAX_POSES = 10_000
 Most poses in the queue, 10 s of odometry at 1 kHz; then the oldest is dropped. Static ones are
 kept apart, as they do not come again.
 """
+
+SHARE_OF_MEMORY = 8
+"""Clouds that come while kernels compile take at most this fraction of the machine's memory."""
 
 TOO_FAST = f'clouds come faster than they can be mapped; {REMEDIES["overload"]}'
 
@@ -117,6 +125,9 @@ class MappingThread:
         self._images: defaultdict[str, deque[SceneImage]] = defaultdict(deque)  # by kind
         self._work: deque[QueuedCloud | Call] = deque()
         self._num_clouds = 0
+        self._num_bytes = 0
+        self._max_bytes = machine_bytes() // SHARE_OF_MEMORY
+        self._is_behind = False  # because of kernels that were compiled
         self._lost: Counter[LostCloud | LostPose] = Counter()
         self._stopping = False
         self._thread = threading.Thread()
@@ -188,14 +199,27 @@ class MappingThread:
         """Queue a cloud or depth image; if the queue is full, drop the oldest."""
         with self._changed:
             self._work.append(QueuedCloud(msg, topic, decode))
-            self._num_clouds += 1
-            if self._num_clouds > self._max_clouds:
+            self._count_cloud(msg, 1)
+            self._is_behind |= PROGRESS.is_active
+            while self._is_full():
                 oldest = next(item for item in self._work if isinstance(item, QueuedCloud))
                 self._work.remove(oldest)
-                self._num_clouds -= 1
+                self._count_cloud(oldest.msg, -1)
                 reason = f'in frame {oldest.frame_id!r}, {TOO_FAST}'
                 self._lost[LostCloud('overload', oldest.topic, reason, oldest.frame_id)] += 1
             self._changed.notify()
+
+    def _is_full(self) -> bool:
+        """Return whether the oldest cloud has to go; called with the lock held."""
+        self._is_behind &= self._num_clouds > self._max_clouds or PROGRESS.is_active
+        if self._is_behind:
+            return self._num_bytes > self._max_bytes and self._num_clouds > 1
+        return self._num_clouds > self._max_clouds
+
+    def _count_cloud(self, msg: Any, number: int) -> None:
+        """Count a cloud that enters (1) or leaves (-1) the queue; called with the lock held."""
+        self._num_clouds += number
+        self._num_bytes += number * len(msg.data)
 
     @property
     def num_clouds(self) -> int:
@@ -248,7 +272,8 @@ class MappingThread:
             poses, self._poses = self._poses, deque()
             images, self._images = self._images, defaultdict(deque)
             item = self._work.popleft() if self._work else None
-            self._num_clouds -= isinstance(item, QueuedCloud)
+            if isinstance(item, QueuedCloud):
+                self._count_cloud(item.msg, -1)
             lost, self._lost = self._lost, Counter()
         with self._mapper.guarded('counting of drops'):
             self._count(lost)

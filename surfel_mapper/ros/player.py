@@ -11,12 +11,7 @@ message, and waits until the last is acknowledged.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from importlib import import_module
 import logging
-import os
-from pathlib import Path
-import re
-import sys
 import time
 from typing import Any
 
@@ -30,7 +25,9 @@ from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.errors import BagError, DependencyError, SubscriberError
 from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.ros.context import context, enlarge_shared_memory
+from surfel_mapper.ros.message_types import message_type
 from surfel_mapper.ros.messages import time_message
+from surfel_mapper.ros.pace import Pace
 
 log = logging.getLogger(__name__)
 
@@ -45,23 +42,7 @@ SETTLE_S = 0.5
 
 CLOCK_PERIOD_S = 0.01
 
-TYPE_NAME = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)')
-"""A message type; the name of a package has neither dots nor capitals."""
-
-MESSAGE_PACKAGES = frozenset(
-    {
-        'builtin_interfaces',
-        'diagnostic_msgs',
-        'geometry_msgs',
-        'nav_msgs',
-        'rosgraph_msgs',
-        'sensor_msgs',
-        'std_msgs',
-        'tf2_msgs',
-        'visualization_msgs',
-    }
-)
-"""Packages of messages that this package depends on, for a ROS from PyPI without ament index."""
+CLOUD = 'sensor_msgs/msg/PointCloud2'
 
 
 def play(
@@ -72,6 +53,7 @@ def play(
     loop: bool = False,
     clock: bool = False,
     wait_for: Collection[str] = (),
+    paced_by: str | None = None,
     timeout_s: float = 60.0,
     ros_args: Sequence[str] = (),
 ) -> dict[str, Any]:
@@ -92,8 +74,11 @@ def play(
         Publish the record time on /clock.
     wait_for : collection of str
         Start when each of these topics has a subscriber.
+    paced_by : str, optional
+        Wait for messages on this topic with the stamps of the clouds, so that a node never gets
+        more clouds than it maps.
     timeout_s : float
-        Longest wait for these subscribers, s.
+        Longest wait for subscribers, and for each answer on ``paced_by``, s.
     ros_args : sequence of str
         The command line from --ros-args on, that included.
 
@@ -107,7 +92,7 @@ def play(
     BagError
         If a topic is not in the bag, none can be played, or it is a ROS 1 bag.
     SubscriberError
-        If a topic has no subscriber in time.
+        If a topic has no subscriber, or a cloud no answer, in time.
 
     """
     keep_freed_memory()
@@ -117,6 +102,8 @@ def play(
         try:
             player = Player(node, reader, topics, rate=rate, clock=clock)
             player.wait_for_subscribers(wait_for, timeout_s)
+            if paced_by is not None:
+                player.pace = Pace(node, paced_by, timeout_s)
             start = time.monotonic()
             player.play()
             while loop:
@@ -138,8 +125,12 @@ class Player:
         Number of messages published, by topic.
     skipped : dict of str to str
         Reason why a topic is not published.
+    pace : Pace, optional
+        Bounds the clouds that are on the way.
 
     """
+
+    pace: Pace | None = None
 
     def __init__(
         self,
@@ -162,6 +153,7 @@ class Player:
         self.published: dict[str, int] = {}
         self.skipped: dict[str, str] = {}
         self._publishers: dict[str, Publisher] = {}
+        self._clouds = {topic.name for topic in reader.topics if topic.type == CLOUD}
         self._make_publishers(node, topics)
 
     def _make_publishers(self, node: Node, names: Collection[str] | None) -> None:
@@ -216,6 +208,8 @@ class Player:
             self._sleep_until(due_s, message.record_ns)
             self._publishers[message.topic].publish(bytes(message.raw))
             self.published[message.topic] += 1
+            if self.pace is not None and message.topic in self._clouds:
+                self.pace.published(message.raw)
 
     def _sleep_until(self, due_s: float, record_ns: int) -> None:
         """Sleep until a message is due; meanwhile publish the bag time on /clock."""
@@ -231,47 +225,11 @@ class Player:
                 return
 
     def flush(self) -> None:
-        """Wait until all reliable subscribers have all messages."""
+        """Wait until all reliable subscribers have all messages, and all clouds are answered."""
+        if self.pace is not None:
+            self.pace.wait()
         clock = {'/clock': self._clock} if self._clock is not None else {}
         for name, publisher in {**self._publishers, **clock}.items():
             if not publisher.wait_for_all_acked(Duration(seconds=5)):
                 log.warning('%s: a subscriber has not confirmed all messages after 5 s', name)
         time.sleep(SETTLE_S)
-
-
-def message_type(name: str) -> Any:
-    """
-    Return the class of a message type such as nav_msgs/msg/Odometry.
-
-    The name comes from a bag, so it is looked up before anything is imported: the package must
-    be one that the ament index lists as having interfaces, or one that this package depends on.
-    Importing by the text of a bag ran a Python package that lay in the working directory.
-
-    Raises
-    ------
-    DependencyError
-        If the name is not package/msg/Name, or its package is not an installed one of messages.
-
-    """
-    match = TYPE_NAME.fullmatch(name)
-    if match is None:
-        raise DependencyError(f'its type {name!r} is not package/msg/Name')
-    package, message = match.groups()
-    if package not in MESSAGE_PACKAGES and package not in packages_with_messages():
-        raise DependencyError(
-            f'its type {name} is not installed: no package {package} of messages'
-        )
-    try:
-        return getattr(import_module(f'{package}.msg'), message)
-    except (ImportError, AttributeError) as error:
-        raise DependencyError(f'its type {name} is not installed ({error})') from error
-
-
-def packages_with_messages() -> frozenset[str]:
-    """Return the packages that the ament index lists with ROS interfaces; none without ament."""
-    found = set[str]()
-    for prefix in [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]:
-        folder = Path(prefix, 'share', 'ament_index', 'resource_index', 'rosidl_interfaces')
-        if prefix and folder.is_dir():
-            found.update(path.name for path in folder.iterdir())
-    return frozenset(found)

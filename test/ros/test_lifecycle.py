@@ -21,12 +21,12 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
+from surfel_mapper.compilation import CompileStage
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.checkpoints import checkpoint_paths
-from surfel_mapper.pipeline.reduction import WarmUpSteps
 from surfel_mapper.ros.context import context
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.main import create_node, executing
@@ -160,8 +160,8 @@ def test_settings_changed_while_kernels_compile_are_used(prefork, peer, monkeypa
         changed = peer.parameters().set_parameters([Parameter('window.max_scans', value=2)])
         answers.extend(peer.result(changed).results)
 
-    steps = WarmUpSteps([compile_until_set], [], [])
-    monkeypatch.setattr(Mapper, 'warm_up_steps', lambda mapper: steps)
+    stages = [CompileStage('settings', compile_until_set)]
+    monkeypatch.setattr(Mapper, 'warm_up_stages', lambda mapper: stages)
     with context(ARGUMENTS):
         node = MapperNode()
         with executing(node):

@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
+from surfel_mapper.compilation import PROGRESS
 from surfel_mapper.config import Config
 from surfel_mapper.messages.poses import poses_in, StampedPose
 from surfel_mapper.pipeline import Mapper
@@ -69,6 +70,22 @@ def bench():
     bench.release()
     bench.thread.stop()
     assert bench.failures == []
+
+
+def test_no_cloud_is_dropped_because_kernels_compile(bench):
+    stamps = [START_NS + i * PERIOD_NS for i in range(3 * MAX_CLOUDS)]
+    bench.hold()
+    PROGRESS.begin()
+    for stamp_ns in stamps[:-1]:
+        bench.put_cloud(stamp_ns)
+    PROGRESS.end()
+    bench.put_cloud(stamps[-1])  # the backlog is still there
+    for stamp_ns in stamps:
+        bench.put_pose(stamp_ns)
+    bench.release()
+    bench.thread.call(lambda: None).result(TIMEOUT_S)
+    assert bench.stamps == stamps
+    assert not bench.mapper.counters.dropped
 
 
 def test_poses_overtake_clouds_so_that_a_backlog_is_mapped_completely(bench):

@@ -31,7 +31,8 @@ from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.cli.main import main
 from surfel_mapper.errors import DependencyError
 from surfel_mapper.ros import context
-from surfel_mapper.ros.player import message_type
+from surfel_mapper.ros.message_types import message_type
+from surfel_mapper.ros.pace import UNANSWERED
 from test.bags.recorded import (
     drive,
     NUM_SCANS,
@@ -129,6 +130,32 @@ def test_a_latched_topic_is_published_latched(start, peer, tmp_path):
 
     peer.spin_until(lambda: late)
     assert playing.is_running()
+
+
+def test_clouds_wait_for_the_answers_of_a_slow_node(start, peer, tmp_path):
+    bag = write_rosbag2(tmp_path / 'bag', drive())
+    clouds = peer.subscribe(PointCloud2, '/points')
+    answers = peer.node.create_publisher(PointCloud2, '/answers', 10)
+
+    playing = start(
+        *('play', bag, '--rate', 1000, '--wait-for', '/points', '--paced-by', '/answers'),
+        *('--timeout', 120, '--json'),
+    )
+    for number in range(NUM_SCANS - UNANSWERED - 1):
+        peer.spin_until(lambda number=number: len(clouds) == number + UNANSWERED + 1)
+        peer.spin_for(0.2)  # enough for all of the bag
+        assert len(clouds) == number + UNANSWERED + 1
+        answers.publish(PointCloud2(header=clouds[number].header))
+    assert playing.is_running()
+    answers.publish(PointCloud2(header=clouds[-1].header))  # answers all before it too
+    peer.spin_until(lambda: len(clouds) == NUM_SCANS)
+    answers.publish(PointCloud2(header=clouds[-1].header))
+    assert report(playing)['published']['/points'] == NUM_SCANS
+
+
+def test_a_node_that_does_not_answer_is_reported(domain, capsys, bag):
+    assert main(['play', str(bag), '--paced-by', '/answers', '--timeout', '0.2']) == 1
+    assert 'no publisher of /answers within 0.2 s' in capsys.readouterr().err
 
 
 def test_a_missing_subscriber_is_reported_with_a_remedy(domain, capsys, bag):

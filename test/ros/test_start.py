@@ -1,72 +1,55 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The first start of a node over DDS: scans are mapped while kernels still compile."""
+"""The start of a node over DDS, without compiled kernels and with them."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+import re
 import sys
 import threading
 
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
-from nav_msgs.msg import OccupancyGrid
-from numba import njit
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
 
-from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.pipeline import Mapper
-from surfel_mapper.pipeline.reduction import WarmUpSteps
 from surfel_mapper.ros.context import context
 from surfel_mapper.ros.main import create_node, executing
-from surfel_mapper.ros.node import MapperNode
-from test.ros.driving import ARGUMENTS, arguments, drive, mapped, send
-from test.ros.live import LATCHED, NODE
+from test.ros.driving import ARGUMENTS, drive, mapped, send
+from test.ros.live import NODE
 from test.test_threads import may_run_in_real_time
 
 MANY = QoSProfile(depth=200, durability=DurabilityPolicy.VOLATILE)
 
 
-def rows_of(message):
-    """Return the surfels of a message: normal and count by position."""
-    scan = to_scan(message)
-    columns = [scan.columns[f'normal_{axis}'] for axis in 'xyz'] + [scan.columns['num_points']]
-    values = np.stack([column.astype(float) for column in columns], axis=1)
-    return dict(zip(map(tuple, scan.points.tolist()), values.tolist(), strict=True))
-
-
-def test_scans_are_mapped_before_surfels_can_be_derived(prefork, peer, monkeypatch):
-    compiled = threading.Event()
-    steps = WarmUpSteps([lambda: njit(lambda x: x + 1)(1)], [compiled.wait], [])
-    monkeypatch.setattr(Mapper, 'warm_up_steps', lambda mapper: steps)
-    changed = peer.subscribe(PointCloud2, f'{NODE}/changed', MANY)
-    normals = peer.subscribe(PointCloud2, f'{NODE}/normals', LATCHED)
-    grids = peer.subscribe(OccupancyGrid, f'{NODE}/grid', LATCHED)
+def test_a_node_without_compiled_kernels_says_what_it_compiles_and_drops_no_cloud(
+    start_anew, peer, tmp_path, monkeypatch
+):
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
+    node = start_anew('node', *ARGUMENTS)
+    reports = peer.subscribe(DiagnosticArray, '/diagnostics')
+    changed = peer.collect(PointCloud2, f'{NODE}/changed', MANY)
+    peer.advertise('/odom', '/points')  # returns when the node has subscribed
     messages = drive(6)
-    with context(arguments(**{'grid.rate_hz': 20.0})):
-        node = MapperNode()
-        with executing(node):
-            node.start()
-            peer.advertise('/odom', '/points')
-            send(peer, messages)
-            peer.diagnosis({'scans.mapped': 6})
-            assert changed == normals == grids == []
+    send(peer, messages)
+    peer.spin_until(lambda: len(changed) == 6)
 
-            compiled.set()
-            peer.spin_until(lambda: normals and changed and grids)
-            node.end()
-        node.destroy_node()
-    _, twin = mapped(messages)
-    position = twin.map.surfels(twin.config.map.min_points).position
-    expected = {tuple(xyz) for xyz in position.astype(np.float32).tolist()}
-    assert rows_of(normals[-1]) == rows_of(changed[0])
-    assert set(rows_of(normals[-1])) == expected
-    assert len(expected) > 100
+    compiling = [status.message for report in reports for status in report.status]
+    assert any(
+        re.fullmatch(r'compiling kernels, once on this machine: \d of \d \(.+\)', text)
+        for text in compiling
+    )
+    assert re.search(r'compiling kernels, once on this machine: 1 of \d \(decoding\)', node.output)
+    assert re.search(r'\d+ kernels compiled in [\d.]+ s', node.output)
+    updates, _ = mapped(messages)
+    assert [each.width for each in changed] == [len(update.changed) for update in updates]
+    _, values = peer.diagnosis({'scans.mapped': 6})
+    assert 'scans.dropped.overload' not in values
 
 
 def test_with_cached_kernels_the_first_scan_is_published(start, peer):
