@@ -78,6 +78,7 @@ HOMES = {
     'rerun_bindings': ('viz/',),
     'OCP': ('files/model_step',),
     'trimesh': ('viz/gltf',),
+    'mcap': ('bags/streamed_mcap',),
     'rosbags': ('bags/_rosbags',),
     'rosgraph_msgs': ('ros/',),
     'rosidl_runtime_py': ('ros/',),

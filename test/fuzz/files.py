@@ -13,7 +13,7 @@ import time
 
 import numpy as np
 
-from surfel_mapper.bags.compression import unpack_file, unpacked_message
+from surfel_mapper.bags.compression import unpack_file
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.config import load_config, TsdfConfig
 from surfel_mapper.errors import ConfigError, SurfelMapperError
@@ -99,9 +99,7 @@ def metadata(data: bytes) -> None:
 
 
 def packed(data: bytes) -> None:
-    """Unpack a message and a file."""
-    with contextlib.suppress(Exception):  # its caller takes any for a damaged bag
-        unpacked_message(data)
+    """Unpack a file."""
     refused(lambda path: unpack_file(path, path.with_suffix('.out')), 'input.zstd', data)
 
 

@@ -22,7 +22,6 @@ from PIL import Image
 import pytest
 import yaml
 
-from surfel_mapper.bags import decoders
 from surfel_mapper.bags import reader as bag_reader
 from surfel_mapper.bags.paths import files_of, stated_counts
 from surfel_mapper.cli.main import main
@@ -53,7 +52,6 @@ from surfel_mapper.messages.poses import raw_poses
 from surfel_mapper.offline.datasets import nuscenes
 from surfel_mapper.simulation.world import World
 from test import extras
-from test.bags.recorded import drive, ROS1, write_ros1
 from test.bags.records import record, text
 from test.fuzz import corpus
 
@@ -493,15 +491,6 @@ def test_settings_of_numbers_that_only_python_reads_are_refused(capsys):
         assert '1_0' in capsys.readouterr().err
 
 
-def test_metadata_of_too_many_files_is_refused_before_a_path_is_made(tmp_path):
-    """It took 1.4 s for 50,000."""
-    names = ''.join(f'    - a{number}.mcap\n' for number in range(50_000))
-    text = f'rosbag2_bagfile_information:\n  relative_file_paths:\n{names}'
-    (tmp_path / 'metadata.yaml').write_text(text)
-    with pytest.raises(BagError, match='50000 files, expected at most 10000'):
-        files_of(tmp_path)
-
-
 @pytest.mark.parametrize(
     ('text', 'problem'),
     [
@@ -618,39 +607,3 @@ def test_a_state_is_read_without_threads(saved, monkeypatch):
     """A thread that could not allocate ended without a word, and the reader waited for it."""
     monkeypatch.setattr(threading.Thread, 'start', lambda self: pytest.fail('a thread'))
     load_map(saved)
-
-
-@pytest.mark.parametrize(
-    'nested',
-    ['nav_msgs/Odometry a', 'B[] a', 'B[60000] a', 'C[60000] a', 'C[200] a\nC[801] b'],
-)
-def test_definitions_of_ros1_without_bounds_are_refused(nested):
-    """Nested arrays of nothing, 60,000 by 60,000, were read for hours; 2^31 filled the memory."""
-    rule = '\n' + '=' * 80 + '\nMSG: nav_msgs/'
-    text = f'{nested}{rule}B\nuint8[0] x{rule}C\nuint8 x'
-    definition = SimpleNamespace(data=text)
-    with pytest.raises(ValueError, match='values'):
-        decoders.ros1_types(SimpleNamespace(msgdef=definition, msgtype='nav_msgs/msg/Odometry'))
-    definition.data = f'C[200] a\nC[800] b{rule}C\nuint8 x'
-    decoders.ros1_types(SimpleNamespace(msgdef=definition, msgtype='nav_msgs/msg/Odometry'))
-
-
-@pytest.mark.parametrize('definition', [b'string x\n' * 100_000, b'string x\n' * 2])
-def test_definitions_of_ros1_are_parsed_once_and_up_to_a_size(tmp_path, monkeypatch, definition):
-    """Each message parsed one that is wrong again, 5 s for 900 kB; so did 5 kB of bz2."""
-    entries = drive(store=ROS1)
-    path = write_ros1(tmp_path / 'a.bag', entries)
-    parsed = []
-    types = decoders.ros1_types
-
-    def counted(connection):
-        parsed.append(connection)
-        wrong = SimpleNamespace(data=definition.decode())
-        return types(SimpleNamespace(msgdef=wrong, msgtype=connection.msgtype))
-
-    monkeypatch.setattr(decoders, 'ros1_types', counted)
-    with bag_reader.BagReader(path) as reader:
-        for message in reader.messages(['/odom']):
-            with pytest.raises(BagError, match='no nav_msgs/msg/Odometry: '):
-                reader.decode(message)
-    assert len(parsed) == 1
