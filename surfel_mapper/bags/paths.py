@@ -18,7 +18,6 @@ from typing import Any
 from surfel_mapper.config import read_yaml
 from surfel_mapper.errors import BagError
 from surfel_mapper.files.atomic import by_number
-from surfel_mapper.files.text_table import whole
 
 STORAGE_SUFFIXES = ('.mcap', '.db3')
 PACKED_SUFFIX = '.zstd'
@@ -84,7 +83,7 @@ def stated_counts(path: Path) -> dict[str, int]:
         return {}
     try:
         return {
-            row['topic_metadata']['name']: whole(row['message_count'])
+            row['topic_metadata']['name']: int(row['message_count'])
             for row in information['topics_with_message_count']
         }
     except (KeyError, TypeError, ValueError) as error:

