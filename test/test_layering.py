@@ -22,9 +22,9 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'surfel_mapper'
 
 LEVELS = (
-    {'compilation', 'errors'},
+    {'compilation', 'errors', 'memory'},
     {'arguments', 'budget', 'kernels'},
-    {'config', 'counters', 'geometry', 'memory', 'scan', 'threads'},
+    {'config', 'counters', 'geometry', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},
     {'files', 'messages'},

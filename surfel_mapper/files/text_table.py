@@ -54,8 +54,8 @@ def read_table(
     Raises
     ------
     FileFormatError
-        If the text has fewer or more rows, other words than numbers, or a number that its type
-        cannot hold.
+        If the text has fewer or more rows, other words than numbers, a number that its type
+        cannot hold, or more rows than memory.
 
     """
     rows = None if is_last else count
@@ -64,7 +64,7 @@ def read_table(
         warnings.simplefilter('ignore', UserWarning)  # no rows
         try:
             table = np.loadtxt(file, layout, comments=None, ndmin=1, max_rows=rows)
-        except (ValueError, DeprecationWarning) as error:
+        except (ValueError, DeprecationWarning, MemoryError) as error:
             raise FileFormatError(f'{path}: {error}') from error
     if len(table) != count:
         raise FileFormatError(f'{path}: {len(table)} rows, expected {count} points; truncated?')
