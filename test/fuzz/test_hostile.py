@@ -464,10 +464,10 @@ def test_settings_of_numbers_that_only_python_reads_are_refused(capsys):
     ('text', 'problem'),
     [
         ('a: {b: &x {c: 1}, d: *x}', None),
-        ('a: *x', 'unknown alias'),
-        ('? [1]\n: 2', 'no text'),
-        ('a: 1\n---\nb: 2', 'more than one document'),
-        ('&x [*x]', 'inside of an anchored node'),
+        ('a: *x', 'undefined alias'),
+        ('? [1]\n: 2', 'unhashable key'),
+        ('a: 1\n---\nb: 2', 'another document'),
+        ('&x [*x]', 'recursion'),
         ('', None),
     ],
 )
