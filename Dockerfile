@@ -9,7 +9,7 @@
 
 FROM ros:jazzy-ros-base AS robot
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
-# numba and rosbags have no apt packages on Ubuntu 24.04, and packages of the system stay as they are.
+# numba, rosbags and mcap have no apt packages on Ubuntu 24.04, and packages of the system stay as they are.
 # hadolint ignore=DL3008
 RUN apt-get update && apt-get install -y --no-install-recommends \
         python3-matplotlib python3-numpy python3-pil python3-scipy python3-tqdm python3-venv \
@@ -17,7 +17,8 @@ RUN apt-get update && apt-get install -y --no-install-recommends \
         ros-jazzy-visualization-msgs \
     && rm -rf /var/lib/apt/lists/* \
     && python3 -m venv --system-site-packages /opt/surfel_mapper_venv \
-    && /opt/surfel_mapper_venv/bin/pip install --no-cache-dir 'numba>=0.61' 'rosbags>=0.11.7,<0.12'
+    && /opt/surfel_mapper_venv/bin/pip install --no-cache-dir \
+        'numba>=0.61' 'rosbags>=0.11.7,<0.12' 'mcap>=1.1'
 COPY . /ros2_ws/src/surfel_mapper
 WORKDIR /ros2_ws
 RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select surfel_mapper

@@ -24,13 +24,14 @@ SITE = 'https://surfel-mapper.example'
 
 REQUIRED = [
     # The lower bounds are what Ubuntu 24.04 has, the system of ROS 2 Jazzy, so that its apt
-    # packages are kept; of numba and rosbags, which it lacks, the oldest that the tests pass with.
+    # packages are kept; of numba, rosbags and mcap, which it lacks, the oldest that pass tests.
     'numpy>=1.26',  # arrays; 1.26 is what the messages of ROS from apt are compiled for
     'scipy>=1.11',  # rotations and spatial search beyond the kernels
     'numba>=0.61',  # compiles the kernels; 0.61 is the first for Python 3.13
     # bags of ROS 1 and 2 without ROS; brings lz4 and backports.zstd. Bounded above, because
     # bags/_rosbags.py fills tables of its readers that are no public interface
     'rosbags>=0.11.7,<0.12',
+    'mcap>=1.1',  # reads mcap files that a killed recorder left without an index; MIT
     'PyYAML>=6.0',  # settings
     'tqdm>=4.66',  # progress on a terminal
     'argcomplete>=3.1',  # Tab completes verbs, options and settings; ros2 itself needs it
@@ -123,7 +124,6 @@ TEST = [
     'plyfile>=1.0.1',  # an independent reader of what we write
     'pypcd4>=1.1',  # likewise
     'pandas>=2.0',  # Surfels.to_pandas
-    'mcap>=1.1',  # an independent writer of what we read
 ]
 
 # Pinned, so that every machine reaches the same verdict; `make lint` keeps them in an environment

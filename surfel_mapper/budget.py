@@ -1,46 +1,38 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Budget: the bytes and seconds that reading one input may take.
+Budget: the bytes that reading one message may take.
 
-A reader of foreign bytes asks its budget before each allocation and each loop whose size the input
-states. The limit is proportional to the size of the input, with a floor that small inputs may
+A reader of bytes from the network asks its budget before each allocation whose size the message
+states. The limit is proportional to the size of the message, with a floor that small messages may
 always use and an upper bound of three quarters of the memory of the machine. The environment
-variable SURFEL_MAPPER_MAX_BYTES replaces it by one number for inputs of any size. Time is
-processor time of the thread, so that a busy machine refuses nothing.
+variable SURFEL_MAPPER_MAX_BYTES replaces it by one number for messages of any size.
 
-``read_small_file`` reads files that people write, such as settings.
+``read_small_file`` reads files that people write, such as settings, ``open_regular`` opens others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 import errno
-from functools import cache
 import os
 from pathlib import Path
 import re
 import stat
-import time
 from typing import BinaryIO
 
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.memory import machine_bytes
 
 FLOOR_BYTES = 64 << 20
-"""Memory that reading any input may take: one unpacked chunk, one image of 16 Mpixel."""
+"""Memory that reading any message may take: one image of 16 Mpixel."""
 
 BYTES_PER_BYTE = 20
-"""Memory per byte of input above the floor; 16 bytes of a point become 40, 60 of a voxel 200."""
-
-FLOOR_S = 5.0
-"""Processor time that reading any input may take, s."""
-
-SECONDS_PER_BYTE = 1e-6
-"""Processor time per byte of input above the floor; the slowest reader (text) takes 200 ns."""
+"""Memory per byte of a message above the floor; 16 bytes of a point become 40."""
 
 VARIABLE = 'SURFEL_MAPPER_MAX_BYTES'
-"""Environment variable with the limit of memory for one input of any size, bytes."""
+"""Environment variable with the limit of memory for one message, and for a verb that reads files,
+bytes."""
 
 MAX_TEXT_BYTES = 1 << 20
 """Size limit of files that people write: settings, chains of filters, metadata.yaml."""
@@ -51,29 +43,25 @@ NOT_REGULAR = 'not a regular file'
 
 class Budget:
     """
-    The bytes and seconds that reading one input may take.
+    The bytes that reading one input may take.
 
     Parameters
     ----------
     name : str or Path
-        File or topic, named in errors.
+        Topic or file, named in errors.
     size : int
         Bytes of the input.
     error : callable of str to Exception
         Class of the errors of the reader.
-    ratio : int
-        Memory per byte of input.
     floor : int
         Memory that is always allowed, bytes.
 
     Attributes
     ----------
-    max_bytes, max_seconds : int, float
-        The limits.
+    max_bytes : int
+        The limit.
     used_bytes : int
-        Memory requested and not yet returned, bytes.
-    used_s : float
-        Processor time spent in ``clock``, s.
+        Memory requested, bytes.
 
     """
 
@@ -83,25 +71,12 @@ class Budget:
         size: int,
         error: Callable[[str], Exception],
         *,
-        ratio: int = BYTES_PER_BYTE,
         floor: int = FLOOR_BYTES,
     ) -> None:
         self.name = name
-        self.max_bytes = limit_for(size, ratio, floor)
-        self.max_seconds = max(FLOOR_S, SECONDS_PER_BYTE * size)
+        self.max_bytes = limit_for(size, floor)
         self.used_bytes = 0
-        self.used_s = 0.0
         self._error = error
-        self._start_s: float | None = None
-
-    @classmethod
-    def of_file(cls, path: str | Path, error: Callable[[str], Exception]) -> Budget:
-        """Return the budget of a file by its size, which is 0 for pipes and missing files."""
-        try:
-            size = os.stat(path).st_size
-        except OSError:
-            size = 0
-        return cls(path, size, error)
 
     def take(self, num_bytes: int, purpose: str) -> None:
         """
@@ -122,36 +97,10 @@ class Budget:
             )
         self.used_bytes = needed
 
-    def give_back(self, num_bytes: int) -> None:
-        """Return memory that was freed."""
-        self.used_bytes -= num_bytes
 
-    @contextmanager
-    def clock(self) -> Iterator[None]:
-        """Count the processor time of a with-block; callers that consume the results pay not."""
-        if self._start_s is not None:
-            yield  # in an outer block
-            return
-        self._start_s = time.thread_time()
-        try:
-            yield
-        finally:
-            self.used_s += time.thread_time() - self._start_s
-            self._start_s = None
-
-    def check_time(self) -> None:
-        """Raise the error of the reader if reading has taken too much processor time."""
-        running_s = 0.0 if self._start_s is None else time.thread_time() - self._start_s
-        if self.used_s + running_s > self.max_seconds:
-            raise self._error(
-                f'{self.name}: reading took over {self.max_seconds:.1f} s of processor time, the '
-                'limit for an input of this size; is it damaged?'
-            )
-
-
-def limit_for(size: int, ratio: int = BYTES_PER_BYTE, floor: int = FLOOR_BYTES) -> int:
+def limit_for(size: int, floor: int) -> int:
     """Return the limit of memory for an input of a size, bytes."""
-    return stated_limit() or min(max(floor, ratio * size), upper_bound())
+    return stated_limit() or min(max(floor, BYTES_PER_BYTE * size), machine_bytes() * 3 // 4)
 
 
 def stated_limit() -> int:
@@ -171,15 +120,6 @@ def stated_limit() -> int:
             f'{VARIABLE}: {text!r}, expected a positive number of bytes, such as 4294967296'
         )
     return int(text or 0)
-
-
-@cache
-def upper_bound() -> int:
-    """Return three quarters of the memory of the machine, bytes; 3 GiB if that is unknown."""
-    try:
-        return os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') * 3 // 4
-    except (ValueError, OSError, AttributeError):
-        return 3 << 30
 
 
 def read_small_file(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:

@@ -22,9 +22,9 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'surfel_mapper'
 
 LEVELS = (
-    {'compilation', 'errors'},
+    {'compilation', 'errors', 'memory'},
     {'arguments', 'budget', 'kernels'},
-    {'config', 'counters', 'geometry', 'memory', 'scan', 'threads'},
+    {'config', 'counters', 'geometry', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},
     {'files', 'messages'},
@@ -78,6 +78,7 @@ HOMES = {
     'rerun_bindings': ('viz/',),
     'OCP': ('files/model_step',),
     'trimesh': ('viz/gltf',),
+    'mcap': ('bags/streamed_mcap',),
     'rosbags': ('bags/_rosbags',),
     'rosgraph_msgs': ('ros/',),
     'rosidl_runtime_py': ('ros/',),

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
 SETUP = (ROOT / 'setup.py').read_text(encoding='utf-8')
 APT_NAMES = {'pyyaml': 'yaml', 'pillow': 'pil'}  # python3-yaml, python3-pil
-NO_RULE = {'numba'}  # no rosdep rule for Ubuntu 24.04
+NO_RULE = {'mcap', 'numba'}  # no rosdep rule for Ubuntu 24.04
 
 
 def test_the_version_is_the_same_everywhere():
@@ -85,8 +85,8 @@ def test_pixi_and_docker_state_the_bounds_of_setup():
     stated['matplotlib'] = stated.pop('matplotlib-base')  # without the widgets of a desktop
     assert {name.lower(): bound for name, bound in bounds.items()}.items() <= stated.items()
     docker = (ROOT / 'Dockerfile').read_text(encoding='utf-8')
-    pinned = dict(re.findall(r"'(numba|rosbags)([^']+)'", docker))
-    assert pinned == {name: bounds[name] for name in ('numba', 'rosbags')}
+    pinned = dict(re.findall(r"'(numba|rosbags|mcap)([^']+)'", docker))
+    assert pinned == {name: bounds[name] for name in ('numba', 'rosbags', 'mcap')}
 
 
 def test_everything_pip_requires_is_known_to_rosdep_too():

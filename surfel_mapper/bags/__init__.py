@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Reading, salvaging and writing of bags.
+Reading and writing of bags.
 
-Reading is our own code because rosbags refuses a file that is cut off, which a killed recorder
-leaves, mcap and sqlite3 alike. The writer and the types of messages are those of rosbags.
+rosbags reads and writes whole bags. It refuses an mcap file that a killed recorder left without
+its index; the mcap package reads that up to the cut.
 """

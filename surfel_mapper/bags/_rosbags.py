@@ -3,9 +3,9 @@
 """
 The only module that imports rosbags, and the only one that uses its internals.
 
-rosbags is imported when the first bag is opened, since it takes 0.2 s. Beside its public writer
-and type store we rely on internals that setup.py therefore bounds to one minor
-version: the named tuples `Connection` and `Qos`, which our readers fill as rosbags does.
+rosbags is imported when the first bag is opened, since it takes 0.2 s. Beside its public readers,
+writer and type store we rely on internals, so setup.py bounds it to one minor version: the named
+tuples `Connection` and `Qos`, and the chunks of its reader of mcap.
 """
 
 from __future__ import annotations
@@ -15,31 +15,27 @@ from pathlib import Path
 import re
 from typing import Any, Literal, TYPE_CHECKING
 
+from surfel_mapper.bags.paths import is_ros1
 from surfel_mapper.bags.topics import SAME_AS
 from surfel_mapper.errors import DependencyError
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection as Connection
     from rosbags.interfaces import Qos
+    from rosbags.rosbag1 import Reader as Rosbag1
+    from rosbags.rosbag2 import Reader as Rosbag2
     from rosbags.rosbag2 import Writer
+    from rosbags.rosbag2.storage_mcap import McapReader as McapReader
     from rosbags.typesys.store import Typestore as Typestore
 
 TRANSIENT_LOCAL = re.compile(r'durability:\s*(1|transient_local)\b', re.IGNORECASE)
 """Durability of a latched topic in the YAML of a bag: a number or a name, by its version."""
 
-TYPE_HASH = re.compile(r'RIHS01_[0-9a-f]{64}')
-"""Hash of a message type, REP 2016."""
+IDL_HEAD = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
+"""The lines before each of the types in a definition as IDL."""
 
 BAG_VERSION: Literal[9] = 9
 """Version of metadata.yaml that rosbag2 of Jazzy writes."""
-
-
-MAX_DEFINITION = 1 << 15
-"""Limit of a definition that rosbags parses, characters; it takes 6 us for each."""
-
-
-MAX_VALUES = 1000
-"""Limit of the values that each message of a ROS 1 type has; rosbags unrolls them."""
 
 
 def import_rosbags() -> Any:
@@ -54,6 +50,35 @@ def import_rosbags() -> Any:
     return rosbags
 
 
+def open_indexed(path: Path) -> Rosbag1 | Rosbag2 | None:
+    """
+    Return rosbags' reader of a file, opened; None for mcap without a whole index.
+
+    rosbags reads mcap without chunks in the order of the file, not of time.
+    """
+    if is_ros1(path):
+        from rosbags.rosbag1 import Reader as Rosbag1
+
+        bag = Rosbag1(path)
+        bag.open()
+        return bag
+    from rosbags.rosbag2 import Reader as Rosbag2
+    from rosbags.rosbag2.storage_mcap import McapReader
+
+    reader = Rosbag2(path)
+    reader.open()
+    if isinstance(reader.storage, McapReader) and not is_indexed(reader.storage):
+        reader.close()
+        return None
+    return reader
+
+
+def is_indexed(mcap: McapReader) -> bool:
+    """Return whether each chunk has an index; of others rosbags yields nothing."""
+    is_empty = not mcap.metadata.message_count
+    return is_empty or (bool(mcap.chunks) and all(c.channel_count for c in mcap.chunks))
+
+
 def ros2_connection(
     key: int,
     topic: str,
@@ -62,11 +87,10 @@ def ros2_connection(
     *,
     encoding: str,
     qos: str,
-    definition: tuple[str, str] = ('', ''),
-    digest: str = '',
+    definition: tuple[str, str],
 ) -> Connection:
     """
-    Return the connection of a topic found in a rosbag2 file without an index.
+    Return the connection of a topic found in an mcap file without an index.
 
     Parameters
     ----------
@@ -82,8 +106,6 @@ def ros2_connection(
         The offered profiles as YAML.
     definition : (str, str)
         Format (ros2msg, ros2idl) and text of the message definition.
-    digest : str
-        Text with the hash of the type, from ROS 2 Iron on.
 
     """
     from rosbags.interfaces import (
@@ -97,31 +119,8 @@ def ros2_connection(
     kind, text = definition
     stated = MessageDefinition(formats.get(kind, MessageDefinitionFormat.NONE), text)
     profiles = [latched_profile()] if TRANSIENT_LOCAL.search(qos) else []
-    found = TYPE_HASH.search(digest)
     ext = ConnectionExtRosbag2(encoding, profiles)
-    return Connection(key, topic, type_, stated, found[0] if found else '', 0, ext, owner)
-
-
-def ros1_connection(
-    key: int, topic: str, owner: Any, *, type_: str, md5sum: str, definition: str, latching: int
-) -> Connection:
-    """Return the connection of a topic found in a ROS 1 bag without an index."""
-    from rosbags.interfaces import (
-        Connection,
-        ConnectionExtRosbag1,
-        MessageDefinition,
-        MessageDefinitionFormat,
-    )
-
-    package, _, name = type_.rpartition('/')
-    stated = MessageDefinition(MessageDefinitionFormat.MSG, definition)
-    ext = ConnectionExtRosbag1(None, latching)
-    return Connection(key, topic, f'{package}/msg/{name}', stated, md5sum, 0, ext, owner)
-
-
-def is_same(a: Connection, b: Connection) -> bool:
-    """Return whether two connections have the same topic, type and serialisation."""
-    return (a.topic, a.msgtype, is_cdr(a)) == (b.topic, b.msgtype, is_cdr(b))
+    return Connection(key, topic, type_, stated, '', 0, ext, owner)
 
 
 def latched_profile() -> Qos:
@@ -186,12 +185,11 @@ def jazzy_types() -> Typestore:
 
 
 def ros1_types(connection: Connection) -> Typestore:
-    """Return the message types of the definition in a ROS 1 connection; ValueError if too long."""
+    """Return the message types of the definition in a ROS 1 connection."""
     from rosbags.typesys import get_typestore, Stores
 
     store = get_typestore(Stores.EMPTY)
     store.register(_parsed(connection))
-    _num_values(store, connection.msgtype, {})
     return store
 
 
@@ -199,59 +197,29 @@ def ros2_hash(connection: Connection) -> str:
     """
     Return the hash of the type of a ROS 2 connection, from the bag or else of its definition.
 
-    No code is generated from the definition. IDL is not parsed: rosbags took over 8 minutes for
-    five pairs of brackets, one in the other. Raises any exception if there is no hash.
+    No code is generated from the definition. Raises any exception if there is no hash.
     """
-    from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import get_typestore, Stores
 
     if connection.digest:
         return connection.digest
-    if connection.msgdef.format is not MessageDefinitionFormat.MSG:
-        raise ValueError('a definition as IDL without the hash of the type')
     store = get_typestore(Stores.EMPTY)
     store.fielddefs = {**jazzy_types().fielddefs, **_parsed(connection)}
     return store.hash_rihs01(connection.msgtype)
 
 
 def _parsed(connection: Connection) -> Any:
-    """Return the fields of the types in a definition; raise ValueError if it is too long."""
-    from rosbags.typesys import get_types_from_msg
+    """Return the fields of the types in a definition."""
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
-    size = len(connection.msgdef.data)
-    if size > MAX_DEFINITION:
-        raise ValueError(f'a definition of {size} characters, expected at most {MAX_DEFINITION}')
-    return get_types_from_msg(connection.msgdef.data, connection.msgtype)
-
-
-def _num_values(store: Typestore, name: str, known: dict[str, int]) -> int:
-    """
-    Return the least number of values in a message of a type; an array of numbers counts as one.
-
-    Raises ValueError if there are over MAX_VALUES, or if a type contains itself or one without
-    values: then the bytes of a message do not bound the steps of reading it.
-    """
-    from rosbags.interfaces import Nodetype
-
-    known[name] = number = 0  # while it is open, so that it is refused inside of itself
-    fields: Any = store.fielddefs[name][1]
-    for field, (kind, content) in fields:
-        length = int(field != 'structure_needs_at_least_one_member')  # rosbags', in no message
-        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            is_fixed = kind == Nodetype.ARRAY
-            (kind, content), length = content[0], content[1] if is_fixed else 1
-        each = 1
-        if kind == Nodetype.NAME:
-            each = known[content] if content in known else _num_values(store, content, known)
-            if not each:
-                raise ValueError(f'{name}: {field} is of a type without values, or of itself')
-        else:
-            length = min(length, 1)
-        number += length * each
-    if number > MAX_VALUES:
-        raise ValueError(f'{name}: {number} values, expected at most {MAX_VALUES}')
-    known[name] = number
-    return number
+    text = connection.msgdef.data
+    if connection.msgdef.format is not MessageDefinitionFormat.IDL:
+        return get_types_from_msg(text, connection.msgtype)
+    fields = {}
+    for idl in filter(None, IDL_HEAD.split(text)):
+        fields.update(get_types_from_idl(idl))
+    return fields
 
 
 def new_writer(directory: Path, storage: str) -> Writer:

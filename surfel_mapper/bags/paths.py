@@ -18,18 +18,11 @@ from typing import Any
 from surfel_mapper.config import read_yaml
 from surfel_mapper.errors import BagError
 from surfel_mapper.files.atomic import by_number
-from surfel_mapper.files.text_table import whole
 
 STORAGE_SUFFIXES = ('.mcap', '.db3')
 PACKED_SUFFIX = '.zstd'
 ROS1_SUFFIXES = ('.bag', '.bag.active')
 METADATA = 'metadata.yaml'
-
-MAX_NODES = 100_000
-"""Limit of the nodes of a metadata.yaml, which has 13 for each file of the bag."""
-
-MAX_FILES = 10_000
-"""Limit of the files of a bag: more than MAX_NODES has room for, as rosbag2 lists them."""
 
 
 def files_of(path: Path) -> list[Path]:
@@ -84,7 +77,7 @@ def stated_counts(path: Path) -> dict[str, int]:
         return {}
     try:
         return {
-            row['topic_metadata']['name']: whole(row['message_count'])
+            row['topic_metadata']['name']: int(row['message_count'])
             for row in information['topics_with_message_count']
         }
     except (KeyError, TypeError, ValueError) as error:
@@ -106,7 +99,7 @@ def metadata(directory: Path) -> Mapping[str, Any] | None:
 @lru_cache(maxsize=16)
 def information_in(path: Path, _mtime_ns: int, _size: int) -> Mapping[str, Any]:
     """Return the content of a metadata.yaml, cached: parsing takes 10 ms."""
-    content = read_yaml(path, as_text=True, max_nodes=MAX_NODES)
+    content = read_yaml(path, as_text=True)
     information = content['rosbag2_bagfile_information']
     if not isinstance(information, Mapping):
         raise TypeError(f'rosbag2_bagfile_information is a {type(information).__name__}')
@@ -125,8 +118,6 @@ def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
         raise BagError(
             f'{directory / METADATA}: relative_file_paths is {names!r}, expected a list of names'
         )
-    if len(names) > MAX_FILES:
-        raise BagError(f'{directory / METADATA}: {len(names)} files, expected at most {MAX_FILES}')
     files = [directory / Path(name).name for name in names]
     foreign = [file.name for file in files if not is_storage(file)]
     if foreign:

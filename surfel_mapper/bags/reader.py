@@ -7,7 +7,8 @@ The files of a rosbag2 directory are opened one by one and merged by record time
 that was killed before its metadata.yaml was written can be read, and no message is lost if the
 descriptions of a topic in metadata.yaml and in the file differ: rosbags 0.11 then silently yields
 none. For the same reason the messages read are counted and compared with the index. A truncated
-file yields its whole messages, and a warning states the offset of the cut.
+mcap file yields its whole messages, and a warning states the offset of the cut; a truncated
+database or ROS 1 bag is refused with the command that mends it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 import heapq
+from itertools import islice
 import logging
 from pathlib import Path
 import tempfile
@@ -27,12 +29,11 @@ from surfel_mapper.bags._rosbags import (
     is_latched,
     type_name,
 )
-from surfel_mapper.bags.bag_file import BagFile
-from surfel_mapper.bags.chunked import ChunkedFile
-from surfel_mapper.bags.compression import unpack_file, unpacked_message, ZSTD_MAGIC
+from surfel_mapper.bags.compression import import_zstd, unpack_file, ZSTD_MAGIC
 from surfel_mapper.bags.decoders import Decoders
 from surfel_mapper.bags.paths import files_of, is_packed, is_ros1, stated_counts, unpacked_name
-from surfel_mapper.bags.storage import damaged, described, open_storage
+from surfel_mapper.bags.storage import damaged, described, open_storage, Storage, suffix
+from surfel_mapper.bags.streamed_mcap import StreamedMcap
 from surfel_mapper.bags.topics import CLOUD, SAME_AS, Topic, Topics
 from surfel_mapper.errors import BagError, SurfelMapperError
 from surfel_mapper.messages.pointcloud2 import parse_cloud
@@ -84,16 +85,14 @@ class BagReader:
         self.path = Path(path)
         self.is_ros1 = is_ros1(self.path) and not self.path.is_dir()
         self.cuts: list[str] = []
-        self._skipped: dict[Path, int] = {}
         self._latched: set[str] | None = None
-        self._storages: list[tuple[Path, BagFile]] = []
+        self._storages: list[tuple[Path, Storage]] = []
         with ExitStack() as files:
             self._open(files_of(self.path), files)
             self.topics = Topics(self.path, self._indexed_topics())
             if not any(topic.count for topic in self.topics):
                 raise BagError(f'{self.path}: a bag without messages')
-            size = sum(storage.size for _, storage in self._storages)
-            self._decoders = Decoders(self._connections, size, is_ros1=self.is_ros1)
+            self._decoders = Decoders(self._connections, is_ros1=self.is_ros1)
             self._files = files.pop_all()
         for cut in self.cuts:
             log.warning(cut)
@@ -210,7 +209,8 @@ class BagReader:
                 continue
             files.callback(storage.close)
             self._storages.append((path, storage))
-            self._note_losses(path, storage)
+            if isinstance(storage, StreamedMcap):
+                self.cuts += storage.losses(path)
             self._note_damaged_names(path, storage)
             journal = path.with_name(f'{path.name}-wal')
             if journal.is_file() and journal.stat().st_size:
@@ -229,7 +229,7 @@ class BagReader:
         return target
 
     def _latched_topics(self) -> set[str]:
-        """Return the latched topics, found once: a bag may have 65,535."""
+        """Return the latched topics, found once."""
         if self._latched is None:
             self._latched = {c.topic for c in self._connections() if is_latched(c)}
         return self._latched
@@ -256,7 +256,7 @@ class BagReader:
     def _stream(
         self,
         path: Path,
-        storage: BagFile,
+        storage: Storage,
         names: Collection[str] | None,
         start_ns: int | None,
         stop_ns: int | None,
@@ -267,34 +267,53 @@ class BagReader:
             wanted = [c for c in wanted if c.topic in names]
         if not wanted:
             return
-        messages, done = iter(storage.messages(wanted, start_ns, stop_ns)), 0
-        while True:
-            try:
-                connection, record_ns, raw = next(messages)
+        unpack, done = import_zstd().decompress, 0
+        try:
+            for connection, record_ns, raw in self._rows(path, storage, wanted, start_ns, stop_ns):
                 if raw[:4] == ZSTD_MAGIC and not self.is_ros1:
-                    raw = unpacked_message(raw)
-            except StopIteration:
-                self._note_skipped(path, storage)
-                return
-            except SurfelMapperError:
+                    raw = unpack(raw)
+                type_ = SAME_AS.get(connection.msgtype, connection.msgtype)
+                yield BagMessage(connection.topic, type_, record_ns, raw)
+                done += 1
+        except SurfelMapperError:
+            raise
+        except Exception as error:  # rosbags raises many types for damaged files
+            raise damaged(path, f'damaged after {done} messages', error) from error
+
+    def _rows(
+        self,
+        path: Path,
+        storage: Storage,
+        wanted: list[Connection],
+        start_ns: int | None,
+        stop_ns: int | None,
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Yield the messages of rosbags; from a damaged chunk of mcap on, those of its stream."""
+        done = 0
+        try:
+            for row in storage.messages(wanted, start_ns, stop_ns):
+                yield row
+                done += 1
+        except Exception:  # rosbags raises many types for damaged files
+            if suffix(path) != '.mcap' or isinstance(storage, StreamedMcap):
                 raise
-            except Exception as error:
-                raise damaged(path, f'damaged after {done} messages', error) from error
-            done += 1
-            type_ = SAME_AS.get(connection.msgtype, connection.msgtype)
-            yield BagMessage(connection.topic, type_, record_ns, raw)
+            streamed = self._open_stream(path, storage)
+            yield from islice(streamed.messages(wanted, start_ns, stop_ns), done, None)
 
-    def _note_losses(self, path: Path, storage: BagFile) -> None:
-        """Add what a file lacks to ``cuts``."""
-        if storage.cut_at is not None:
-            self.cuts.append(
-                f'{path}: the file is cut off or damaged at byte {storage.cut_at} of '
-                f'{storage.size}; the {storage.message_count} messages found are read'
-            )
-        self.cuts += [f'{path}: {loss}' for loss in storage.losses]
-        self._note_skipped(path, storage, log_now=False)
+    def _open_stream(self, path: Path, storage: Storage) -> StreamedMcap:
+        """Replace rosbags' reader of an mcap file by the one that skips damaged chunks."""
+        streamed = StreamedMcap(storage.path)
+        self._files.callback(streamed.close)
+        self._storages = [
+            (name, streamed if other is storage else other) for name, other in self._storages
+        ]
+        for loss in streamed.losses(path):
+            if loss not in self.cuts:  # of an iterator begun earlier
+                self.cuts.append(loss)
+                log.warning(loss)
+        return streamed
 
-    def _note_damaged_names(self, path: Path, storage: BagFile) -> None:
+    def _note_damaged_names(self, path: Path, storage: Storage) -> None:
         """Add the messages that are skipped because their topic has no legal name to ``cuts``."""
         damaged = [c for c in storage.connections if not has_legal_names(c)]
         if damaged:
@@ -303,20 +322,6 @@ class BagReader:
                 f'{path}: {sum(c.msgcount for c in damaged)} messages are skipped, as their topic '
                 f'or type has no legal name: {names}'
             )
-
-    def _note_skipped(self, path: Path, storage: BagFile, *, log_now: bool = True) -> None:
-        """Add the chunks skipped since the last call to ``cuts``."""
-        if not isinstance(storage, ChunkedFile):
-            return
-        number = len(storage.skipped_at)
-        if number > self._skipped.get(path, 0):
-            self._skipped[path] = number
-            self.cuts.append(
-                f'{path}: {number} damaged chunks are skipped from the damage on, the first at '
-                f'byte {storage.skipped_at[0]}: {storage.skip_reason}'
-            )
-            if log_now:
-                log.warning(self.cuts[-1])
 
     def _check_complete(self, read: Counter[str], names: Collection[str] | None) -> None:
         """Compare the number of messages read of each topic, if all are CDR, with the index."""

@@ -3,34 +3,79 @@
 """
 Opening one file of a bag, by its kind.
 
-A database that SQLite cannot read, or that is truncated, is read page by page. Each exception that
-damaged files lead to becomes a BagError here.
+rosbags reads files with an index. An mcap file without one is read record by record. Each
+exception that damaged files lead to becomes a BagError here.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterator
 from pathlib import Path
 import struct
+from typing import Any, Protocol, TYPE_CHECKING
 
-from surfel_mapper.bags._rosbags import import_rosbags
-from surfel_mapper.bags.bag_file import BagFile
-from surfel_mapper.bags.chunked import ChunkedFile
-from surfel_mapper.bags.mcap import McapFile
+from surfel_mapper.bags._rosbags import import_rosbags, open_indexed
 from surfel_mapper.bags.paths import is_ros1, unpacked_name
-from surfel_mapper.bags.ros1 import Ros1File
-from surfel_mapper.bags.sqlite import SqliteFile
-from surfel_mapper.bags.sqlite_pages import is_short, SalvagedSqlite
-from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import BagError, SurfelMapperError
+from surfel_mapper.bags.streamed_mcap import StreamedMcap
+from surfel_mapper.errors import BagError
 
-OURS: dict[str, type[BagFile]] = {'.mcap': McapFile, '.db3': SalvagedSqlite, '.bag': Ros1File}
-"""The reader for each kind of file, if it may be damaged."""
+if TYPE_CHECKING:
+    from surfel_mapper.bags._rosbags import Connection
 
-REPAIR = {'.mcap': 'mcap recover', '.db3': 'sqlite3 FILE .recover', '.bag': 'rosbag reindex'}
-"""The tool that may repair a damaged file."""
+RECOVER = 'sqlite3 {0} .recover | sqlite3 mended.db3'
+
+DUMP = 'sqlite3 {0} .dump | sed "s/^ROLLBACK.*/COMMIT;/" | sqlite3 mended.db3'
+
+MEND = {
+    '.mcap': '`mcap recover {0} -o mended.mcap` may save the readable part',
+    '.db3': f'`{RECOVER}` may save the readable part, or `{DUMP}` if that sqlite3 cannot recover',
+    '.bag': 'if it was never closed, `rosbag reindex {0}` of ROS 1 may mend it',
+}
+"""
+Advice for a damaged file. The sqlite3 of Debian 12 cannot recover. A dump of a cut database loses
+all rows if the upper pages of its tree are behind the cut.
+"""
 
 
-def open_storage(path: Path, named: Path | None = None) -> BagFile:
+HEADER = struct.Struct('>H10xI')
+"""Size and number of the pages of a database, at byte 16."""
+
+
+class Storage(Protocol):
+    """A reader of one file: those of rosbags, and StreamedMcap."""
+
+    path: Any
+    """The file."""
+
+    @property
+    def connections(self) -> list[Connection]:
+        """The topics, with the number of messages."""
+
+    @property
+    def message_count(self) -> int:
+        """Number of all messages."""
+
+    @property
+    def start_time(self) -> int:
+        """Record time of the first message."""
+
+    @property
+    def end_time(self) -> int:
+        """One after the record time of the last message."""
+
+    def messages(
+        self,
+        connections: Collection[Connection],
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Yield connection, record time and bytes of messages, in order of record time."""
+
+    def close(self) -> None:
+        """Close the file."""
+
+
+def open_storage(path: Path, named: Path) -> Storage:
     """
     Open one file of a bag.
 
@@ -38,8 +83,8 @@ def open_storage(path: Path, named: Path | None = None) -> BagFile:
     ----------
     path : Path
         The file.
-    named : Path, optional
-        Name in errors, if the file is an unpacked copy.
+    named : Path
+        Name in errors: of the packed file, if the file is an unpacked copy.
 
     Raises
     ------
@@ -47,48 +92,44 @@ def open_storage(path: Path, named: Path | None = None) -> BagFile:
         If it cannot be read and holds no whole message either.
 
     """
-    named = named or path
     import_rosbags()
     try:
-        if suffix(path) == '.db3' and not is_short(path):
-            return SqliteFile(path)
-        return open_ours(path, named)
-    except SurfelMapperError:
-        raise
-    except Exception as error:
-        if suffix(path) != '.db3':
+        if suffix(path) == '.db3' and is_short(path):
+            raise ValueError('shorter than its header states')
+        indexed = open_indexed(path)
+        if indexed is not None:
+            return indexed
+    except Exception as error:  # rosbags raises many types for damaged files
+        if suffix(path) != '.mcap':
             raise damaged(named, 'cannot be read', error) from error
     try:
-        return open_ours(path, named)
-    except (ValueError, LookupError, struct.error) as error:
+        streamed = StreamedMcap(path)
+    except (OSError, ValueError) as error:
         raise damaged(named, 'cannot be read', error) from error
+    if streamed.message_count or (streamed.cut_at is None and not streamed.skipped_at):
+        return streamed
+    streamed.close()
+    reason = streamed.skip_reason or f'no whole message before byte {streamed.cut_at}'
+    raise BagError(f'{named}: cannot be read: {reason}; {advice(named)}')
 
 
-def open_ours(path: Path, named: Path) -> BagFile:
-    """Return a file opened by our own reader; raise ValueError or BagError if it has nothing."""
-    kind = OURS[suffix(path)]
-    with open_regular(path) as file:
-        if file.read(len(kind.MAGIC)) != kind.MAGIC:
-            raise ValueError(f'its first bytes are not those of {suffix(path)}')
-    storage = kind(path)
-    if storage.message_count or (storage.cut_at is None and not storage.skipped_at):
-        return storage
-    storage.close()
-    reason = storage.skip_reason if isinstance(storage, ChunkedFile) else ''
-    reason = reason or f'no whole message before byte {storage.cut_at}'
-    raise BagError(f'{named}: cannot be read: {reason}; {repair(path)}')
+def is_short(path: Path) -> bool:
+    """Return whether a database is cut off; SQLite fills a last page that is cut with zeros."""
+    with open(path, 'rb') as file:
+        header = file.read(100).ljust(100, b'\0')
+    page_bytes, num_pages = HEADER.unpack_from(header, 16)
+    size: int = (65536 if page_bytes == 1 else page_bytes) * num_pages
+    return path.stat().st_size < size
 
 
-def repair(path: Path) -> str:
+def advice(path: Path) -> str:
     """Return the advice for a damaged file."""
-    return (
-        f'if it was cut off or never closed, `{REPAIR[suffix(path)]}` may save the readable part'
-    )
+    return MEND[suffix(path)].format(path)
 
 
 def damaged(path: Path, problem: str, error: Exception) -> BagError:
     """Return the error for a file that cannot be read."""
-    return BagError(f'{path}: {problem}: {described(error)}; {repair(path)}')
+    return BagError(f'{path}: {problem}: {described(error)}; {advice(path)}')
 
 
 def suffix(path: Path) -> str:

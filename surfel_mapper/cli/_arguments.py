@@ -30,17 +30,17 @@ class UsageError(Exception):
 
 
 def real(text: str) -> float:
-    """Return a number as files have it; ValueError for others that Python reads."""
-    from surfel_mapper.files import text_table  # loads numpy, which --help does not need
-
-    return text_table.real(text)
+    """Return a number in ASCII; ValueError for others that Python reads, such as 1_0."""
+    if '_' in text or not text.isascii():
+        raise ValueError(f'{text!r} is no number')
+    return float(text)
 
 
 def whole(text: str) -> int:
     """Return a whole number; ValueError as for ``real``."""
-    from surfel_mapper.files import text_table
-
-    return text_table.whole(text)
+    if '_' in text or not text.isascii():
+        raise ValueError(f'{text!r} is no number')
+    return int(text)
 
 
 def positive_int(text: str) -> int:

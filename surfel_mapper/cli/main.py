@@ -22,16 +22,19 @@ from contextlib import nullcontext
 from importlib import import_module
 import logging
 import os
+from pathlib import Path
 import platform
 import sys
 from types import ModuleType
 
 import surfel_mapper
+from surfel_mapper.budget import stated_limit, VARIABLE
 from surfel_mapper.cli._arguments import UsageError
 from surfel_mapper.cli._parser import Parser
 from surfel_mapper.cli._progress import interrupted_by_sigterm
 from surfel_mapper.cli._verbosity import set_log_level
 from surfel_mapper.errors import LineFormatter, one_line, SurfelMapperError
+from surfel_mapper.memory import limit_address_space
 
 VERBS = (
     'node',
@@ -50,6 +53,9 @@ VERBS = (
 
 WITH_SIGNALS = ('node', 'view')
 """Verbs that handle SIGTERM themselves."""
+
+FILE_VERBS = ('replay', 'info', 'filter', 'extract', 'merge', 'evaluate')
+"""Verbs whose memory is limited; those of ROS and browsers reserve address space at will."""
 
 _log = logging.getLogger('surfel_mapper.cli')  # __name__ is __main__ with `python -m`
 
@@ -75,6 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parsed(sys.argv[1:] if argv is None else argv)
     start_logging(args)
     try:
+        if argv is None:
+            limit_memory(args)
         ends_early = interrupted_by_sigterm(ends_process=argv is None)
         with nullcontext() if args.verb in WITH_SIGNALS else ends_early:
             code = int(args.run(args))
@@ -92,6 +100,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         named = error.filename and error.strerror
         message = f'{error.filename}: {error.strerror}' if named else str(error)
         return refused(args.verb, one_line(message))
+    except MemoryError as error:
+        message = f'{named_files(args)}: needs more memory than there is ({error})'
+        return refused(args.verb, one_line(f'{message}; {VARIABLE} sets the limit, bytes'))
     except KeyboardInterrupt:
         print(f'surfel-mapper {args.verb}: interrupted', file=sys.stderr)
         return 130
@@ -126,6 +137,19 @@ def complete() -> None:
     import argcomplete
 
     argcomplete.autocomplete(parser_of([]), always_complete_options=False)
+
+
+def limit_memory(args: argparse.Namespace) -> None:
+    """Limit the memory of this process if its verb reads files and starts no viewer."""
+    if args.verb in FILE_VERBS and not getattr(args, 'view', False):
+        limit_address_space(stated_limit())
+
+
+def named_files(args: argparse.Namespace) -> str:
+    """Return the files that a verb was given, for errors."""
+    inputs = [value for name, value in vars(args).items() if name != 'output']
+    files = [file for value in inputs for file in (value if isinstance(value, list) else [value])]
+    return ', '.join(str(file) for file in files if isinstance(file, Path))
 
 
 def replace_closed_streams() -> None:

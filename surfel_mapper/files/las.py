@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, BYTES_PER_BYTE, open_regular
+from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import ConfigError, DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 
@@ -52,12 +52,6 @@ LASZIP_RECORD = (b'laszip encoded', 22204)
 
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 """Layers of the items of a point by their type; type 14, further bytes, has one for each byte."""
-
-PACKED_RATIO = 60
-"""Memory per byte of a LAZ file, which packs a point into 3 to 10 bytes."""
-
-COLUMN_BYTES = 40
-"""Memory of a point in the columns returned."""
 
 
 def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
@@ -211,9 +205,6 @@ def check_header(path: str | Path) -> None:
             f'{path}: {size} bytes, expected {start + count * point_size} for {count} points of '
             f'{point_size} bytes; truncated, or is its header damaged?'
         )
-    ratio = PACKED_RATIO if is_packed else BYTES_PER_BYTE
-    needed = count * (2 * point_size + COLUMN_BYTES)
-    Budget(path, size, FileFormatError, ratio=ratio).take(needed, f'{count} points')
 
 
 def check_units(path: str | Path, header: bytes) -> None:

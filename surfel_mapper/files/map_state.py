@@ -37,9 +37,6 @@ FILE = 'map.npz'
 NO_ORIGIN = (0.0, 0.0, 0.0)
 """Origin of maps in files of before there were origins."""
 
-COPIES = 5
-"""Memory of loading, by that of the arrays: the map, its window, and the map without it."""
-
 NAMES = ('key', 'count', 'total', 'product', 'view', 'channels')
 
 
@@ -90,7 +87,7 @@ def save_map(
         'frame_ids': [scan.frame_id for scan in scans],
         'digest': digest,
     }
-    save_state(path, arrays, attributes, compress=compress, copies=COPIES)
+    save_state(path, arrays, attributes, compress=compress)
     return digest
 
 
@@ -124,7 +121,7 @@ def load_map(
     """
     if Path(path).is_dir():
         path = Path(path) / FILE
-    arrays, attributes = load_state(path, copies=COPIES)
+    arrays, attributes = load_state(path)
     if attributes.get('kind') != KIND:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
     found_m: Any = attributes.get('voxel_size_m')
@@ -171,7 +168,7 @@ def load_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap, list[Windowe
         If the file cannot be read, is damaged, of another kind or version.
 
     """
-    arrays, attributes = load_state(path, copies=COPIES)
+    arrays, attributes = load_state(path)
     if attributes.get('kind') != KIND:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
     with refusing(path, FileFormatError), map_errors(path):

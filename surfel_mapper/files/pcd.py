@@ -27,10 +27,10 @@ from typing import Any, BinaryIO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, open_regular
+from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import check_names, replace_file
-from surfel_mapper.files.text_table import read_table, whole
+from surfel_mapper.files.text_table import read_table
 from surfel_mapper.mapping.surfel_columns import surfel_columns
 
 if TYPE_CHECKING:
@@ -145,19 +145,16 @@ def read_points(path: str | Path) -> Columns:
     try:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
-            budget = Budget(path, size, FileFormatError)
-            with budget.clock():
-                header = read_header(path, file)
-                left = size - file.tell()
-                if header.encoding == 'binary_compressed':
-                    return compressed_columns(path, header, file, budget)
-                if header.encoding == 'binary':
-                    table = binary_table(path, header, file, left, budget)
-                else:
-                    table = read_table(path, file, header.layout, header.num_points, budget)
-                budget.take(table.nbytes, 'columns')
-                names = header.layout.names or ()
-                return {name: np.ascontiguousarray(table[name]) for name in names}
+            header = read_header(path, file)
+            left = size - file.tell()
+            if header.encoding == 'binary_compressed':
+                return compressed_columns(path, header, file)
+            if header.encoding == 'binary':
+                table = binary_table(path, header, file, left)
+            else:
+                table = read_table(path, file, header.layout, header.num_points)
+            names = header.layout.names or ()
+            return {name: np.ascontiguousarray(table[name]) for name in names}
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
 
@@ -173,10 +170,10 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
         words[keyword] = values
     try:
         names, kinds = words['FIELDS'], words['TYPE']
-        sizes = [whole(word) for word in words['SIZE']]
-        counts = [whole(word) for word in words.get('COUNT', ['1'] * len(names))]
-        num_points = whole(words['POINTS'][0])
-        stated = [whole(words[name][0]) for name in ('WIDTH', 'HEIGHT') if name in words]
+        sizes = [int(word) for word in words['SIZE']]
+        counts = [int(word) for word in words.get('COUNT', ['1'] * len(names))]
+        num_points = int(words['POINTS'][0])
+        stated = [int(words[name][0]) for name in ('WIDTH', 'HEIGHT') if name in words]
         if len(stated) == 2 and stated[0] * stated[1] not in (0, num_points):
             raise ValueError(f'WIDTH {stated[0]}, HEIGHT {stated[1]}, POINTS {num_points}')
         (encoding,) = words['DATA']
@@ -207,7 +204,7 @@ def field_of(name: str, kind: str, size: int, count: int, place: int) -> tuple[A
 
 
 def binary_table(
-    path: str | Path, header: PcdHeader, file: BinaryIO, left: int, budget: Budget
+    path: str | Path, header: PcdHeader, file: BinaryIO, left: int
 ) -> npt.NDArray[Any]:
     """Return the points of an uncompressed file."""
     size = header.num_points * header.layout.itemsize
@@ -216,7 +213,6 @@ def binary_table(
             f'{path}: {left} bytes after the header, expected {size} for {header.num_points} '
             'points; truncated?'
         )
-    budget.take(size, f'{header.num_points} points')
     content = file.read(size)
     is_padded = left - size <= PADDING and not any(file.read(PADDING))
     if left - size >= header.layout.itemsize and not is_padded:
@@ -227,9 +223,7 @@ def binary_table(
     return np.frombuffer(content, header.layout)
 
 
-def compressed_columns(
-    path: str | Path, header: PcdHeader, file: BinaryIO, budget: Budget
-) -> Columns:
+def compressed_columns(path: str | Path, header: PcdHeader, file: BinaryIO) -> Columns:
     """Return the fields of the points of a compressed file, which is stored field by field."""
     try:
         import lzf
@@ -247,7 +241,6 @@ def compressed_columns(
             f'{path}: {len(packed)} of {packed_size} packed bytes, for {size} bytes of points, '
             f'expected {expected}; truncated?'
         )
-    budget.take(packed_size + 2 * size, f'{header.num_points} points')
     try:
         content = lzf.decompress(packed, size) if size else b''
     except ValueError as error:

@@ -24,10 +24,10 @@ from typing import Any, BinaryIO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, open_regular
+from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import check_names, replace_file
-from surfel_mapper.files.text_table import read_table, whole
+from surfel_mapper.files.text_table import read_table
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
@@ -165,21 +165,17 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
     try:
         with open_regular(path) as file:
             file_size = os.fstat(file.fileno()).st_size
-            budget = Budget(path, file_size, FileFormatError)
-            with budget.clock():
-                count, layout, is_text, is_last = read_header(path, file)
-                if is_text:
-                    table = read_table(path, file, layout, count, budget, is_last=is_last)
-                else:
-                    left = file_size - file.tell()
-                    check_size(path, count, layout, left, is_last=is_last)
-                    budget.take(count * layout.itemsize, f'{count} vertices')
-                    table = np.frombuffer(file.read(count * layout.itemsize), layout)
-                budget.take(table.nbytes, 'columns')
-                return {
-                    name: np.ascontiguousarray(table[name], layout[name].newbyteorder('='))
-                    for name in layout.names or ()
-                }
+            count, layout, is_text, is_last = read_header(path, file)
+            if is_text:
+                table = read_table(path, file, layout, count, is_last=is_last)
+            else:
+                left = file_size - file.tell()
+                check_size(path, count, layout, left, is_last=is_last)
+                table = np.frombuffer(file.read(count * layout.itemsize), layout)
+            return {
+                name: np.ascontiguousarray(table[name], layout[name].newbyteorder('='))
+                for name in layout.names or ()
+            }
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
 
@@ -217,7 +213,6 @@ def read_mesh(path: str | Path) -> Mesh | None:
                     f'{path}: {file_size - file.tell()} bytes after the header, expected {needed} '
                     f'for {number} vertices and {count} triangles'
                 )
-            Budget(path, file_size, FileFormatError).take(2 * needed, f'{count} triangles')
             columns = np.frombuffer(file.read(number * vertex.itemsize), vertex)
             faces = np.frombuffer(file.read(count * layout.itemsize), layout)
     except OSError as error:
@@ -252,7 +247,7 @@ def read_faces_header(path: str | Path, file: BinaryIO) -> tuple[np.dtype[Any] |
         layout = np.dtype(
             [('count', order + TYPES[of_count]), ('corners', order + TYPES[of_corner], (3,))]
         )
-        number = whole(count)
+        number = int(count)
     except (ValueError, KeyError, StopIteration) as error:
         raise FileFormatError(f'{path}: faces that are no list of vertices') from error
     if kind != 'list' or 'property' in [line[0] for line in others if line] or number < 0:
@@ -295,7 +290,7 @@ def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], b
         after = [i for i, line in enumerate(others) if line[0] == 'element']
         properties = others[: after[0]] if after else others
         layout = np.dtype([(name, ORDERS[encoding] + TYPES[kind]) for _, kind, name in properties])
-        number = whole(count)
+        number = int(count)
     except (ValueError, KeyError) as error:
         raise FileFormatError(
             f'{path}: not a PLY whose first element has scalar properties only'

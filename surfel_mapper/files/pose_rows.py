@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.text_lines import Rows
+from surfel_mapper.files.text_table import Rows
 from surfel_mapper.geometry import MAX_NORM_ERROR, orthogonality, pose_matrix
 
 logger = logging.getLogger(__name__)

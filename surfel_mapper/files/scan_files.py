@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, open_regular
+from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import las, pcd, ply
 from surfel_mapper.files.atomic import by_number
@@ -97,7 +97,6 @@ def read_raw(path: Path) -> tuple[npt.NDArray[Any], Columns]:
                 raise FileFormatError(
                     f'{path}: {size} bytes, expected {4 * width} for every point ({width} float32)'
                 )
-            Budget(path, size, FileFormatError).take(2 * size, f'{size // (4 * width)} points')
             table = np.fromfile(file, '<f4').reshape(-1, width)
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error

@@ -7,9 +7,8 @@ The file is an npz archive, so numpy reads the arrays without this package. Its 
 ``manifest.json`` has name and version of the format, attributes, type and shape of every array,
 and the SHA-256 of all of that and of the arrays' bytes. Nothing is pickled.
 
-Sizes in a file are not trusted: the headers of all arrays are compared with the manifest and with
-the budget of the file before an array is unpacked (zlib reaches a ratio of 1000). Content that
-would compress better than the budget allows is written uncompressed.
+Sizes in a file are not trusted: the headers of all arrays are compared with the manifest before an
+array is unpacked.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ import zipfile
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, BYTES_PER_BYTE, FLOOR_BYTES, open_regular
+from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import replace_file
 
@@ -40,12 +39,6 @@ CHUNK_BYTES = 1 << 20
 
 MAX_MANIFEST_BYTES = 16 << 20
 """Limit of the manifest; 10,000 scans need 6 MB."""
-
-OBJECT_BYTES = 10
-"""Memory per byte of the manifest, as text and as objects."""
-
-MEMBER_BYTES = 1000
-"""Memory of the entry of a member in the directory of the archive."""
 
 NPY_HEADER_BYTES = 12000
 """Upper bound of the header that numpy writes before an array."""
@@ -77,7 +70,6 @@ def save_state(
     attributes: Mapping[str, Any],
     *,
     compress: bool = False,
-    copies: int = 1,
     lasting: bool = True,
 ) -> None:
     """
@@ -93,8 +85,6 @@ def save_state(
         JSON values; tuples come back as lists.
     compress : bool
         Compress with zlib: a map gets 1.7 times smaller and takes 4 times as long.
-    copies : int
-        How many times the memory of the arrays a reader needs, as it tells ``load_state``.
     lasting : bool
         Whether to wait until the bytes are on the disk; False for temporary files.
 
@@ -124,19 +114,15 @@ def save_state(
     }
     manifest['sha256'] = content_sha256(manifest, contiguous.values())
     with replace_file(path, lasting=lasting) as file:
-        size = write_archive(
+        write_archive(
             file, manifest, contiguous, zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
         )
-        if size * copies > max(FLOOR_BYTES, BYTES_PER_BYTE * file.tell()):
-            file.seek(0)
-            file.truncate()
-            write_archive(file, manifest, contiguous, zipfile.ZIP_STORED)
 
 
 def write_archive(
     file: BinaryIO, manifest: Mapping[str, Any], arrays: Arrays, compress_type: int
-) -> int:
-    """Write manifest and arrays as a zip archive; return the uncompressed size of its members."""
+) -> None:
+    """Write manifest and arrays as a zip archive."""
     with zipfile.ZipFile(file, 'w') as archive:
         text = json.dumps(manifest, indent=1, allow_nan=False)
         archive.writestr(zipfile.ZipInfo(MANIFEST), text, compress_type, compresslevel=1)
@@ -150,7 +136,6 @@ def write_archive(
             content = io.BytesIO()
             write_npy(content, array)
             archive.writestr(info, content.getbuffer(), compress_type, compresslevel=1)
-        return sum(info.file_size for info in archive.infolist())
 
 
 def write_npy(file: IO[bytes], array: npt.NDArray[Any]) -> None:
@@ -170,9 +155,7 @@ def content_sha256(manifest: Mapping[str, Any], arrays: Iterable[npt.NDArray[Any
     return content.hexdigest()
 
 
-def load_state(
-    path: str | Path, *, copies: int = 1
-) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+def load_state(path: str | Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """
     Return the arrays and the attributes of a file that save_state wrote.
 
@@ -180,8 +163,6 @@ def load_state(
     ----------
     path : str or Path
         The file.
-    copies : int
-        How many times the memory of the arrays the caller needs in all.
 
     Raises
     ------
@@ -190,10 +171,9 @@ def load_state(
 
     """
     with refusing(path, FileFormatError), open_regular(path) as file:
-        budget = Budget(path, os.fstat(file.fileno()).st_size, FileFormatError)
         try:
-            with zipfile.ZipFile(file) as archive, budget.clock():
-                return read_archive(path, archive, budget, copies)
+            with zipfile.ZipFile(file) as archive:
+                return read_archive(path, archive)
         except zipfile.BadZipFile as error:
             raise FileFormatError(
                 f'{path}: {error}; expected a state of surfel_mapper: damaged, or another file'
@@ -201,7 +181,7 @@ def load_state(
 
 
 def read_archive(
-    path: str | Path, archive: zipfile.ZipFile, budget: Budget, copies: int
+    path: str | Path, archive: zipfile.ZipFile
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return arrays and attributes; raise any exception if the content is inconsistent."""
     members = {info.filename: info for info in archive.infolist()}
@@ -209,13 +189,11 @@ def read_archive(
         raise FileFormatError(f'{path}: damaged: a member occurs twice')
     if MANIFEST not in members:
         raise FileFormatError(f'{path}: no {MANIFEST} inside, expected a state of surfel_mapper')
-    budget.take(MEMBER_BYTES * len(members), f'{len(members)} members')
     manifest_size = members[MANIFEST].file_size
     if manifest_size > MAX_MANIFEST_BYTES:
         raise FileFormatError(
             f'{path}: {MANIFEST} of {manifest_size} bytes, expected at most {MAX_MANIFEST_BYTES}'
         )
-    budget.take(OBJECT_BYTES * manifest_size, MANIFEST)
     for info in members.values():
         check_packing(info)
     manifest = json.loads(read_bytes(archive, members.pop(MANIFEST)))
@@ -227,8 +205,6 @@ def read_archive(
     infos = [members.pop(f'{entry["name"]}.npy') for entry in manifest['arrays']]
     for info, entry in zip(infos, manifest['arrays'], strict=True):
         check_header(archive, info, entry)
-        budget.take(info.file_size * copies, f'array {entry["name"]}')
-        budget.check_time()
     arrays: dict[str, npt.NDArray[Any]] = {}
 
     def read_arrays() -> Iterator[npt.NDArray[Any]]:

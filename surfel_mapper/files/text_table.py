@@ -1,45 +1,30 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Tables of numbers in text, read in pieces within a budget.
+Tables in text: points of ASCII PLY and PCD, poses, times, tables of data sets.
 
-Every word of a text is an object of 34 bytes or more. Split as a whole, a file of one-digit
-numbers takes 40 times its size; split by pieces, its table of numbers and little more.
-
-``read_table`` reads the points of ASCII PLY and PCD, whose rows may break anywhere; tables with a
-row a line are in text_lines.py, on the same pieces and numbers.
+``read_table`` reads points by numpy.loadtxt into columns of several types. ``read_lines`` and
+``table_rows`` split the other tables into words, since their stamps are read to the nanosecond
+(stamps.py); empty lines and comments are left out, and errors name the line in the file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
+import warnings
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
+from surfel_mapper.budget import read_small_file
 from surfel_mapper.errors import FileFormatError
 
-PIECE_BYTES = 1 << 14
-"""Bytes read at a time: half a megabyte of words at most."""
-
-MAX_WORD_BYTES = 1 << 16
-"""Limit of a number, which may have that many digits, and of a line."""
-
-SHORT_BYTES = 6
-"""Mean length, with its space, of words that are remembered: few can differ."""
-
-SPACES = b' \t\n\r\x0b\x0c'
-"""The characters at which bytes.split splits; str.split and Decimal take others too."""
-
-NO_END = (
-    'no end of line after the last number, which may be cut off; truncated? If it is complete, '
-    'append an end of line'
-)
-"""Why a text is refused whose last number may lack digits."""
+MAX_TEXT_BYTES = 1 << 29
+"""Size limit of a table that is split into words, bytes: five million poses of 100 characters. A
+pose of 8 words takes about 600 bytes while it is read."""
 
 
 def read_table(
@@ -47,12 +32,11 @@ def read_table(
     file: BinaryIO,
     layout: np.dtype[Any],
     count: int,
-    budget: Budget,
     *,
     is_last: bool = True,
 ) -> npt.NDArray[Any]:
     """
-    Return the rows of a text, one word for every number.
+    Return the rows of a text, a line each.
 
     Parameters
     ----------
@@ -64,128 +48,160 @@ def read_table(
         Structured: the columns, each a number or an array of numbers.
     count : int
         Number of rows.
-    budget : Budget
-        Of the file.
     is_last : bool
         Whether the file ends after the table; else the rest is not read.
 
     Raises
     ------
     FileFormatError
-        If the text has fewer or more numbers, does not end with an end of line, has other words
-        than numbers, or a number that its type cannot hold.
+        If the text has fewer or more rows, other words than numbers, a number that its type
+        cannot hold, or more rows than memory.
 
     """
-    budget.take(count * layout.itemsize, f'{count} rows of {layout.itemsize} bytes')
-    table, width, filled = np.empty(count, layout), num_numbers(layout), 0
-    words: list[bytes] = []
-    extra = 0
-    for piece in pieces_of(file, budget, SPACES):
-        if piece[-1:] not in SPACES:
-            problem = f'a number of over {MAX_WORD_BYTES} digits'
-            raise FileFormatError(f'{path}: {problem if len(piece) > MAX_WORD_BYTES else NO_END}')
-        if b'_' in piece:  # Python reads 1_0
-            raise FileFormatError(f'{path}: a _ among the numbers')
-        words += piece.split()
-        rows = min(len(words) // width, count - filled)
+    rows = None if is_last else count
+    with warnings.catch_warnings():
+        warnings.simplefilter('error', DeprecationWarning)  # 1.5 in a column of integers
+        warnings.simplefilter('ignore', UserWarning)  # no rows
         try:
-            fill(table[filled : filled + rows], words[: rows * width])
-        except (ValueError, OverflowError) as error:
+            table = np.loadtxt(file, layout, comments=None, ndmin=1, max_rows=rows)
+        except (ValueError, DeprecationWarning, MemoryError) as error:
             raise FileFormatError(f'{path}: {error}') from error
-        filled += rows
-        del words[: rows * width]
-        if filled == count:
-            extra += len(words)
-            words = []
-            if not is_last:
-                return table
-    if filled < count or extra:
-        found = filled * width + len(words) + extra
-        raise FileFormatError(
-            f'{path}: {found} numbers, expected {count * width} for {count} points; truncated?'
-        )
+    if len(table) != count:
+        raise FileFormatError(f'{path}: {len(table)} rows, expected {count} points; truncated?')
     return table
 
 
-def real(text: str | bytes) -> float:
-    """Return a number in text; ValueError for 1_0 and digits beyond ASCII, which Python reads."""
-    return float(plain(text))
-
-
-def whole(text: str | bytes) -> int:
-    """Return a whole number in text; ValueError as for ``real``."""
-    return int(plain(text))
-
-
-def plain(text: str | bytes) -> str:
-    """Return text in which Python finds the numbers that other languages do, or ValueError."""
-    found = text if isinstance(text, str) else text.decode('latin-1')
-    if '_' in found or not found.isascii():
-        raise ValueError(f'{found!r} is no number')
-    return found
-
-
-def num_numbers(layout: np.dtype[Any]) -> int:
-    """Return the number of numbers in a row."""
-    return sum(math.prod(layout[name].shape) for name in layout.names or ())
-
-
-def pieces_of(file: BinaryIO, budget: Budget, ends: bytes) -> Iterator[bytes]:
+@dataclass(frozen=True, slots=True, eq=False)
+class TextLines:
     """
-    Yield a text in pieces that each end after one of some characters.
+    Lines of a text, without those that are empty or comments.
 
-    A last piece without an end is the rest of the file, or longer than MAX_WORD_BYTES.
+    Attributes
+    ----------
+    path : str or Path
+        The file, named in errors.
+    numbers : list of int
+        Number of each line in the file, from 1.
+    texts : list of str
+        The lines.
+
     """
-    rest = b''
-    while piece := file.read(PIECE_BYTES):
-        budget.check_time()
-        piece = rest + piece
-        end = 1 + max(piece.rfind(character) for character in ends)
-        if end:
-            yield piece[:end]
-        rest = piece[end:]
-        if len(rest) > MAX_WORD_BYTES:
-            break
-    if rest:
-        yield rest
+
+    path: str | Path
+    numbers: list[int]
+    texts: list[str]
+
+    def where(self, row: int) -> str:
+        """Return file:line."""
+        return f'{self.path}:{self.numbers[row]}'
+
+    def without_first(self) -> TextLines:
+        """Return the lines after the first one."""
+        return TextLines(self.path, self.numbers[1:], self.texts[1:])
 
 
-class Remembered(dict[bytes, float]):
-    """Numbers by their words; reading one again takes a fifth of the time."""
-
-    def __missing__(self, word: bytes) -> float:
-        """Read a number and keep it."""
-        number = self[word] = float(word)
-        return number
-
-
-def reals(words: list[bytes]) -> npt.NDArray[np.float64]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
     """
-    Return the numbers of words, (W,) float64; raise ValueError if one is none.
+    Rows of a table.
 
-    A number of one digit takes 170 ns to read, remembered 30: the shorter words are, the more
-    there are in a file of a size, and the more often they are the same.
+    Attributes
+    ----------
+    lines : TextLines
+        A line a row.
+    words : list of list of str
+        The columns of each row; with separators, perhaps with spaces at their ends.
+    num_columns : int
+        Their number.
+
     """
-    if len(b' '.join(words)) < SHORT_BYTES * len(words):
-        return np.fromiter(map(Remembered().__getitem__, words), np.float64, len(words))
-    return np.array(words, object).astype(np.float64)
+
+    lines: TextLines
+    words: list[list[str]]
+    num_columns: int
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.words)
+
+    def numbers(self, columns: list[int] | slice) -> npt.NDArray[np.float64]:
+        """Return columns as finite numbers, (R, C); raise FileFormatError if one is none."""
+        texts = np.array(self.words, object).reshape(-1, self.num_columns)[:, columns]
+        try:
+            values = texts.astype(np.float64)
+        except ValueError:
+            values = np.full(texts.shape, np.nan)
+        for row in np.flatnonzero(~np.isfinite(values).all(axis=1)):
+            finite(texts[row].tolist(), self.lines.where(row))
+        return values
 
 
-def fill(table: npt.NDArray[Any], words: list[bytes]) -> None:
-    """Write the numbers of whole rows into a table; raise ValueError if one does not fit."""
-    rows = np.array(words, object).reshape(len(table), -1)
-    at = 0
-    for name in table.dtype.names or ():
-        column = table[name]
-        width = math.prod(column.shape[1:])
-        values = rows[:, at : at + width]
-        # by way of float64, which holds integers of 32 bits and reads 9.0
-        is_long = column.dtype.kind in 'iu' and column.dtype.itemsize == 8
-        numbers = values.astype(np.int64) if is_long else reals(values.ravel().tolist())
-        numbers = numbers.reshape(column.shape)
-        with np.errstate(invalid='ignore', over='ignore'):
-            column[...] = numbers
-        if column.dtype.kind in 'iu' and (column != numbers).any():
-            wrong = numbers[column != numbers].flat[0]
-            raise ValueError(f'{name}: {wrong}, which {column.dtype} cannot hold')
-        at += width
+def finite(texts: Sequence[str], where: str) -> list[float]:
+    """Return finite numbers from text; raise FileFormatError if one is none."""
+    try:
+        values = [float(text) for text in texts]
+    except ValueError as error:
+        raise FileFormatError(f'{where}: {error}, expected a number') from error
+    if not np.isfinite(values).all():
+        raise FileFormatError(f'{where}: {", ".join(texts)}: not all are finite')
+    return values
+
+
+def read_lines(path: str | Path) -> TextLines:
+    """
+    Return the lines of a text but empty ones and comments; a commented CSV header is kept.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is no text, or is larger than MAX_TEXT_BYTES.
+
+    """
+    try:
+        text = read_small_file(path, MAX_TEXT_BYTES).decode('utf-8-sig')
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f'{path}: no text, expected a table of numbers') from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, 'strerror', None) or error
+        raise FileFormatError(f'{path}: cannot be read: {reason}') from error
+    lines = text.replace('\r\n', '\n').replace('\r', '\n').split('\n')
+    kept = [(number, line) for number, line in enumerate(lines, 1) if has_content(line)]
+    return TextLines(path, [number for number, _ in kept], [line for _, line in kept])
+
+
+def has_content(line: str) -> bool:
+    """Return whether a line is neither empty nor a comment."""
+    text = line.lstrip()
+    return bool(text) and (text[0] not in '#%' or ',' in text)
+
+
+def table_rows(
+    lines: TextLines, columns: int, *, separator: str | None = None, meaning: str = ''
+) -> Rows:
+    """
+    Return the rows of a table.
+
+    Parameters
+    ----------
+    lines : TextLines
+        Its lines.
+    columns : int
+        Number of columns that each line has to have.
+    separator : str, optional
+        The character between two columns; spaces by default.
+    meaning : str
+        Names of the columns, for errors.
+
+    Raises
+    ------
+    FileFormatError
+        If a line has another number of columns.
+
+    """
+    words = [line.split(separator) for line in lines.texts]
+    for row, texts in enumerate(words):
+        if len(texts) != columns:
+            raise FileFormatError(
+                f'{lines.where(row)}: {len(texts)} columns, expected {columns}{meaning}'
+            )
+    return Rows(lines, words, columns)

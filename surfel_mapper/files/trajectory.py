@@ -12,9 +12,8 @@ The formats are in one module because they share the class and the check of stam
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +21,11 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_array, as_numbers, as_path, as_whole, made_array
-from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.pose_rows import matrix_rows, quaternion_rows, warn_of_skew
 from surfel_mapper.files.stamps import column_ns, read_times, UNITS_NS
-from surfel_mapper.files.text_lines import read_lines, table_rows, TextLines
+from surfel_mapper.files.text_table import read_lines, table_rows, TextLines
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw, quaternions
 from surfel_mapper.poses.pose_track import seconds
 
@@ -247,22 +245,15 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
         not increase.
 
     """
-    budget = Budget.of_file(path, FileFormatError)
-    with budget.clock():
-        lines = read_lines(path, budget)
-        first = next(lines, None)
-        if first is None:
-            raise FileFormatError(f'{path}: no poses in it, expected a line for each')
-        format_ = format_ or guessed(path, first.first())
-        if format_ not in FORMATS:
-            expected = ', '.join(FORMATS)
-            raise FileFormatError(f'{path}: format {format_!r}, expected one of {expected}')
-        if format_ == 'csv':
-            return csv_poses(path, first, lines, budget)
-        lines = chain([first], lines)
-        if format_ == 'kitti':
-            return kitti_poses(path, lines, budget)
-        return tum_poses(path, lines, budget)
+    lines = read_lines(path)
+    if not lines.texts:
+        raise FileFormatError(f'{path}: no poses in it, expected a line for each')
+    format_ = format_ or guessed(path, lines.texts[0])
+    if format_ not in FORMATS:
+        expected = ', '.join(FORMATS)
+        raise FileFormatError(f'{path}: format {format_!r}, expected one of {expected}')
+    readers = {'csv': csv_poses, 'kitti': kitti_poses, 'tum': tum_poses}
+    return readers[format_](lines)
 
 
 def trajectory_beside(path: Path) -> Path | None:
@@ -285,73 +276,42 @@ def guessed(path: str | Path, line: str) -> str:
     return formats[count]
 
 
-def tum_poses(path: str | Path, lines: Iterable[TextLines], budget: Budget) -> Trajectory:
+def tum_poses(lines: TextLines) -> Trajectory:
     """Return the poses of a TUM file."""
-    found = StampedPoses(path)
     columns, meaning = COLUMNS['tum']
-    for rows in table_rows(lines, columns, budget, meaning=meaning):
-        found.add(rows.lines, column_ns(rows, 0), quaternion_rows(rows, slice(1, None)))
-    return found.trajectory()
+    rows = table_rows(lines, columns, meaning=meaning)
+    return stamped_poses(lines, column_ns(rows, 0), quaternion_rows(rows, slice(1, None)))
 
 
-def csv_poses(
-    path: str | Path, first: TextLines, lines: Iterable[TextLines], budget: Budget
-) -> Trajectory:
+def csv_poses(lines: TextLines) -> Trajectory:
     """Return the poses of a CSV file with a header, its first line."""
-    header = [column_name(column) for column in first.first().lstrip('# ').split(',')]
+    header = [column_name(column) for column in lines.texts[0].lstrip('# ').split(',')]
     names = [name for name, _ in header]
-    stamps = [place for place, name in enumerate(names) if name in STAMP_COLUMNS]
-    places = [[names.index(alias) for alias in known if alias in names] for known in POSE_COLUMNS]
-    if not stamps or not all(places):
+    stamps = [column for column, name in enumerate(names) if name in STAMP_COLUMNS]
+    aliased = [[names.index(a) for a in aliases if a in names] for aliases in POSE_COLUMNS]
+    if not stamps or not all(aliased):
         raise FileFormatError(
-            f'{first.where(0)}: columns {", ".join(names)}; expected a header with stamp_s or '
+            f'{lines.where(0)}: columns {", ".join(names)}; expected a header with stamp_s or '
             'stamp_ns, x, y, z, qx, qy, qz, qw'
         )
-    wanted = [found[0] for found in places]
-    unit = header[stamps[0]][1]
-    found = StampedPoses(path)
-    lines = chain([first.without_first()], lines)
-    for rows in table_rows(lines, len(names), budget, separator=b','):
-        found.add(rows.lines, column_ns(rows, stamps[0], unit), quaternion_rows(rows, wanted))
-    return found.trajectory()
+    rows = table_rows(lines.without_first(), len(names), separator=',')
+    stamp_ns = column_ns(rows, stamps[0], header[stamps[0]][1])
+    poses = quaternion_rows(rows, [columns[0] for columns in aliased])
+    return stamped_poses(rows.lines, stamp_ns, poses)
 
 
-class StampedPoses:
-    """
-    Poses with their stamps, while they are read.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file, named in errors.
-
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        self.path = path
-        self._stamps: list[npt.NDArray[np.int64]] = [np.empty(0, np.int64)]
-        self._poses: list[npt.NDArray[np.float64]] = [np.empty((0, 7))]
-
-    def add(
-        self, lines: TextLines, stamp_ns: npt.NDArray[np.int64], poses: npt.NDArray[np.float64]
-    ) -> None:
-        """Append (R,) stamps and (R, 7) poses; raise FileFormatError if a stamp is not later."""
-        known = np.concatenate([self._stamps[-1][-1:], stamp_ns])
-        back = np.flatnonzero(np.diff(known) <= 0)
-        if len(back):
-            row = back[0] + 1 - (len(known) - len(stamp_ns))
-            raise FileFormatError(
-                f'{lines.where(row)}: stamp is not after that of the pose before'
-            )
-        self._stamps.append(stamp_ns)
-        self._poses.append(poses)
-
-    def trajectory(self) -> Trajectory:
-        """Return the poses; raise FileFormatError if there are none."""
-        stamps, poses = np.concatenate(self._stamps), np.concatenate(self._poses)
-        if not len(stamps):
-            raise FileFormatError(f'{self.path}: no poses in it, only a header or comments')
-        return Trajectory(stamps, poses[:, :3], poses[:, 3:])
+def stamped_poses(
+    lines: TextLines, stamp_ns: npt.NDArray[np.int64], poses: npt.NDArray[np.float64]
+) -> Trajectory:
+    """Return poses (R, 7) with stamps; raise FileFormatError if there are none, or one is late."""
+    if not len(stamp_ns):
+        raise FileFormatError(f'{lines.path}: no poses in it, only a header or comments')
+    back = np.flatnonzero(np.diff(stamp_ns) <= 0)
+    if len(back):
+        raise FileFormatError(
+            f'{lines.where(back[0] + 1)}: stamp is not after that of the pose before'
+        )
+    return Trajectory(stamp_ns, poses[:, :3], poses[:, 3:])
 
 
 def column_name(text: str) -> tuple[str, str]:
@@ -364,19 +324,13 @@ def column_name(text: str) -> tuple[str, str]:
     return name, unit
 
 
-def kitti_poses(path: str | Path, lines: Iterable[TextLines], budget: Budget) -> Trajectory:
+def kitti_poses(lines: TextLines) -> Trajectory:
     """Return the poses of a KITTI file, each the upper three rows of a matrix."""
     columns, meaning = COLUMNS['kitti']
-    xyz, turns, most_skew = [], [], 0.0
-    for rows in table_rows(lines, columns, budget, meaning=meaning):
-        poses, skew = matrix_rows(rows, slice(None))
-        xyz.append(poses[:, :3, 3].copy())
-        turns.append(quaternions(poses))
-        most_skew = max(most_skew, skew)
-    warn_of_skew(path, most_skew)
-    places = np.concatenate(xyz)
-    stamps = kitti_stamps(Path(path).with_name(KITTI_TIMES), len(places))
-    return Trajectory(stamps, places, np.concatenate(turns))
+    poses, skew = matrix_rows(table_rows(lines, columns, meaning=meaning), slice(None))
+    warn_of_skew(lines.path, skew)
+    stamps = kitti_stamps(Path(lines.path).with_name(KITTI_TIMES), len(poses))
+    return Trajectory(stamps, poses[:, :3, 3].copy(), quaternions(poses))
 
 
 def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:

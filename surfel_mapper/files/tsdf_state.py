@@ -37,9 +37,6 @@ SHAPE = (
 )
 """Settings that must be equal in a configuration and a file."""
 
-COPIES = 4
-"""Memory of loading, by that of the arrays: storage grows by doubling."""
-
 ARRAYS = {
     'index': np.int64,
     'stamp_ns': np.int64,
@@ -77,7 +74,7 @@ def save_tsdf(path: str | Path, blocks: BlockMap, *, compress: bool = False) -> 
     content = blocks.copied(rows)
     arrays = {name: getattr(content, name) for name in ARRAYS}
     attributes = attributes_of(blocks.config)
-    save_state(path, arrays, attributes, compress=compress, copies=COPIES)
+    save_state(path, arrays, attributes, compress=compress)
 
 
 def save_tsdf_parts(
@@ -126,7 +123,7 @@ def save_tsdf_parts(
             for name in CHANNELS:
                 missing = np.empty((0, *getattr(empty, name).shape[1:]), ARRAYS[name])
                 arrays[name] = channels[name].read(len(keys)) if name in channels else missing
-            save_state(path, arrays, attributes_of(config), copies=COPIES)
+            save_state(path, arrays, attributes_of(config))
     except OSError as error:
         raise cannot_write(path, error) from error
 
@@ -191,7 +188,7 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
         If the map does not fit into max_blocks.
 
     """
-    arrays, attributes = load_state(path, copies=COPIES)
+    arrays, attributes = load_state(path)
     if attributes.get('kind') != KIND:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
     for name in SHAPE:

@@ -6,7 +6,7 @@ Folders of public data sets, recognised by their layout: scans, times, poses, ca
 ``find_dataset`` tries the layouts of KITTI odometry and raw, nuScenes, MulRan, HeLiPR, Newer
 College, NCLT and Boreas. Poses are returned as poses of the lidar, if the folder has them and the
 calibration they need; without, the scans are registered. Of a KITTI drive, a part of the scans may
-have been copied: their names are the numbers of their rows. Each file is read under a budget.
+have been copied: their names are the numbers of their rows.
 
 One module: a list of layouts, a function each.
 
@@ -16,18 +16,17 @@ not read, because the folders do not contain the calibration of the lidar.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, open_regular
+from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import ConfigError, FileFormatError
 from surfel_mapper.files.atomic import by_number
 from surfel_mapper.files.pose_rows import (
@@ -39,8 +38,8 @@ from surfel_mapper.files.pose_rows import (
 )
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.stamps import column_ns, read_dates, read_times
-from surfel_mapper.files.text_lines import finite, read_lines, Rows, table_rows
-from surfel_mapper.files.trajectory import read_trajectory, StampedPoses, Trajectory
+from surfel_mapper.files.text_table import finite, read_lines, table_rows
+from surfel_mapper.files.trajectory import read_trajectory, stamped_poses, Trajectory
 from surfel_mapper.geometry import pose_matrix, quaternions
 from surfel_mapper.offline.scan_times import numbered, rows_of
 
@@ -71,9 +70,6 @@ EARTH_M = 6378137.0
 
 MAX_CALIBRATION_BYTES = 1 << 16
 """Size limit of a calibration; those of KITTI have 2 kB."""
-
-OBJECT_BYTES, LIST_BYTES, VALUE_BYTES = 240, 90, 70
-"""Upper bounds of the memory of an object, a list and a value of JSON once it is read."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -243,15 +239,13 @@ def mulran(path: Path) -> Dataset | None:
     if not poses_path.is_file():
         return Dataset('MulRan', files, stamps_ns)
     T_base_lidar = euler_pose(MULRAN_MOUNT[:3], np.radians(MULRAN_MOUNT[3:]))
-    poses, most_skew = StampedPoses(poses_path), 0.0
-    for rows in stamped_rows(poses_path, 12, b','):
-        T_map_base, skew = matrix_rows(rows, slice(1, None))
-        T_map_lidar = T_map_base @ T_base_lidar
-        numbers = np.hstack([T_map_lidar[:, :3, 3], quaternions(T_map_lidar)])
-        poses.add(rows.lines, column_ns(rows, 0, 'ns'), numbers)
-        most_skew = max(most_skew, skew)
-    warn_of_skew(poses_path, most_skew)
-    return Dataset('MulRan', files, stamps_ns, poses.trajectory(), poses_path)
+    rows = table_rows(read_lines(poses_path), 13, separator=',')
+    T_map_base, skew = matrix_rows(rows, slice(1, None))
+    T_map_lidar = T_map_base @ T_base_lidar
+    numbers = np.hstack([T_map_lidar[:, :3, 3], quaternions(T_map_lidar)])
+    warn_of_skew(poses_path, skew)
+    poses = stamped_poses(rows.lines, column_ns(rows, 0, 'ns'), numbers)
+    return Dataset('MulRan', files, stamps_ns, poses, poses_path)
 
 
 def helipr(path: Path) -> Dataset | None:
@@ -263,10 +257,10 @@ def helipr(path: Path) -> Dataset | None:
     poses_path = path / 'LiDAR_GT' / 'Ouster_gt.txt'
     if not poses_path.is_file():
         return Dataset('HeLiPR', files, stamps_ns, read=read)
-    poses = StampedPoses(poses_path)
-    for rows in stamped_rows(poses_path, 7):
-        poses.add(rows.lines, column_ns(rows, 0, 'ns'), quaternion_rows(rows, slice(1, None)))
-    return Dataset('HeLiPR', files, stamps_ns, poses.trajectory(), poses_path, read)
+    rows = table_rows(read_lines(poses_path), 8)
+    numbers = quaternion_rows(rows, slice(1, None))
+    poses = stamped_poses(rows.lines, column_ns(rows, 0, 'ns'), numbers)
+    return Dataset('HeLiPR', files, stamps_ns, poses, poses_path, read)
 
 
 def newer_college(path: Path) -> Dataset | None:
@@ -346,39 +340,20 @@ def content_of(path: Path) -> bytes:
     """Return the content of a file; raise FileFormatError if it cannot be read."""
     try:
         with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            Budget(path, size, FileFormatError).take(size, 'its content')
             return file.read()
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
 
 
 def json_of(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a table in JSON, of which the memory is known from its characters."""
-    content = content_of(path)
-    budget = Budget(path, len(content), FileFormatError)
-    num_values = content.count(b',') + content.count(b':') + 1
-    budget.take(
-        OBJECT_BYTES * content.count(b'{')
-        + LIST_BYTES * content.count(b'[')
-        + VALUE_BYTES * num_values
-        + 4 * len(content),
-        'a table in JSON',
-    )
+    """Return the rows of a table in JSON."""
     try:
-        rows = json.loads(content)
+        rows = json.loads(content_of(path))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f'{path}: no JSON: {error}') from error
     if not isinstance(rows, list):
         raise FileFormatError(f'{path}: expected a list of rows')
     return rows
-
-
-def stamped_rows(path: Path, columns: int, separator: bytes | None = None) -> Iterator[Rows]:
-    """Yield the rows of a table of a time, ns, and a number of columns."""
-    budget = Budget.of_file(path, FileFormatError)
-    with budget.clock():
-        yield from table_rows(read_lines(path, budget), 1 + columns, budget, separator=separator)
 
 
 def calibration(path: Path) -> dict[str, Floats]:
@@ -388,13 +363,12 @@ def calibration(path: Path) -> dict[str, Floats]:
         return found
     if path.stat().st_size > MAX_CALIBRATION_BYTES:
         raise FileFormatError(f'{path}: larger than {MAX_CALIBRATION_BYTES} bytes')
-    for lines in read_lines(path, Budget.of_file(path, FileFormatError)):
-        for line in lines.text.decode().splitlines():
-            name, _, rest = line.partition(':')
-            try:
-                found[name.strip()] = np.array(rest.split(), np.float64)
-            except ValueError:  # the date of the calibration
-                continue
+    for line in read_lines(path).texts:
+        name, _, rest = line.partition(':')
+        try:
+            found[name.strip()] = np.array(rest.split(), np.float64)
+        except ValueError:  # the date of the calibration
+            continue
     return found
 
 
@@ -462,8 +436,8 @@ def oxts_poses(files: Sequence[Path]) -> list[Floats]:
     first: Floats = np.zeros(3)
     poses: list[Floats] = []
     for file in files:
-        lines = next(read_lines(file, Budget.of_file(file, FileFormatError)), None)
-        numbers = [] if lines is None else finite(lines.first().split()[:6], lines.where(0))
+        lines = read_lines(file)
+        numbers = finite(lines.texts[0].split()[:6], lines.where(0)) if lines.texts else []
         if len(numbers) != 6 or not abs(numbers[0]) < 90.0:
             raise FileFormatError(
                 f'{file}: {numbers}, expected latitude, longitude, altitude, three angles'

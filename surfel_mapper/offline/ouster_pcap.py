@@ -22,7 +22,6 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.trajectory import Trajectory
-from surfel_mapper.offline.pcap_packets import check_capture
 
 SUFFIX = '.pcap'
 
@@ -56,8 +55,11 @@ class OusterPcap:
     DependencyError
         If ouster-sdk is not installed.
     FileFormatError
-        If it is no capture, has no metadata, no scan, or several lidars, or ouster-sdk must not
-        read it, see pcap_packets.py.
+        If it is no capture, has no metadata, no scan, or several lidars.
+
+    Notes
+    -----
+    ouster-sdk 1.0 ends the process at a UDP packet without content, which no lidar sends.
 
     """
 
@@ -67,7 +69,6 @@ class OusterPcap:
 
     def __init__(self, path: Path) -> None:
         read = reader_of_sdk(path)
-        check_capture(path)
         try:
             self._frames = read(str(path))
         except Exception as error:  # the package states no types of its errors

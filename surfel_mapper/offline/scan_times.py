@@ -13,18 +13,16 @@ because scans at the poses of others are mapped to the wrong places.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain
 import os
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.scan_files import SUFFIXES
 from surfel_mapper.files.stamps import column_ns, nanoseconds, read_dates
-from surfel_mapper.files.text_lines import read_lines, table_rows
+from surfel_mapper.files.text_table import read_lines, table_rows
 from surfel_mapper.files.trajectory import KITTI_TIMES
 
 TIME_FILES = (KITTI_TIMES, 'timestamps.txt')
@@ -109,17 +107,13 @@ def read_stamps(path: Path) -> npt.NDArray[np.int64]:
     Each line has a date and a clock, seconds, or a whole number of another unit by its digits; the
     first line decides for all.
     """
-    budget = Budget.of_file(path, FileFormatError)
-    with budget.clock():
-        lines = read_lines(path, budget)
-        first = next(lines, None)
-        if first is None:
-            raise FileFormatError(f'{path}: no times in it, expected a line for each scan')
-        text = first.first()
-        if len(text.split()) == 2:
-            return read_dates(path)
-        rows = table_rows(chain([first], lines), 1, budget, meaning=': a time')
-        return np.concatenate([column_ns(each, 0, unit_of(text)) for each in rows])
+    lines = read_lines(path)
+    if not lines.texts:
+        raise FileFormatError(f'{path}: no times in it, expected a line for each scan')
+    if len(lines.texts[0].split()) == 2:
+        return read_dates(path)
+    rows = table_rows(lines, 1, meaning=': a time')
+    return column_ns(rows, 0, unit_of(lines.texts[0].strip()))
 
 
 def is_gapless(files: Sequence[Path]) -> bool:

@@ -87,7 +87,7 @@ def uncertain_text(summary: Mapping[str, Any]) -> str:
 
 
 def surrounded_text(summary: Mapping[str, Any]) -> str:
-    """Return how long most of the surroundings seemed to move along; empty if hardly."""
+    """Return a sentence about surroundings that moved along; empty if they hardly did."""
     found = summary.get('registration', {}).get('tracking', {}).get('surrounded')
     if found is None or found['scans'] < MOST_SURROUNDED:
         return ''

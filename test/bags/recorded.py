@@ -12,6 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from mcap.writer import Writer
 import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
@@ -148,6 +149,22 @@ def write_rosbag2(
                 connections[topic] = writer.add_connection(topic, type_, typestore=ROS2)
             raw = ROS2.serialize_cdr(message, type_)
             writer.write(connections[topic], record_ns, raw)
+    return path
+
+
+def write_mcap(path: Path, entries: Entries, **options: Any) -> Path:
+    """Write an mcap file with the library of the format; a chunk holds one scan of the drive."""
+    with open(path, 'wb') as stream:
+        writer = Writer(stream, **{'chunk_size': 50_000, **options})
+        writer.start('ros2')
+        channels: dict[str, int] = {}
+        for topic, type_, record_ns, message in entries:
+            if topic not in channels:
+                schema = writer.register_schema(type_, 'ros2msg', b'')
+                channels[topic] = writer.register_channel(topic, 'cdr', schema)
+            raw = ROS2.serialize_cdr(message, type_)
+            writer.add_message(channels[topic], record_ns, raw, record_ns)
+        writer.finish()
     return path
 
 

@@ -17,6 +17,7 @@ from test.bags.recorded import (
     NUM_SCANS,
     ODOMETRY,
     ROS1,
+    write_mcap,
     write_ros1,
     write_rosbag2,
 )
@@ -97,8 +98,8 @@ def test_no_bag_is_refused(tmp_path, capsys):
 
 
 def test_a_bag_that_is_cut_off_is_shown_as_far_as_it_goes(tmp_path, capsys):
-    path = write_rosbag2(tmp_path / 'a', drive())
-    cut(path / 'a.mcap', 0.5)
+    path = write_mcap(tmp_path / 'a.mcap', drive())
+    cut(path, 0.5)
 
     assert main(['info', str(path)]) == 0
     assert 'damaged: ' in capsys.readouterr().out

@@ -122,8 +122,8 @@ UNSIZED = HEADER.replace('WIDTH 2', 'WIDTH 0')
         (HEADER + 'DATA binary\n1234567', '7 bytes after the header, expected 8'),
         (HEADER + 'DATA binary\n' + '\0' * 8 + '1234', 'is its header damaged'),
         (HEADER + 'DATA binary\n' + '\0' * 4105, 'is its header damaged'),
-        (HEADER + 'DATA ascii\n1\n', '1 numbers, expected 2'),
-        (HEADER + 'DATA ascii\n1 a\n', 'could not convert'),
+        (HEADER + 'DATA ascii\n1\n', '1 rows, expected 2 points'),
+        (HEADER + 'DATA ascii\n1 a\n', 'requires 1 columns but 2 were found'),
         (HEADER + 'DATA packed\n', 'DATA packed, expected'),
         (HEADER + 'DATA binary_compressed\n1234', 'truncated'),
         (HEADER + 'DATA binary_compressed\n\x02\0\0\0\x08\0\0\0ab', 'damaged'),
@@ -140,14 +140,6 @@ def test_truncated_and_inconsistent_files_are_refused(tmp_path, content, says):
     (tmp_path / 'bad.pcd').write_bytes(content.encode('latin-1'))
 
     with pytest.raises(FileFormatError, match=rf'bad\.pcd: .*{says}'):
-        read_points(tmp_path / 'bad.pcd')
-
-
-def test_a_small_file_that_claims_gigabytes_is_not_unpacked(tmp_path):
-    header = UNSIZED.replace('POINTS 2', f'POINTS {2**29}') + 'DATA binary_compressed\n'
-    (tmp_path / 'bad.pcd').write_bytes(header.encode() + b'\x02\0\0\0\0\0\0\x80ab')
-
-    with pytest.raises(FileFormatError, match='536870912 points: needs 4294967298 bytes'):
         read_points(tmp_path / 'bad.pcd')
 
 

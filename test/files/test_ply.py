@@ -117,7 +117,7 @@ HEADER = 'ply\nformat binary_little_endian 1.0\n'
         ('ply\nformat latin 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n', 'a PLY'),
         (
             'ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n',
-            '1 numbers, expected 2 for 2 points',
+            '1 rows, expected 2 points',
         ),
         ('ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\na\n', 'float'),
         (

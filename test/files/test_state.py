@@ -9,7 +9,6 @@ import os
 from pathlib import Path
 import subprocess
 import sys
-import tracemalloc
 import zipfile
 
 import numpy as np
@@ -78,18 +77,6 @@ def test_numpy_reads_the_arrays_alone(tmp_path):
     with np.load(tmp_path / 'map.npz', allow_pickle=False) as archive:
         for name, array in arrays.items():
             np.testing.assert_array_equal(archive[name], array)
-
-
-def test_content_that_compresses_too_well_is_stored_uncompressed(tmp_path):
-    arrays = {'zeros': np.zeros(10**6)}
-    path = tmp_path / 'map.npz'
-    save_state(path, arrays, {}, compress=True)
-    assert os.path.getsize(path) < 1_000_000
-    with pytest.raises(FileFormatError, match='array zeros: needs'):
-        load_state(path, copies=9)
-    save_state(path, arrays, {}, compress=True, copies=9)
-    assert os.path.getsize(path) > arrays['zeros'].nbytes
-    assert_equal_arrays(load_state(path, copies=9)[0], arrays)
 
 
 @pytest.mark.parametrize(
@@ -231,20 +218,6 @@ def test_another_compression_is_refused(tmp_path, compression):
     forge(tmp_path / 'map.npz', {}, compression=compression)
     with pytest.raises(FileFormatError, match='packing'):
         load_state(tmp_path / 'map.npz')
-
-
-def test_a_zip_bomb_is_refused_by_the_size_it_claims(tmp_path):
-    bomb = npy(np.zeros(10**6))
-    entries = [{'name': name, 'dtype': '<f8', 'shape': [10**6]} for name in 'abcdefghi']
-    members = {f'{name}.npy': bomb for name in 'abcdefghi'}
-    forge(tmp_path / 'map.npz', {'arrays': entries}, members, zipfile.ZIP_DEFLATED)
-    tracemalloc.start()
-    try:
-        with pytest.raises(FileFormatError, match=r'array i: needs 720\d+ bytes'):
-            load_state(tmp_path / 'map.npz')
-        assert tracemalloc.get_traced_memory()[1] < 5_000_000
-    finally:
-        tracemalloc.stop()
 
 
 LIMITED = """

@@ -1,96 +1,22 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables in text are read in steps of a piece, not of a line, and errors still name the line."""
+"""Tables in text are read to the last digit, and errors name the line."""
 
 from fractions import Fraction
-import itertools
 import random
-import sys
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files import pcd, ply
-from surfel_mapper.files.obj import read_obj
+from surfel_mapper.files import pcd, ply, text_table
 from surfel_mapper.files.pose_rows import EXACT_SKEW, MAX_SKEW, rigid_poses
 from surfel_mapper.files.stamps import nanoseconds, read_dates, read_times
-from surfel_mapper.files.text_lines import num_decimals, read_lines, table_rows
+from surfel_mapper.files.text_table import read_lines, table_rows
 from surfel_mapper.files.trajectory import read_trajectory
-from surfel_mapper.offline.datasets import find_dataset
-from test.offline import dataset_folders
 
-LINES = 40_000
-
-
-def steps_of(function):
-    """Return the result of a function, and the number of calls that Python makes for it."""
-    number = 0
-
-    def count(frame, event, argument):
-        nonlocal number
-        number += event in ('call', 'c_call')
-
-    sys.setprofile(count)
-    try:
-        result = function()
-    finally:
-        sys.setprofile(None)
-    return result, number
-
-
-def helipr(path):
-    folder, _, _ = dataset_folders.helipr(path.parent)
-    path.rename(folder / 'LiDAR_GT' / 'Ouster_gt.txt')
-    return find_dataset(folder).trajectory
-
-
-def mulran(path):
-    folder, _, _ = dataset_folders.mulran(path.parent)
-    path.rename(folder / 'global_pose.csv')
-    return find_dataset(folder).trajectory
-
-
-TUM, HEADER = '{0} 0 0 0 0 0 0 1\n', 't,x,y,z,qx,qy,qz,qw\n'
-
-LONG = {
-    'tum': (read_trajectory, '', TUM),
-    'tum with an exponent': (read_trajectory, '', '{0}e0 0 0 0 0 0 0 1\n'),
-    'tum with 25 digits': (read_trajectory, '', '{0}.{0:020} 0 0 0 0 0 0 1\n'),
-    'kitti': (read_trajectory, '', '1 0 0 0 0 1 0 0 0 0 1 0\n'),
-    'kitti of three digits': (read_trajectory, '', '1 0 0 0 0 1 0 0 0 0 .9995 0\n'),
-    'csv': (read_trajectory, HEADER, '{0},0,0,0,0,0,0,1\n'),
-    'csv with spaces': (read_trajectory, HEADER, '{0}, 0, 0, 0, 0, 0, 0, 1\n'),
-    'times': (read_times, '', '{0}\n'),
-    'times of KITTI': (read_times, '', '{0:e}\n'),
-    'dates': (read_dates, '', '2011-09-26 13:02:25.594360375\n'),
-    'HeLiPR': (helipr, '', '{0} 0 0 0 0 0 0 1\n'),
-    'MulRan': (mulran, '', '{0},1,0,0,0,0,1,0,0,0,0,1,0\n'),
-}
-
-
-@pytest.mark.parametrize(('read', 'head', 'line'), LONG.values(), ids=LONG)
-def test_a_long_table_takes_no_step_of_python_a_line(tmp_path, read, head, line):
-    """A pose of 24 bytes took 60 calls and 50 us; a date, or a stamp with spaces, takes two."""
-    path = tmp_path / 'table.txt'
-    path.write_text(head + ''.join(map(line.format, range(LINES))))
-    found, steps = steps_of(lambda: read(path))
-    assert len(found) == LINES
-    assert steps < 3 * LINES
-
-
-@pytest.mark.parametrize('line', ['', ' ', '#', '# a comment of poses', '%'])
-def test_lines_that_say_nothing_take_no_step_of_python(tmp_path, line):
-    path = tmp_path / 'poses.txt'
-    path.write_text('1.5 1 2 3 0 0 0 1\n' + f'{line}\n' * LINES + '2.5 1 2 3 0 0 0 1\n')
-    found, steps = steps_of(lambda: read_trajectory(path))
-    assert found.stamp_ns.tolist() == [1_500_000_000, 2_500_000_000]
-    assert steps < LINES
-    path.write_text('1.5 1 2 3 0 0 0 1\n' + f'{line}\n' * LINES + '2.5 1 2 3\n')
-    with pytest.raises(FileFormatError, match=rf'poses\.txt:{LINES + 2}: 4 columns, expected 8'):
-        read_trajectory(path)
+TUM = '{0} 0 0 0 0 0 0 1\n'
 
 
 @pytest.mark.parametrize(
@@ -98,7 +24,6 @@ def test_lines_that_say_nothing_take_no_step_of_python(tmp_path, line):
     [
         ('{0} 0 0 0 0 0 1', '7 columns, expected 8: stamp x y z q'),
         ('{0} 0 0 x 0 0 0 1', "could not convert string to float: 'x', expected a number"),
-        ('{0} 0 0 1_0 0 0 0 1', "'1_0' is no number, expected a number"),
         ('{0} 0 0 inf 0 0 0 1', '0, 0, inf, 0, 0, 0, 1: not all are finite'),
         ('{0} 0 0 0 0 0 0 2', r'quaternion \[0.0, 0.0, 0.0, 2.0\] has norm 2, expected 1'),
         ('noon 0 0 0 0 0 0 1', "'noon' is no time"),
@@ -132,16 +57,8 @@ def test_lines_are_those_of_a_loop_over_them(tmp_path):
             is_comment = line.strip()[:1] in ('#', '%') and ',' not in line
             if line.strip() and not is_comment:
                 expected.append((number, line))
-        found = []
-        for lines in read_lines(path, Budget.of_file(path, FileFormatError)):
-            texts = lines.text.decode().split('\n')[:-1]
-            found += zip(lines.numbers.tolist(), texts, strict=True)
-        assert found == expected, text
-
-
-def test_decimals_are_those_of_the_last_number():
-    text = b'1 2.25\n 3.5 4 \n5,6.125\n7.5,\n0.1 1.5e-03\n,\n8.\n'
-    assert num_decimals(text).tolist() == [2, 0, 3, 1, 5, 0, 0]
+        lines = read_lines(path)
+        assert [*zip(lines.numbers, lines.texts, strict=True)] == expected, text
 
 
 def exact_ns(word, unit_ns):
@@ -180,15 +97,6 @@ def test_times_of_a_table_are_exact_to_the_last_nanosecond(tmp_path):
             nanoseconds(word, 'a')
 
 
-@pytest.mark.parametrize('word', ['7E+1\x1c', '\x1f5', '1e999999999', '-1e999999999', 'nan'])
-def test_times_with_separators_of_ascii_or_of_no_size_are_refused(tmp_path, word):
-    """Decimal takes separators for spaces: 7E+1 with one was read by itself, a line at a time."""
-    path = tmp_path / 'times.txt'
-    path.write_text(f'1\n{word}\n')
-    with pytest.raises(FileFormatError, match=r'times\.txt:2: '):
-        read_times(path)
-
-
 @pytest.mark.parametrize(
     'line',
     ['2011-13-26 13:02:25', '2011-09-26 13:02:25.x', '11-09-26 13:02:25', '1969-12-31 0:0:0'],
@@ -200,119 +108,6 @@ def test_dates_of_another_form_are_refused_with_their_line(tmp_path, line):
         read_dates(path)
 
 
-CUT = {
-    'tum': (read_trajectory, '{0}.5 0 0 0 0 0 0 1.000000\n'),
-    'kitti': (read_trajectory, '1 0 0 0.25 0 1 0 0.5 0 0 1 0.125000\n'),
-    'times': (read_times, '{0}.250000\n'),
-    'dates': (read_dates, '2011-09-26 13:02:25.594360375\n'),
-    'HeLiPR': (helipr, '{0} 0 0 0 0 0 0 1.000000\n'),
-    'MulRan': (mulran, '{0},1,0,0,0,0,1,0,0,0,0,1,0.500000\n'),
-}
-
-
-@pytest.mark.parametrize(('read', 'line'), CUT.values(), ids=CUT)
-def test_a_last_number_that_is_cut_is_refused_in_every_table(tmp_path, caplog, read, line):
-    whole = ''.join(line.format(row) for row in range(1, 5))
-    for length in range(1, 7):
-        path = tmp_path / str(length) / 'table.txt'
-        path.parent.mkdir()
-        path.write_text(whole[:-length])
-        if length == 1:  # as editors and scripts leave it
-            assert len(read(path)) == 4
-            assert ':4: the last line has no end; is the file cut off there?' in caplog.text
-            continue
-        with pytest.raises(FileFormatError, match=':4: no end of line after the last number'):
-            read(path)
-
-
-def test_numbers_of_many_lengths_tell_a_shorter_one_after_a_hundred(tmp_path, caplog):
-    path = tmp_path / 'times.txt'
-    for number, is_refused in ((90, False), (200, True)):
-        words = [f'{row}.{"25" * (1 + row % 3)}' for row in range(number)]
-        path.write_text('\n'.join([*words, f'{number}.2']))
-        if is_refused:
-            with pytest.raises(FileFormatError, match=f':{number + 1}: no end of line'):
-                read_times(path)
-        else:
-            assert len(read_times(path)) == number + 1
-        path.write_text('\n'.join([*words, f'{number}.25']))
-        assert len(read_times(path)) == number + 1
-    assert caplog.text.count('the last line has no end') == 3
-
-
-@pytest.mark.parametrize('last', ['0', '0.5'])
-def test_whole_numbers_among_decimals_refuse_no_last_one(tmp_path, last):
-    path = tmp_path / 'poses.txt'
-    numbers = ['0', *['0.500'] * 300, last]
-    path.write_text('\n'.join(f'1 0 0 0 0 1 0 0 0 0 1 {number}' for number in numbers))
-    assert len(read_trajectory(path)) == 302
-
-
-def slow_obj(text):
-    """Return vertices and triangles of an OBJ file, a line at a time."""
-    vertices, triangles = [], []
-    for line in text.splitlines():
-        kind, *words = line.split() or ['']
-        if kind == 'v':
-            vertices.append([float(word) for word in words[:3]])
-        elif kind == 'f':
-            corners = [int(word.split('/')[0]) for word in words]
-            corners = [c - 1 if c > 0 else len(vertices) + c for c in corners]
-            triangles += [(corners[0], *pair) for pair in itertools.pairwise(corners[1:])]
-    return vertices, triangles
-
-
-def test_polygons_of_obj_are_those_of_a_loop(tmp_path):
-    rng, lines, known = random.Random(4), ['# made', 'o a_b', 'v 0 0 0', 'v 1 0 0', 'v 0 1 0'], 3
-    for _ in range(3000):
-        if rng.random() < 0.5:
-            lines.append(
-                f'v {rng.random()} {rng.randrange(9)} -1e-3' + ' 0.5 0.5 1' * rng.randrange(2)
-            )
-            known += 1
-        else:
-            corners = rng.choices([*range(1, known + 1), *range(-known, 0)], k=rng.randrange(3, 7))
-            lines.append(' f ' + ' '.join(f'{c}{rng.choice(("", "/1", "//2"))}' for c in corners))
-        lines += rng.choice(([], ['vn 0 0 1'], ['']))
-    path = tmp_path / 'a.obj'
-    path.write_text('\n'.join(lines) + '\n')
-    vertices, triangles = slow_obj(path.read_text())
-    read_obj(path)  # imports
-    found, steps = steps_of(lambda: read_obj(path))
-    np.testing.assert_array_equal(found.vertices, vertices)
-    np.testing.assert_array_equal(found.triangles, triangles)
-    assert steps < 8 * len(lines)  # one for the slash of each corner
-
-
-@pytest.mark.parametrize(
-    ('line', 'problem'),
-    [
-        ('v 1 2', '2 numbers, expected 3'),
-        ('v 1 2 x', "could not convert string to float: 'x'"),
-        ('f 1 2 1.5', "'1.5' is no vertex"),
-        ('f 1 2 nan', "'nan' is no vertex"),
-        ('f 1 2 3_0', "'3_0' is no number"),
-        ('f 1 2 99999999999999999999', '.* is no vertex'),
-    ],
-)
-def test_damaged_lines_of_obj_are_named(tmp_path, line, problem):
-    path = tmp_path / 'a.obj'
-    path.write_text(f'v 0 0 0\n\n# a\nv 1 0 0\n{line}\nf 1 1 2\n')
-    with pytest.raises(FileFormatError, match=f'a.obj: line 5 is damaged: {problem}'):
-        read_obj(path)
-
-
-@pytest.mark.parametrize('write', [ply, pcd])
-def test_points_of_one_digit_are_read_by_remembered_words(tmp_path, write):
-    """A number of one digit took 170 ns to read, and a file has one for each two bytes."""
-    points = np.random.default_rng(1).integers(0, 9, (20_000, 3))
-    path = tmp_path / f'a.{write.__name__.rpartition(".")[2]}'
-    rows = '\n'.join(' '.join(map(str, row)) for row in points.tolist()) + '\n'
-    path.write_text(HEADS[path.suffix].format(len(points)) + rows)
-    columns = write.read_points(path)
-    np.testing.assert_array_equal(np.stack([columns[axis] for axis in 'xyz'], axis=1), points)
-
-
 HEADS = {
     '.ply': 'ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty double y\n'
     'property uchar z\nend_header\n',
@@ -321,11 +116,44 @@ HEADS = {
 }
 
 
+@pytest.mark.parametrize(('suffix', 'module'), [('.ply', ply), ('.pcd', pcd)])
+def test_points_in_text_are_read_into_columns_of_their_types(tmp_path, suffix, module):
+    path = tmp_path / f'a{suffix}'
+    path.write_text(HEADS[suffix].format(2) + '0.1 20 255\n-1e3  -3 0')  # no end of the last line
+    columns = module.read_points(path)
+    np.testing.assert_array_equal(columns['x'], np.float32([0.1, -1000.0]))
+    np.testing.assert_array_equal(columns['y'], [20, -3])
+    np.testing.assert_array_equal(columns['z'], np.uint8([255, 0]))
+
+
+def test_stamps_of_points_in_text_keep_all_digits(tmp_path):
+    path = tmp_path / 'a.pcd'
+    path.write_text(
+        'VERSION 0.7\nFIELDS x y z t\nSIZE 4 4 4 8\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 1\n'
+        'HEIGHT 1\nPOINTS 1\nDATA ascii\n1 2 3 1700000000123456789\n'
+    )
+    assert pcd.read_points(path)['t'].tolist() == [1_700_000_000_123_456_789]
+
+
+@pytest.mark.parametrize('end', ['', '\n', '\r\n'])
+def test_the_last_line_needs_no_end(tmp_path, end):
+    path = tmp_path / 'poses.tum'
+    path.write_text('1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1.0' + end)
+    assert len(read_trajectory(path)) == 2
+
+
+def test_a_table_over_the_limit_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(text_table, 'MAX_TEXT_BYTES', 10)
+    path = tmp_path / 'poses.tum'
+    path.write_text('1 0 0 0 0 0 0 1\n')
+    with pytest.raises(FileFormatError, match=r'poses\.tum: cannot be read: larger than 10 bytes'):
+        read_trajectory(path)
+
+
 def test_rows_of_a_table_name_their_lines(tmp_path):
     path = tmp_path / 'a.txt'
     path.write_text('# b\n1 2\n\n3 4\n')
-    budget = Budget.of_file(path, FileFormatError)
-    (rows,) = table_rows(read_lines(path, budget), 2, budget)
+    rows = table_rows(read_lines(path), 2)
     assert rows.numbers([1, 0]).tolist() == [[2.0, 1.0], [4.0, 3.0]]
     assert [rows.lines.where(row) for row in range(2)] == [f'{path}:2', f'{path}:4']
 
