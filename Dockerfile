@@ -21,8 +21,10 @@ RUN apt-get update && apt-get install -y --no-install-recommends \
         'numba>=0.61' 'rosbags>=0.11.7,<0.12' 'mcap>=1.1'
 COPY . /ros2_ws/src/surfel_mapper
 WORKDIR /ros2_ws
-RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select surfel_mapper
 ENV PATH=/opt/surfel_mapper_venv/bin:$PATH NUMBA_CACHE_DIR=/var/cache/surfel_mapper
+# Kernels are compiled here, for the processor that builds; another one compiles its own.
+RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select surfel_mapper \
+    && source install/setup.bash && python3 -m surfel_mapper.cli.main compile
 WORKDIR /data
 ENTRYPOINT ["/bin/bash", "-c", \
     "source /opt/ros/jazzy/setup.bash && source /ros2_ws/install/setup.bash && exec \"$@\"", "--"]
@@ -36,8 +38,8 @@ RUN apt-get update && apt-get install -y --no-install-recommends chromium git ma
 
 FROM python:3.12-slim AS desktop
 COPY . /src
-RUN pip install --no-cache-dir '/src[cluster,formats,las]' && rm -rf /src
 ENV NUMBA_CACHE_DIR=/var/cache/surfel_mapper
+RUN pip install --no-cache-dir '/src[cluster,formats,las]' && rm -rf /src && surfel-mapper compile
 WORKDIR /data
 ENTRYPOINT ["surfel-mapper"]
 CMD ["--help"]

@@ -11,13 +11,13 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-import time
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import add_overwrite, add_workers, positive_int
 from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._verbosity import add_verbosity
+from surfel_mapper.compilation import clock
 from surfel_mapper.errors import escaped
 from surfel_mapper.offline.summary import rounded
 
@@ -62,14 +62,14 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.viz.picture import draw_map
 
     check_free(args.output, args.overwrite)
-    began = time.perf_counter()
+    began = clock()
     with open_executor(args.workers, args.scheduler) as executor:
         tiled = merge_maps(args.maps, executor, args.output, args.min_points)
     summary = {
         'maps': [str(path) for path in args.maps],
         'points': tiled.points,
         **tiled.summary(),
-        'seconds': time.perf_counter() - began,
+        'seconds': clock() - began,
         'peak_memory_mb': {'merging': tiled.peak_bytes // 10**6},
     }
     picture = args.output / 'map.png'

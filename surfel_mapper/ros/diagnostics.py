@@ -211,6 +211,7 @@ def figures(session: Session) -> dict[str, Any]:
         'window_scans': len(mapper.window),
         'window_bytes': mapper.window.nbytes,
         'process_bytes': process_bytes(),
+        'compile_s': round(PROGRESS.seconds, 1),
     }
 
 
