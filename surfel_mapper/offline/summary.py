@@ -30,10 +30,6 @@ def as_text(summary: Mapping[str, Any], written: Sequence[str]) -> str:
     )
     errors = f'{errors_text(summary["pose_errors"])}\n' if 'pose_errors' in summary else ''
     apart = uncertain_text(summary)
-    compile_s = summary.get('compile_s', 0.0)
-    compiled = (
-        f'compiling kernels, once on this machine: {compile_s:.1f} s more\n' if compile_s else ''
-    )
     deskewed = ', deskewed' if summary.get('deskewed') else ''
     poses = (
         f'poses from {summary["poses_from"]}{deskewed}: {summary["poses_reason"]}\n'
@@ -46,7 +42,7 @@ def as_text(summary: Mapping[str, Any], written: Sequence[str]) -> str:
         f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
         f'surfels {summary["surfels"]}\n'
         f'{stages_text(summary)}\n'
-        f'{compiled}{filters}{aligned}{errors}{f"{apart}{chr(10)}" if apart else ""}'
+        f'{filters}{aligned}{errors}{f"{apart}{chr(10)}" if apart else ""}'
         f'digest {summary["digest"]}\n'
         f'{"   ".join(written)}'
     )
