@@ -60,9 +60,10 @@ def test_a_replay_writes_map_picture_and_summary(bag, tmp_path, capsys):
     assert (output / 'map.png').read_bytes().startswith(PNG_MAGIC)
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
-    assert lines[0] == f'scans {NUM_SCANS}   points 27 k   surfels {summary["surfels"]}'
-    assert lines[1].startswith('read ')
-    assert lines[2] == f'digest {summary["digest"]}'
+    assert lines[0] == 'poses from tf: /tf has them'
+    assert lines[1] == f'scans {NUM_SCANS}   points 27 k   surfels {summary["surfels"]}'
+    assert lines[2].startswith('read ')
+    assert lines[3] == f'digest {summary["digest"]}'
     assert printed.err == ''  # no progress without a terminal
 
 
