@@ -236,10 +236,18 @@ class PoseInputs:
         for topic in (*self._waiting, STATIC_TOPIC):
             if not self._reads(topic, choice):
                 self._subscriptions.unsubscribe(topic)
-        self._thread.put_poses(self._static.values(), static=True)
+        if self._reads(STATIC_TOPIC, choice):
+            self._put_static()
         self._thread.put_poses(poses)
         self._waiting.clear()
         self._on_choice(choice)
+
+    def _put_static(self) -> None:
+        """Hand on the static transforms; mounts of the configuration are in the mapper already."""
+        frames = self._config.frames
+        mounted = {self._frame_id, *frames.sensors} if frames.base_to_sensor else set()
+        transforms = [pose for pose in self._static.values() if pose.child not in mounted]
+        self._thread.put_poses(transforms, static=True)
 
     def _reads(self, topic: str, choice: SourceChoice) -> bool:
         """Return whether a topic is read with a source; mounts come from static transforms."""

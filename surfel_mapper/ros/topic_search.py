@@ -61,9 +61,15 @@ class TopicSearch:
 
     @property
     def only_alternative(self) -> str:
-        """The only other topic of the type; empty if it is not the only one, or not wanted."""
-        is_only = len(self.alternatives) == 1 and not self.is_remapped
-        return self.alternatives[0] if is_only else ''
+        """
+        The only other topic of the type, to be read instead.
+
+        Empty if there are several, if the user has remapped the topic, or if it is outside the
+        namespace of the node: it is another robot's then.
+        """
+        namespace = self._node.get_namespace().rstrip('/')
+        is_only = len(self.alternatives) == 1 and self.alternatives[0].startswith(f'{namespace}/')
+        return self.alternatives[0] if is_only and not self.is_remapped else ''
 
     @property
     def missing(self) -> str:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PolygonStamped, PoseStamped
 from nav_msgs.msg import Odometry
 import pytest
 from sensor_msgs.msg import PointCloud2
@@ -14,8 +14,10 @@ from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.request import Request
 from surfel_mapper.ros import pose_inputs
 from surfel_mapper.ros.pose_inputs import PoseInputs
+from surfel_mapper.ros.topic_search import TopicSearch
 from test.bags import recorded
 from test.ros.driving import drive
+from test.ros.live import Peer
 
 DEFAULTS = ['--ros-args', '-p', 'publish.diagnostics_rate_hz:=20.0']
 MOUNT = ['-p', 'frames.base_to_sensor:=[0.1, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]']
@@ -124,6 +126,33 @@ def test_a_configured_source_is_kept(start, peer, source):
     assert (values['pose_source'], values['pose_reason']) == (source, 'configured')
 
 
+def test_topics_of_mapping_nodes_are_no_alternatives(peer):
+    for name in ('/peer/normals', '/lidar'):
+        peer.node.create_publisher(PointCloud2, name, 1)
+    search = TopicSearch(peer.node, 'points', PointCloud2)
+    search.look()
+    assert search.alternatives == ['/lidar', '/peer/normals']
+    peer.node.create_subscription(PolygonStamped, '/peer/clear_polygon', print, 1)
+    search.look()
+    assert search.alternatives == []
+
+
+def test_only_topics_of_the_own_namespace_are_read_instead(domain):
+    robot = Peer(['--ros-args', '-r', '__ns:=/robot', '-r', 'odom:=wheels'])
+    try:
+        search = TopicSearch(robot.node, 'points', PointCloud2)
+        robot.node.create_publisher(PointCloud2, '/other/lidar', 1)
+        search.look()
+        assert (search.alternatives, search.only_alternative) == (['/other/lidar'], '')
+        assert search.missing.startswith('no publisher of /robot/points; -r points:=/other/lidar')
+        robot.node.create_publisher(Odometry, '/robot/odometry', 1)
+        remapped = TopicSearch(robot.node, 'odom', Odometry)
+        remapped.look()
+        assert (remapped.alternatives, remapped.only_alternative) == (['/robot/odometry'], '')
+    finally:
+        robot.close()
+
+
 class Subscriptions:
     """Subscriptions without DDS: the callbacks, by topic."""
 
@@ -227,9 +256,17 @@ def test_transforms_that_do_not_lead_to_the_cloud_leave_odometry(reading):
 
 def test_a_configured_mount_completes_the_transforms(reading):
     mount = {'frames.base_to_sensor': [*recorded.MOUNT_M, 0.0, 0.0, 0.0, 1.0]}
-    inputs, _, topics = reading(messages_of('/tf', recorded.ODOMETRY), mount)
+    inputs, edges, topics = reading(messages_of('/tf', recorded.ODOMETRY), mount)
     assert inputs.source == 'tf'
     assert topics == ['/tf', '/tf_static']
+    assert edges == [('odom', 'base_link', False)] * recorded.NUM_SCANS
+
+
+@pytest.mark.parametrize('kept', [recorded.TF, recorded.ODOMETRY])
+def test_a_configured_mount_is_kept_although_the_static_one_came(reading, kept):
+    mount = {'frames.base_to_sensor': [*recorded.MOUNT_M, 0.0, 0.0, 0.0, 1.0]}
+    _, edges, _ = reading(messages_of(kept, '/tf_static'), mount)
+    assert edges == [('odom', 'base_link', False)] * recorded.NUM_SCANS
 
 
 def test_registration_is_never_taken_for_a_map_with_an_origin(reading):
