@@ -163,9 +163,11 @@ def choose_by_frames(
         topic = DEFAULTS[source] if DEFAULTS[source] in names else (names or [''])[0]
         candidates.append(PoseCandidate(source, topic, missing))
     choice = choose_source(candidates)
-    if not choice.topic:
-        return registered(reader, topics, config, choice.reason)
-    return PoseChoice(config.replace({'pose.source': choice.source}), choice.reason)
+    if choice.topic:
+        return PoseChoice(config.replace({'pose.source': choice.source}), choice.reason)
+    if request.pose_topic is not None:
+        return PoseChoice(config)  # pose_topics refuses its name
+    return registered(reader, topics, config, choice.reason)
 
 
 def missing_transforms(
