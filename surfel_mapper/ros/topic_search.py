@@ -36,8 +36,6 @@ class TopicSearch:
     ----------
     topic : str
         Its full name.
-    is_remapped : bool
-        Whether the user has given it another name, so that no other is read instead.
     has_publisher : bool
         Whether it had a publisher when ``look`` was called last.
     alternatives : list of str
@@ -50,7 +48,6 @@ class TopicSearch:
         self._name = name
         self._message = message
         self.topic = str(node.resolve_topic_name(name))
-        self.is_remapped = self.topic != node.resolve_topic_name(name, only_expand=True)
         self.has_publisher = False
         self.alternatives: list[str] = []
 
@@ -69,7 +66,12 @@ class TopicSearch:
         """
         namespace = self._node.get_namespace().rstrip('/')
         is_only = len(self.alternatives) == 1 and self.alternatives[0].startswith(f'{namespace}/')
-        return self.alternatives[0] if is_only and not self.is_remapped else ''
+        return self.alternatives[0] if is_only and not self._is_remapped else ''
+
+    @property
+    def _is_remapped(self) -> bool:
+        """Whether the user has given the topic another name."""
+        return self.topic != str(self._node.resolve_topic_name(self._name, only_expand=True))
 
     @property
     def missing(self) -> str:
