@@ -284,7 +284,7 @@ def wanted_source(request: Request, config: Config) -> str | None:
     if request.poses is not None:
         return 'file'
     if request.poses_from is not None:
-        return request.poses_from
+        return None if request.poses_from == AUTO else request.poses_from
     return config.pose.source if config.pose.source != AUTO else None
 
 

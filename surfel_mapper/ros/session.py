@@ -183,6 +183,7 @@ class Session:
         try:
             self.thread.call(self.mapper.register_scans).result()
             assert self.mapper.registered is not None
+            self._node.get_logger().info('compiling registration: the first time 15 s or more')
             self.mapper.registered.warm_up()
             self.registration = registration_outputs(self._node, self.mapper, self.thread)
             self.thread.post(self._map_waiting)

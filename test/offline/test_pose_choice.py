@@ -99,6 +99,7 @@ def test_settings_of_the_user_are_kept(tmp_path):
     mapped_in = {'pose.source': 'tf', 'frames.fixed': 'map'}
     assert chosen(bag, mapped_in) == (mapped_in, '')
     assert chosen(bag, {'pose.source': 'tf'}) == ({'pose.source': 'tf'}, '')
+    assert chosen(bag, {'pose.source': 'pose'}, poses_from='auto') == chosen(bag)
     assert chosen(bag, {'pose.source': 'identity'}) == ({'pose.source': 'identity'}, '')
     assert chosen(bag, poses_from='identity') == ({'pose.source': 'identity'}, '')
     assert chosen(bag, poses_from='registration') == ({'pose.source': 'registration'}, '')
