@@ -173,6 +173,13 @@ class PoseConfig(Stage):
         'are in the fixed frame; registration: scans are aligned to the map.',
         choices=POSE_SOURCES,
     )
+    registration_after_s: float = setting(
+        5.0,
+        'With auto, the node takes registration if no source is there this long after the first '
+        'cloud, s.',
+        low=0.0,
+        high=3600.0,
+    )
     max_wait_s: float = setting(
         0.5,
         'A scan is dropped if its pose is missing when data newer by this arrives, s.',

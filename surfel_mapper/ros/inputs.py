@@ -222,8 +222,8 @@ class Inputs:
             return
         elif search.only_alternative:
             self._node.get_logger().warning(
-                f'{search.topic} has no publisher, so the only topic of clouds is read: '
-                f'{search.argument(search.only_alternative)} says so'
+                f'no publisher of {search.topic}; the only topic of clouds is read instead, as '
+                f'with {search.argument(search.only_alternative)}'
             )
             self._read_instead(search.topic, search.only_alternative)
             self._search = None

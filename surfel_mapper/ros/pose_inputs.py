@@ -55,9 +55,6 @@ Time after the first cloud before odometry or poses are chosen, s. A tree of tra
 at once; at the usual 10 Hz and more it is complete within this time.
 """
 
-WAIT_S = 5.0
-"""Time after the first cloud before registration is chosen, s: late publishers are awaited."""
-
 HOW_TO_CHOOSE = 'to choose another: -p pose.source:=tf, odometry or pose, at the start'
 
 
@@ -156,7 +153,7 @@ class PoseInputs:
         if self.choice is not None:
             is_last = self.choice.source == 'registration'
             return f'{self.choice}; {HOW_TO_CHOOSE}' if is_last else ''
-        if not self.is_choosing or self._waited_s < WAIT_S:
+        if not self.is_choosing or self._waited_s < self._config.pose.registration_after_s:
             return ''
         return (
             f'scans wait: {self._missing}; map.origin needs poses, so that registration is not '
@@ -179,7 +176,7 @@ class PoseInputs:
             self._subscribe(ODOMETRY, alternative)
         choice, waited_s = choose_source(self._candidates()), self._waited_s
         self._missing = choice.reason
-        is_due = waited_s >= (TREE_S if choice.topic else WAIT_S)
+        is_due = waited_s >= (TREE_S if choice.topic else self._config.pose.registration_after_s)
         may_register = not self._config.map.origin
         if self._first_cloud_s is not None and (
             choice.source == TF or (is_due and (choice.topic or may_register))
@@ -224,7 +221,8 @@ class PoseInputs:
         self.choice = choice
         log = self._node.get_logger()
         if self.warning:
-            log.warning(f'no poses within {WAIT_S:g} s of the first cloud: {self.warning}')
+            wait_s = self._config.pose.registration_after_s
+            log.warning(f'no poses within {wait_s:g} s of the first cloud: {self.warning}')
         else:
             log.info(str(choice))
         poses = self._waiting.get(choice.topic, deque())

@@ -79,7 +79,7 @@ class TopicSearch:
         if self.has_publisher:
             return ''
         arguments = ' or '.join(map(self.argument, self.alternatives))
-        return f'no publisher of {self.topic}{f"; {arguments} reads another" if arguments else ""}'
+        return f'no publisher of {self.topic}{f"; choose with {arguments}" if arguments else ""}'
 
     def argument(self, topic: str) -> str:
         """Return the argument of the node that reads another topic."""

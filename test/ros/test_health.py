@@ -50,7 +50,7 @@ def test_a_publisher_that_cannot_be_heard_is_named_instead_of_another_remedy():
 
 
 def test_other_topics_of_clouds_are_the_remedy_if_the_default_has_no_publisher():
-    text = 'no publisher of /points; -r points:=/velodyne_points reads another'
+    text = 'no publisher of /points; choose with -r points:=/velodyne_points'
     assert found(ever_received=False, num_publishers=0, alternatives=text) == [
         (WARN, f'no cloud on /points yet: {text}')
     ]
