@@ -66,6 +66,18 @@ def test_the_only_topics_of_clouds_and_odometry_need_no_setting(start, peer):
     assert 'as with -r points:=/velodyne_points' in node.output
 
 
+def test_scans_of_a_sensor_without_a_mount_are_dropped_with_the_remedy(start, peer):
+    node = start('node', *PATIENT)
+    peer.advertise('/odom', '/points')
+    send(peer, drive(10))
+
+    _, values = peer.diagnosis({'scans.dropped.no_pose': 4})  # those older by pose.max_wait_s
+
+    assert (values['pose_source'], values['scans.mapped']) == ('odometry', '0')
+    assert 'no transforms lead from odom to lidar: set frames.base_to_sensor' in node.output
+    assert 'a sensor without a transform needs frames.base_to_sensor' in node.output
+
+
 def test_pose_messages_are_taken_without_odometry(start, peer):
     node = start('node', *PATIENT, '-p', 'frames.base:=lidar')
     peer.advertise('/pose', '/points', kinds={'/pose': PoseStamped})
