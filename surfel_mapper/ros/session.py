@@ -11,7 +11,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from surfel_mapper.compilation import run_stages
+from surfel_mapper.compilation import CompileStage, run_stages
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
 from surfel_mapper.memory import lasting_objects
@@ -183,8 +183,7 @@ class Session:
         try:
             self.thread.call(self.mapper.register_scans).result()
             assert self.mapper.registered is not None
-            self._node.get_logger().info('compiling registration: the first time 15 s or more')
-            self.mapper.registered.warm_up()
+            run_stages([CompileStage('registration', self.mapper.registered.warm_up)])
             self.registration = registration_outputs(self._node, self.mapper, self.thread)
             self.thread.post(self._map_waiting)
         except CancelledError:
