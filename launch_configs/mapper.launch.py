@@ -21,7 +21,7 @@ PRESETS = ('default', 'spinning_lidar', 'solid_state_lidar', 'indoor_depth_camer
 
 BOOLEAN = ['true', 'false']
 
-SOURCES = ('tf', 'odometry', 'pose', 'identity', 'registration')
+SOURCES = ('auto', 'tf', 'odometry', 'pose', 'identity', 'registration')
 
 ARGUMENTS = [
     DeclareLaunchArgument(
@@ -59,10 +59,10 @@ ARGUMENTS = [
         description='Topic of depth images, for input.kind depth; camera_info is beside it.',
     ),
     DeclareLaunchArgument(
-        'odom', default_value='odom', description='Topic of odometry, for pose.source odometry.'
+        'odom', default_value='odom', description='Topic of odometry, if pose.source takes it.'
     ),
     DeclareLaunchArgument(
-        'pose', default_value='pose', description='Topic of poses, for pose.source pose.'
+        'pose', default_value='pose', description='Topic of poses, if pose.source takes it.'
     ),
     DeclareLaunchArgument(
         'fixed_frame',

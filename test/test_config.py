@@ -206,7 +206,7 @@ def test_a_name_unlike_all_settings_is_refused_without_a_suggestion():
 
 
 def test_an_unknown_pose_source_is_refused_with_the_known_ones():
-    with pytest.raises(ConfigError, match=r"pose\.source: 'odom', expected one of tf, odometry"):
+    with pytest.raises(ConfigError, match=r"pose\.source: 'odom', expected one of auto, tf"):
         configured('pose.source', 'odom')
 
 

@@ -103,9 +103,9 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
     add('--pose-topic', metavar='TOPIC', help='topic of the poses (/tf, /odom or /pose)')
     add(
         '--poses-from',
-        choices=('tf', 'odometry', 'pose', 'file', 'registration', 'identity'),
-        help='source of the poses (default: pose.source of the configuration; else the first of '
-        'tf, odometry, pose that the recording has; else registration)',
+        choices=('auto', 'tf', 'odometry', 'pose', 'file', 'registration', 'identity'),
+        help='source of the poses (default: pose.source of the configuration); auto is the first '
+        'of tf, odometry, pose that the recording has, else registration',
     )
     add(
         '--poses',

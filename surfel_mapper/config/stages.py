@@ -17,7 +17,7 @@ import math
 from surfel_mapper.config.settings import read_number, setting, Stage
 from surfel_mapper.errors import ConfigError
 
-POSE_SOURCES = ('tf', 'odometry', 'pose', 'identity', 'registration')
+POSE_SOURCES = ('auto', 'tf', 'odometry', 'pose', 'identity', 'registration')
 
 INPUT_KINDS = ('cloud', 'depth')
 
@@ -167,10 +167,18 @@ class PoseConfig(Stage):
     """Source of the poses of scans."""
 
     source: str = setting(
-        'tf',
-        'tf: the tree in /tf; odometry: nav_msgs/Odometry; pose: geometry_msgs/PoseStamped; '
-        'identity: clouds are in the fixed frame; registration: scans are aligned to the map.',
+        'auto',
+        'auto: the first of tf, odometry and pose that is there, else registration; tf: the tree '
+        'in /tf; odometry: nav_msgs/Odometry; pose: geometry_msgs/PoseStamped; identity: clouds '
+        'are in the fixed frame; registration: scans are aligned to the map.',
         choices=POSE_SOURCES,
+    )
+    registration_after_s: float = setting(
+        5.0,
+        'With auto, the node takes registration if no source is there this long after the first '
+        'cloud, s.',
+        low=0.0,
+        high=3600.0,
     )
     max_wait_s: float = setting(
         0.5,

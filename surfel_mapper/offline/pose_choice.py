@@ -3,22 +3,24 @@
 """
 Choice of the source of poses, when neither the configuration nor the user names one.
 
-A bag is sampled at its start: the first of tf, odometry and pose that gives its clouds poses is
-taken, with the frames that this needs. A bag or a folder without poses is registered, scan to
-map, and deskewed if its points carry times. ``Request.poses_from`` overrides the choice.
+This is ``pose.source: auto``, in the order of ``poses.choose_source``. A bag is sampled at its
+start: the first of tf, odometry and pose that gives its clouds poses is taken, with the frames
+that this needs unless the user has set them. A bag or a folder without poses is registered, scan
+to map, and deskewed if its points carry times. ``Request.poses_from`` overrides the choice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.offline.pose_sources import TYPES
+from surfel_mapper.offline.pose_sources import DEFAULTS, TYPES
 from surfel_mapper.offline.survey import mounting, Offer, offers, Survey, survey
+from surfel_mapper.poses import AUTO, choose_source, has_chain, PoseCandidate, without_chain
 
 if TYPE_CHECKING:
     from surfel_mapper.bags.reader import BagReader
@@ -29,8 +31,6 @@ SAMPLE_NS = 3_000_000_000
 """Length of the sample of a bag, quadrupled until it contains a cloud."""
 
 DEFAULT = Config()
-
-KINDS = list(TYPES)
 
 SETTING = {'file': 'pose'}
 """The pose.source of a choice that has another name."""
@@ -44,9 +44,9 @@ class PoseChoice:
     Attributes
     ----------
     config : Config
-        The configuration given, with ``pose.source`` and the settings that this source needs.
+        The configuration given, with the ``pose.source`` chosen and the settings that it needs.
     reason : str
-        Why this source was chosen; empty if it was configured or asked for.
+        Why it was chosen; empty if it was configured or asked for.
 
     """
 
@@ -69,7 +69,7 @@ def choose_for_bag(
     request : Request
         Its ``poses_from`` and ``poses`` come first.
     config : Config
-        Its ``pose.source`` counts if it is not the default, and its ``frames``.
+        Its ``pose.source`` counts unless it is auto, and its ``frames``.
 
     Raises
     ------
@@ -83,47 +83,121 @@ def choose_for_bag(
         return PoseChoice(with_registration(config, first_scans(reader, topics)))
     if wanted in ('file', 'identity', 'registration'):
         return PoseChoice(config.replace({'pose.source': SETTING.get(wanted, wanted)}))
-    asked = config if wanted is None else config.replace({'pose.source': wanted})
-    if is_depth:
-        return PoseChoice(asked)
+    asked = config.replace({'pose.source': wanted or AUTO})
     has_poses = any(reader.topics.of_type(type_) for type_ in TYPES.values())
     is_framed = config.frames != DEFAULT.frames or request.mounts or request.pose_topic
-    if has_poses and is_framed:
-        return PoseChoice(asked)
-    if has_poses:
+    if has_poses and not is_depth and not is_framed:
         return choose_by_sample(reader, topics, wanted, asked)
     if wanted is not None:
         return PoseChoice(asked)
-    scans = first_scans(reader, topics)
-    return PoseChoice(with_registration(config, scans), 'the recording has no poses')
+    if has_poses:
+        return choose_by_frames(reader, topics, request, config)
+    return registered(reader, topics, config, 'the recording has no poses')
 
 
 def choose_by_sample(
     reader: BagReader, topics: Sequence[str], wanted: str | None, config: Config
 ) -> PoseChoice:
     """Return the source that gives the clouds of a sample their poses, or registration."""
-    found = sampled(reader)
-    made = [
-        offer
-        for offer in offers(found)
-        if offer.clouds in topics and wanted in (None, offer.settings['pose.source'])
-    ]
-    usable = [offer for offer in made if is_usable(offer, found)]
-    if usable:
-        best = min(usable, key=lambda o: (2 * o.covered < o.total, KINDS.index(source_of(o))))
-        default = DEFAULT.to_mapping()
-        changed = {name: value for name, value in best.settings.items() if value != default[name]}
-        if not changed or (wanted is not None and list(changed) == ['pose.source']):
-            return PoseChoice(config.replace({'pose.source': source_of(best)}))
-        text = ', '.join(f'{name}: {value}' for name, value in changed.items())
-        return PoseChoice(config.replace(best.settings), f'{best.poses} has them ({text})')
-    if wanted is not None or not found.stamps:
+    sample = sampled(reader)
+    sources = list(TYPES) if wanted is None else [wanted]
+    best = {
+        source: tried
+        for source in sources
+        if (tried := best_offer([o for o in offers(sample) if o.clouds in topics], source, sample))
+    }
+    usable = [offer for offer in best.values() if is_usable(offer, sample)]
+    has_half = any(2 * offer.covered >= offer.total for offer in usable)
+    candidates = [candidate(source, best.get(source), sample, has_half) for source in sources]
+    choice = choose_source(candidates)
+    if choice.topic:
+        settings = best[choice.source].settings
+        is_plain = wanted is not None and not changes(settings)
+        return PoseChoice(config.replace(settings), '' if is_plain else choice.reason)
+    if wanted is not None:
         return PoseChoice(config)
-    why = (
-        f'{made[0].poses}: {made[0].missing}' if made and made[0].missing else 'none of them moves'
-    )
-    scans = first_scans(reader, topics)
-    reason = f'no topic gives the poses of the clouds ({why})'
+    return registered(reader, topics, config, choice.reason)
+
+
+def best_offer(made: Sequence[Offer], source: str, sample: Survey) -> Offer | None:
+    """Return the best offer of a source, those that can be used first; None if there is none."""
+    of_source = [offer for offer in made if source_of(offer) == source]
+    return min(of_source, key=lambda o: (not is_usable(o, sample), -o.covered), default=None)
+
+
+def candidate(source: str, offer: Offer | None, sample: Survey, needs_half: bool) -> PoseCandidate:
+    """Return the best offer of a source as a candidate; some need poses for half of the clouds."""
+    if offer is None:
+        return PoseCandidate(source, '', 'no topic' if sample.stamps else 'no cloud can be read')
+    missing = ''
+    if not is_usable(offer, sample):
+        missing = f'{offer.poses}: {offer.missing or "none of them moves"}'
+    elif needs_half and 2 * offer.covered < offer.total:
+        missing = f'{offer.poses} covers {offer.covered} of {offer.total} clouds'
+    text = ', '.join(f'{name}: {value}' for name, value in changes(offer.settings).items())
+    return PoseCandidate(source, offer.poses, missing, text)
+
+
+def changes(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of an offer that are not the defaults, without ``pose.source``."""
+    default = DEFAULT.to_mapping()
+    return {
+        name: value
+        for name, value in settings.items()
+        if value != default[name] and name != 'pose.source'
+    }
+
+
+def choose_by_frames(
+    reader: BagReader, topics: Sequence[str], request: Request, config: Config
+) -> PoseChoice:
+    """Return the first source that is there, as the node does, with the frames of the user."""
+    candidates = []
+    for source, type_ in TYPES.items():
+        names = [
+            topic for topic in reader.topics.of_type(type_) if request.pose_topic in (None, topic)
+        ]
+        missing = '' if names else 'no topic'
+        if names and source == 'tf' and config.input.kind == 'cloud':
+            missing = missing_transforms(sampled(reader), topics, request, config)
+        topic = DEFAULTS[source] if DEFAULTS[source] in names else (names or [''])[0]
+        candidates.append(PoseCandidate(source, topic, missing))
+    choice = choose_source(candidates)
+    if choice.topic:
+        return PoseChoice(config.replace({'pose.source': choice.source}), choice.reason)
+    if request.pose_topic is not None:
+        return PoseChoice(config)  # pose_topics refuses its name
+    return registered(reader, topics, config, choice.reason)
+
+
+def missing_transforms(
+    sample: Survey, topics: Sequence[str], request: Request, config: Config
+) -> str:
+    """Return which frames of clouds have no transforms to the fixed frame; empty if all have."""
+    frames = config.frames
+    parents = {
+        pose.child: pose.parent
+        for topic, poses in sample.poses.items()
+        if sample.topics[topic].topic.type == TYPES['tf']
+        for pose in poses
+    }
+    parents |= {pose.child: pose.parent for pose in sample.static}
+    parents |= dict.fromkeys(request.mounts, frames.base)
+    of_clouds = {
+        topic if topic in request.mounts else frame
+        for topic, frame in sample.stamps
+        if topic in topics
+    }
+    parents |= {frame: frames.base for frame in of_clouds if frames.mount_of(frame)}
+    alone = [frame for frame in of_clouds if not has_chain(parents, frames.fixed, frame)]
+    return without_chain(frames.fixed, alone) if alone else ''
+
+
+def registered(
+    reader: BagReader, topics: Sequence[str], config: Config, reason: str
+) -> PoseChoice:
+    """Return registration of the clouds or depth images of a bag, for a reason."""
+    scans = [] if config.input.kind == 'depth' else first_scans(reader, topics)
     return PoseChoice(with_registration(config, scans), reason)
 
 
@@ -169,7 +243,7 @@ def choose_for_folder(
     request : Request
         Its ``poses_from`` and ``poses`` come first.
     config : Config
-        Its ``pose.source`` counts if it is not the default.
+        Its ``pose.source`` counts unless it is auto.
     has_poses : bool
         Whether the folder has poses of its own.
     first : Scan, optional
@@ -210,8 +284,8 @@ def wanted_source(request: Request, config: Config) -> str | None:
     if request.poses is not None:
         return 'file'
     if request.poses_from is not None:
-        return request.poses_from
-    return config.pose.source if config.pose.source != DEFAULT.pose.source else None
+        return None if request.poses_from == AUTO else request.poses_from
+    return config.pose.source if config.pose.source != AUTO else None
 
 
 def first_scans(reader: BagReader, topics: Sequence[str]) -> list[Scan]:
@@ -237,7 +311,7 @@ def with_registration(config: Config, scans: Sequence[Scan]) -> Config:
 
 def is_default(config: Config) -> bool:
     """Return whether a configuration leaves source and frames of the poses open."""
-    return config.pose.source == DEFAULT.pose.source and config.frames == DEFAULT.frames
+    return config.pose.source == AUTO and config.frames == DEFAULT.frames
 
 
 def has_times(scan: Scan) -> bool:

@@ -22,6 +22,7 @@ from surfel_mapper.bags.topics import ODOMETRY, POSE, TF, Topics
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError
 from surfel_mapper.files.trajectory import read_trajectory, Trajectory
+from surfel_mapper.poses import AUTO
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper
@@ -151,8 +152,8 @@ def pose_topics(topics: Topics, config: Config, name: str | None = None) -> Pose
     topics : Topics
         Topics of the bag.
     config : Config
-        Gives ``pose.source``; if ``frames.base_to_sensor`` is set, static transforms are needed
-        for tf only.
+        Gives ``pose.source``, auto for the first that is there. If ``frames.base_to_sensor`` is
+        set, static transforms are needed for tf only.
     name : str, optional
         The topic of poses, if there are several.
 
@@ -167,6 +168,8 @@ def pose_topics(topics: Topics, config: Config, name: str | None = None) -> Pose
         return PoseTopics({})
     if source == 'registration':
         return PoseTopics({}, () if config.frames.base_to_sensor else static_topics(topics))
+    if source == AUTO:
+        source = next((kind for kind, type_ in TYPES.items() if topics.of_type(type_)), 'tf')
     if not topics.of_type(TYPES[source]):
         raise BagError(
             f'{topics.path}: pose.source is {source}, but no topic is of type {TYPES[source]}; '

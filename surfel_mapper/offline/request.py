@@ -40,8 +40,8 @@ class Request:
     poses_format : str, optional
         tum, kitti or csv.
     poses_from : str, optional
-        Source of the poses: tf, odometry, pose, file, registration or identity; without, the
-        configuration decides, then pose_choice.py.
+        Source of the poses: auto, tf, odometry, pose, file, registration or identity; without,
+        the configuration decides.
     mounts : mapping of str to 7 floats
         Pose of the sensor of each topic in frames.base, x y z qx qy qz qw.
     start_s, duration_s, every : float, float, int

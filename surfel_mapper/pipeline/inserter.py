@@ -98,8 +98,7 @@ class Inserter:
         around = Surroundings(surfel_map=self.map, window=self.window, sensors=sensors)
         self.aligner = WindowAligner(lambda scan, pose: moments_at(scan, pose, self.map, config))
         self.loops = LoopCloser(config, self.map, self.window) if config.loops.enabled else None
-        has_local_map = config.loops.enabled and poses.registered is not None
-        self._local_map = LocalMap(config) if has_local_map else None
+        self._local_map: LocalMap | None = None
         self.layers = LayerStack(config, around, drops)
         wanted = self.layers.images
         self.images = ScanImages(wanted) if wanted.topics else None
@@ -111,10 +110,18 @@ class Inserter:
             self.images,
             self.layers.needs_free_rays,
             drops,
-            self._local_map,
         )
+        if poses.registered is not None:
+            self.register(config)
         self._reduction = Reduction(self.map, config.map.threads or 1)
         self._unreported: tuple[int, list[npt.NDArray[np.int32]]] | None = None
+
+    def register(self, config: Config) -> None:
+        """Keep the map that scans are registered to, if loops are closed."""
+        if config.loops.enabled:
+            self._local_map = LocalMap(config)
+            if not self.map.num_voxels:  # else scans are registered to the map that was loaded
+                self.preparation.local_map = self._local_map
 
     def reconfigure(self, config: Config) -> None:
         """Take new settings; if preparation refuses them, nothing has changed."""

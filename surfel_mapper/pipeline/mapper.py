@@ -40,11 +40,13 @@ from surfel_mapper.pipeline.inserter import Inserter, map_frame
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import MapOrigin
 from surfel_mapper.pipeline.regions import Region
+from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.scan_queue import ScanQueue
 from surfel_mapper.pipeline.stamp_guard import StampGuard
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.pipeline.window_aligner import Alignment
+from surfel_mapper.poses import AUTO
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import SceneImage
 from surfel_mapper.sensors.deskew import point_times
@@ -59,7 +61,8 @@ class Mapper:
     Parameters
     ----------
     config : Config, optional
-        All settings; the defaults without it.
+        All settings; the defaults without it. Poses come by ``add_pose``, so that ``pose.source``
+        auto, tf, odometry and pose are the same here.
 
     Attributes
     ----------
@@ -104,7 +107,6 @@ class Mapper:
             self.config.pose.max_waiting_scans, self._poses, self._inserter.images, self._drops
         )
         self.transforms = self._poses.transforms
-        self.registered = self._poses.registered
         self.window = self._inserter.window
         self.layers = self._inserter.layers.by_name
 
@@ -115,6 +117,46 @@ class Mapper:
             if name in layer_names():
                 return self.layers[name].public if name in self.layers else None
             raise AttributeError(f'{type(self).__name__!r} object has no attribute {name!r}')
+
+    @property
+    def registered(self) -> RegisteredPoses | None:
+        """The poses found by registration; None if poses come from another source."""
+        return self._poses.registered
+
+    @property
+    def knows_source(self) -> bool:
+        """
+        Whether the source of the poses is known, True at first.
+
+        A node sets it to False while ``pose.source: auto`` looks for one: scans wait, at most
+        ``pose.max_waiting_scans``, and are mapped by ``insert_ready`` once it is True.
+        """
+        return self._queue.is_open
+
+    @knows_source.setter
+    def knows_source(self, value: bool) -> None:
+        self._queue.is_open = value
+
+    def register_scans(self) -> None:
+        """
+        Take the poses from registration, as ``pose.source: auto`` does without another source.
+
+        Raises
+        ------
+        ConfigError
+            If ``pose.source`` is not auto, scans are mapped already, or ``map.origin`` is set,
+            which needs poses in the fixed frame. Nothing has changed then.
+
+        """
+        source, origin = self.config.pose.source, self.config.map.origin
+        num_used = self.counters.mapped + self.counters.localised
+        if source != AUTO or num_used or origin:
+            raise ConfigError(
+                f'pose.source {source}, {num_used} scans mapped, map.origin {origin!r}: expected '
+                'auto, none and none to take registration'
+            )
+        self._poses.register(self.config)
+        self._inserter.register(self.config)
 
     @property
     def chain(self) -> Chain:

@@ -59,15 +59,13 @@ class Preparation:
         Whether layers need the directions in which the sensor met nothing.
     drops : Drops
         Counts the scans that are left out.
-    local_map : LocalMap, optional
-        Scans are registered to it instead of the whole map.
 
     Attributes
     ----------
     chain : Chain
         The filters.
     local_map : LocalMap or None
-        As given; may be replaced at any time.
+        Scans are registered to it instead of the whole map; may be replaced at any time.
 
     """
 
@@ -80,9 +78,8 @@ class Preparation:
         images: ScanImages | None,
         needs_free_rays: bool,
         drops: Drops,
-        local_map: LocalMap | None = None,
     ) -> None:
-        self.local_map = local_map
+        self.local_map: LocalMap | None = None
         self._filters = config.filters
         self._poses = poses
         self._around = around

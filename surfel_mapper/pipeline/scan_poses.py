@@ -47,7 +47,7 @@ class ScanPoses:
     transforms : TransformBuffer
         The tree of frames; the origin of the fixed frame is that of the map.
     registered : RegisteredPoses, optional
-        The poses by registration, if ``pose.source`` is ``registration``.
+        The poses by registration, if ``pose.source`` is ``registration``, or auto chose it.
 
     """
 
@@ -61,7 +61,11 @@ class ScanPoses:
         self._set_max_gap(config)
         self.registered: RegisteredPoses | None = None
         if config.pose.source == 'registration':
-            self.registered = RegisteredPoses(config, self.transforms, drops)
+            self.register(config)
+
+    def register(self, config: Config) -> None:
+        """Find the poses by registration from now on."""
+        self.registered = RegisteredPoses(config, self.transforms, self._drops)
 
     def reconfigure(self, config: Config) -> None:
         """Take new settings; those of frames and sources never change."""

@@ -50,6 +50,8 @@ class ScanQueue:
         The next scans to map, and their T_fixed_sensor.
     ended : bool
         No poses come any more: a scan without one is dropped at once, for those behind it.
+    is_open : bool
+        False while the source of the poses is unknown: scans wait, at most ``max_scans``.
 
     """
 
@@ -65,6 +67,7 @@ class ScanQueue:
         self._newest_ns: dict[str, int] = {}
         self._before_ns: dict[str, int] = {}
         self.ended = False
+        self.is_open = True
 
     @property
     def newest_ns(self) -> int | None:
@@ -159,7 +162,7 @@ class ScanQueue:
 
     def _next(self, config: PoseConfig) -> PosedScan | None:
         """Remove the next scan whose pose is there; drop those before it that get none."""
-        while self._scans:
+        while self.is_open and self._scans:
             scan = self._scans[0]
             stamps = (self.newest_ns, self._poses.newest_for(scan.frame_id))
             newest_ns = max(stamp for stamp in stamps if stamp is not None)

@@ -1,7 +1,25 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The tree of coordinate frames over time."""
+"""The tree of coordinate frames over time, and the choice of the source of poses."""
 
 from surfel_mapper.poses.buffer import MAX_EDGES, MAX_TRANSFORMS, TransformBuffer
+from surfel_mapper.poses.source_choice import (
+    AUTO,
+    choose_source,
+    has_chain,
+    PoseCandidate,
+    SourceChoice,
+    without_chain,
+)
 
-__all__ = ['MAX_EDGES', 'MAX_TRANSFORMS', 'TransformBuffer']
+__all__ = [
+    'AUTO',
+    'MAX_EDGES',
+    'MAX_TRANSFORMS',
+    'PoseCandidate',
+    'SourceChoice',
+    'TransformBuffer',
+    'choose_source',
+    'has_chain',
+    'without_chain',
+]

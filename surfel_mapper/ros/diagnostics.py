@@ -149,6 +149,8 @@ class Totals:
             paused=session.thread.paused,
             layers_off=session.mapper.counters.layers_off,
             loss=session.inputs.loss() if self.lost > last.lost or not self.received else '',
+            alternatives=session.inputs.alternatives,
+            poses=session.inputs.poses.warning,
         )
 
     def rates(self, last: Totals) -> dict[str, Any]:
@@ -204,6 +206,8 @@ def figures(session: Session) -> dict[str, Any]:
             for name, found in (('median', latency(session, 50)), ('p99', latency(session, 99)))
         },
         **counters.summary(),
+        'pose_source': session.inputs.poses.source,
+        'pose_reason': session.inputs.poses.reason,
         **({'registration': mapper.registered.summary()} if mapper.registered else {}),
         'normals': 'oriented' if is_oriented(mapper.config) else 'not oriented',
         'voxels': mapper.map.num_voxels,

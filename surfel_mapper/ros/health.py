@@ -54,6 +54,10 @@ class Interval:
         Last error of each layer that is switched off, by its name.
     loss : str
         Messages lost by the middleware, and the remedy; empty if none.
+    alternatives : str
+        The missing publisher, and the topics that could be read instead; empty if none.
+    poses : str
+        The poses that are missing, and the remedy; empty if none.
 
     """
 
@@ -68,6 +72,8 @@ class Interval:
     paused: bool = False
     layers_off: Mapping[str, str] = field(default_factory=dict)
     loss: str = ''
+    alternatives: str = ''
+    poses: str = ''
 
 
 def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
@@ -75,6 +81,8 @@ def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[in
     yield from _input(interval, limits)
     if interval.loss and interval.received:
         yield WARN, interval.loss
+    if interval.poses:
+        yield WARN, interval.poses
     if interval.paused:
         yield WARN, 'paused: clouds are dropped until ~/pause is called with false'
     for name, error in interval.layers_off.items():
@@ -91,7 +99,8 @@ def _input(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int,
         remedy = interval.unheard or (
             f'publishers: {interval.num_publishers}; see fastdds_shm.xml if clouds are large'
             if interval.num_publishers
-            else 'it has no publisher; remap points to the topic of the lidar'
+            else interval.alternatives
+            or 'it has no publisher; remap points to the topic of the lidar'
         )
         yield WARN, f'no cloud on {topic} yet: {remedy}'
     elif 0.0 < limits.silence_s < interval.silent_s:

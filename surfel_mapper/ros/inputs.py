@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The inputs of the node: clouds or depth images, and the poses that ``pose.source`` names.
+The inputs of the node: clouds or depth images, and poses (pose_inputs.py).
 
 Callbacks only pass messages on to the mapping thread, so that none waits in the middleware, whose
 full queues overwrite the oldest message silently. Losses that the middleware does report are
@@ -12,18 +12,18 @@ as long to build objects of them, and silently skips messages that it cannot des
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial
 import time
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from surfel_mapper.config import Config
-from surfel_mapper.errors import CloudFormatError, ConfigError, DependencyError, PoseError
+from surfel_mapper.errors import CloudFormatError, ConfigError
+from surfel_mapper.messages.cdr import frame_name
 from surfel_mapper.messages.compressed_image import is_packed
 from surfel_mapper.messages.images import (
     camera_info_topic,
@@ -32,12 +32,14 @@ from surfel_mapper.messages.images import (
     DepthImages,
     SceneImages,
 )
-from surfel_mapper.messages.pointcloud2 import parse_cloud
-from surfel_mapper.messages.poses import ODOMETRY, POSE, raw_poses, TF
+from surfel_mapper.messages.pointcloud2 import parse_cloud, to_scan
+from surfel_mapper.poses import SourceChoice
 from surfel_mapper.ros.base_node import BaseNode
 from surfel_mapper.ros.context import PROFILE
 from surfel_mapper.ros.mapping_thread import MappingThread
+from surfel_mapper.ros.pose_inputs import PoseInputs
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
+from surfel_mapper.ros.topic_search import TopicSearch
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import SceneImage
 
@@ -47,15 +49,11 @@ DEFAULT_TOPICS = {'cloud': 'points', 'depth': 'depth/image'}
 CLOUDS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
 """Holds 2 s of a lidar at 10 Hz. Here and below, best effort if a publisher offers no more."""
 
-POSES = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+CHECK_S = 0.25
+"""Period in which the graph is looked at, while a source of poses or the clouds are missing, s."""
 
-STATIC_TRANSFORMS = QoSProfile(
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-
-STATIC_TOPIC = '/tf_static'
+SEARCH_S = 5.0
+"""Time without a publisher of ``points`` before the only other topic of clouds is read, s."""
 
 LARGE_BYTES = 500_000
 """Larger messages do not fit into the default shared memory of Fast DDS, 512 KiB."""
@@ -75,14 +73,18 @@ class Inputs:
         Takes the messages.
     on_failure : callable
         Called in the thread of the subscriptions with an unexpected error.
+    on_choice : callable
+        Called with the source that ``pose.source: auto`` takes; see PoseInputs.
 
     Attributes
     ----------
+    poses : PoseInputs
+        The subscriptions to poses.
     cloud_topics : list of str
         The full names of the topics of clouds, or of depth images.
     lost : dict of str to int
         Clouds lost on the way, by topic, as far as the middleware reports them; of all
-        subscriptions so far. The mapping thread reads it, so that no topic is added later.
+        subscriptions so far. The mapping thread reads it, so that it is replaced to add a topic.
 
     Raises
     ------
@@ -99,9 +101,10 @@ class Inputs:
         config: Config,
         thread: MappingThread,
         on_failure: Callable[[BaseException], None],
+        on_choice: Callable[[SourceChoice], object] = lambda choice: None,
     ) -> None:
-        if config.pose.source == TF:
-            transform_message()
+        subscriptions = SubscriptionExecutor(node, on_failure)
+        self.poses = PoseInputs(node, config, thread, subscriptions, on_choice)
         self.cloud_topics = cloud_topics(node, config)
         self._image_topics = {
             kind: resolved(node, f'layers.tsdf.{kind}_topic', name)
@@ -115,7 +118,12 @@ class Inputs:
         self._node = node
         self._config = config
         self._thread = thread
-        self._subscriptions = SubscriptionExecutor(node, on_failure)
+        self._subscriptions = subscriptions
+        self._search: TopicSearch | None = None
+        if config.input.kind == 'cloud' and not config.input.topics:
+            self._search = TopicSearch(node, DEFAULT_TOPICS['cloud'], PointCloud2)
+        self._warned_of: list[str] = []
+        self._start_s = self._checked_s = time.monotonic()
 
     def subscribe(self) -> None:
         """
@@ -128,21 +136,13 @@ class Inputs:
 
         """
         self._received_s = dict.fromkeys(self.cloud_topics, time.monotonic())
-        source = self._config.pose.source
-        if source == ODOMETRY:
-            self._subscribe_poses(ODOMETRY, Odometry, 'odom', POSES)
-        elif source == POSE:
-            self._subscribe_poses(POSE, PoseStamped, 'pose', POSES)
-        elif source == TF:
-            message = transform_message()
-            self._subscribe_poses(TF, message, STATIC_TOPIC, STATIC_TRANSFORMS)
-            self._subscribe_poses(TF, message, '/tf', POSES)
-        if source in (ODOMETRY, POSE, 'registration') and not self._config.frames.base_to_sensor:
-            self._subscribe_static()
+        self.poses.subscribe()
         for topic in self.cloud_topics:
             self._subscribe_clouds(topic)
         for kind, topic in self._image_topics.items():
             self._subscribe_images(kind, topic)
+        self._start_s = time.monotonic()
+        self._subscriptions.on_turn = self._on_turn
         self._subscriptions.start()
 
     def unsubscribe(self) -> None:
@@ -196,6 +196,50 @@ class Inputs:
         """Number of clouds lost on all topics."""
         return sum(self.lost.values())
 
+    @property
+    def alternatives(self) -> str:
+        """The topics of clouds that could be read instead of the default one; empty if none."""
+        search = self._search
+        return search.missing if search is not None and search.alternatives else ''
+
+    def _on_turn(self) -> None:
+        """Look for poses and clouds until there are some; called by the subscriptions."""
+        if time.monotonic() - self._checked_s < CHECK_S:
+            return
+        self._checked_s = time.monotonic()
+        self.poses.check()
+        if self._search is not None:
+            self._find_clouds(self._search)
+        if self._search is None and not self.poses.is_choosing:
+            self._subscriptions.on_turn = None
+
+    def _find_clouds(self, search: TopicSearch) -> None:
+        """Read the only topic of clouds, if the default one has no publisher for a while."""
+        search.look()
+        if search.has_publisher:
+            self._search = None
+        elif time.monotonic() - self._start_s < SEARCH_S:
+            return
+        elif search.only_alternative:
+            self._node.get_logger().warning(
+                f'no publisher of {search.topic}; the only topic of clouds is read instead, as '
+                f'with {search.argument(search.only_alternative)}'
+            )
+            self._read_instead(search.topic, search.only_alternative)
+            self._search = None
+        elif search.alternatives and search.alternatives != self._warned_of:
+            self._warned_of = search.alternatives
+            self._node.get_logger().warning(f'no clouds: {search.missing}')
+
+    def _read_instead(self, topic: str, alternative: str) -> None:
+        """Read the clouds of another topic; the counts of both are kept."""
+        self._subscriptions.unsubscribe(topic)
+        self.lost = {**self.lost, alternative: 0}
+        self._largest_bytes = {**self._largest_bytes, alternative: 0}
+        self._received_s = {alternative: time.monotonic()}
+        self.cloud_topics = [alternative]
+        self._subscribe_clouds(alternative)
+
     def _subscribe_clouds(self, topic: str) -> None:
         """Subscribe to the clouds or images of one sensor."""
         on_lost = partial(self._on_lost, topic, self.lost[topic])
@@ -223,27 +267,10 @@ class Inputs:
         except CloudFormatError as error:
             self._thread.refuse_image(str(error))
 
-    def _subscribe_static(self) -> None:
-        """Subscribe to /tf_static for the mounting poses of sensors."""
-        try:
-            message = transform_message()
-        except DependencyError:
-            self._node.get_logger().warning(
-                'tf2_msgs is not installed, so /tf_static is not read: clouds have to be in '
-                f'{self._config.frames.base}, or set frames.base_to_sensor'
-            )
-            return
-        self._subscribe_poses(TF, message, STATIC_TOPIC, STATIC_TRANSFORMS)
-
-    def _subscribe_poses(self, kind: str, message: Any, topic: str, qos: QoSProfile) -> None:
-        """Subscribe to poses or transforms."""
-        on_pose = partial(self._on_pose, kind, topic)
-        self._subscriptions.subscribe(message, topic, on_pose, qos, eager=True, raw=True)
-
     def _on_cloud(self, topic: str, raw: bytes) -> None:
         self._note_received(topic, len(raw))
         try:
-            self._thread.put_cloud(parse_cloud(raw, topic=topic), topic)
+            self._put_cloud(parse_cloud(raw, topic=topic), topic)
         except CloudFormatError as error:
             self._thread.refuse_cloud(topic, str(error))
 
@@ -264,15 +291,16 @@ class Inputs:
 
     def _put_images(self, topic: str, images: Iterable[CameraImage]) -> None:
         for image in images:
-            self._thread.put_cloud(image.msg, topic, partial(decode_image, image))
+            self._put_cloud(image.msg, topic, partial(decode_image, image))
 
-    def _on_pose(self, kind: str, topic: str, raw: bytes) -> None:
-        try:
-            poses = raw_poses(kind, raw, self._config.frames.base, topic)
-        except PoseError as error:
-            self._thread.refuse_pose(str(error))
-        else:
-            self._thread.put_poses(poses, static=topic == STATIC_TOPIC)
+    def _put_cloud(
+        self, msg: Any, topic: str, decode: Callable[[Any, str], Scan] = to_scan
+    ) -> None:
+        """Queue a cloud or depth image; its frame takes part in the choice of the poses."""
+        self._thread.put_cloud(msg, topic, decode)
+        if self.poses.is_choosing:
+            with suppress(CloudFormatError):  # counted when it is decoded
+                self.poses.note_cloud(frame_name(msg.header.frame_id))
 
     def _on_lost(self, topic: str, before: int, number: int) -> None:
         """Take the number that a subscription has lost; those of earlier ones are ``before``."""
@@ -307,24 +335,3 @@ def image_message(topic: str) -> Any:
 def decode_image(image: CameraImage, _: Any, topic: str) -> Scan:
     """Return the scan of an image; a decoder for ``MappingThread.put_cloud``."""
     return depth_scan(image, topic)
-
-
-def transform_message() -> Any:
-    """
-    Return the class tf2_msgs/TFMessage.
-
-    Raises
-    ------
-    DependencyError
-        If it is not installed; the message has the command and the alternatives.
-
-    """
-    try:
-        from tf2_msgs.msg import TFMessage
-    except ImportError as error:
-        raise DependencyError(
-            'pose.source tf needs the package tf2_msgs, which is not installed: '
-            '`sudo apt install ros-jazzy-tf2-msgs`. PyPI has no such package; with ROS from '
-            'there use pose.source odometry or pose, and frames.base_to_sensor'
-        ) from error
-    return TFMessage

@@ -41,9 +41,9 @@ from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.map_origin import has_own_frame
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.ros.base_node import LATCHED
-from surfel_mapper.ros.inputs import transform_message
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import fill, pose_message, time_message
+from surfel_mapper.ros.pose_inputs import transform_message
 
 MAX_TRACK = 1000
 """Poses that ~/track holds at most, the newest; 100 s at 10 Hz."""

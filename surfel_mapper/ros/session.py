@@ -11,13 +11,14 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from surfel_mapper.compilation import run_stages
+from surfel_mapper.compilation import CompileStage, run_stages
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
 from surfel_mapper.memory import lasting_objects
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
 from surfel_mapper.pipeline.warm_up import node_stages
+from surfel_mapper.poses import AUTO, SourceChoice
 from surfel_mapper.ros.base_node import BaseNode
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.main_thread import TaskQueue
@@ -70,10 +71,11 @@ class Session:
         self._tasks = tasks
         self.config = config
         self.mapper = Mapper(config)
+        self.mapper.knows_source = config.pose.source != AUTO
         load_start(self.mapper)
         self._checkpoints = Checkpoints(self.mapper)
         self.thread = MappingThread(self.mapper, tasks.fail)
-        self.inputs = Inputs(node, config, self.thread, tasks.fail)
+        self.inputs = Inputs(node, config, self.thread, tasks.fail, self._on_choice)
         log, start = node.get_logger(), time.monotonic()
         log.info('loading kernels')
         with lasting_objects():
@@ -168,6 +170,32 @@ class Session:
             self._checkpoints.save_if_due()
         now_ns = self._node.get_clock().now().nanoseconds
         self.latencies_s.append((now_ns - update.stamp_ns) / 1e9)
+
+    def _on_choice(self, choice: SourceChoice) -> None:
+        """Map the scans that have waited for the choice of ``pose.source: auto``."""
+        if choice.source == 'registration':
+            self._tasks.submit(self._register_scans)  # compiles: signals end it there
+        else:
+            self.thread.post(self._map_waiting)
+
+    def _register_scans(self) -> bool:
+        """Take the poses from registration; called in the main thread, as scans wait on."""
+        try:
+            self.thread.call(self.mapper.register_scans).result()
+            assert self.mapper.registered is not None
+            run_stages([CompileStage('registration', self.mapper.registered.warm_up)])
+            self.registration = registration_outputs(self._node, self.mapper, self.thread)
+            self.thread.post(self._map_waiting)
+        except CancelledError:
+            return False  # the session has ended
+        except Exception as error:
+            self._tasks.fail(error)
+            return False
+        return True
+
+    def _map_waiting(self) -> None:
+        """Map scans from now on; called in the mapping thread."""
+        self.mapper.knows_source = True
 
     def _reconfigure(self) -> None:
         """Pass the newest settings to the mapper; called in the mapping thread."""

@@ -150,6 +150,12 @@ class SubscriptionExecutor:
     on_failure : callable
         Called in the thread with the error that ends it; see take_turns.
 
+    Attributes
+    ----------
+    on_turn : callable or None
+        Called in the thread after each turn, at least every FOLLOW_PERIOD_S; it may subscribe and
+        unsubscribe.
+
     """
 
     def __init__(self, node: BaseNode, on_failure: Callable[[BaseException], None]) -> None:
@@ -160,6 +166,7 @@ class SubscriptionExecutor:
         self._others: list[TopicReader] = []
         self._end_s = math.inf
         self._thread: threading.Thread | None = None
+        self.on_turn: Callable[[], object] | None = None
 
     def subscribe(
         self,
@@ -205,6 +212,14 @@ class SubscriptionExecutor:
             reader.qos.reliability = self._offered(reader, default=qos.reliability)
         self._open(reader)
         (self._eager if eager else self._others).append(reader)
+
+    def unsubscribe(self, name: str) -> None:
+        """End the subscription to a topic; called in the thread, or while it does not run."""
+        topic = self._node.resolve_topic_name(name)
+        for readers in (self._eager, self._others):
+            for reader in [reader for reader in readers if reader.topic == topic]:
+                readers.remove(reader)
+                self._close(reader)
 
     def topics(self) -> list[str]:
         """Return the full names of the topics subscribed to."""
@@ -355,6 +370,8 @@ class SubscriptionExecutor:
         self._follow_publishers()
         while self._take_turn():
             pass
+        if self.on_turn is not None:
+            self.on_turn()
         return True
 
     def _wait(self) -> None:
@@ -371,7 +388,8 @@ class SubscriptionExecutor:
         for event in events:
             event.add_to_wait_set(wait_set)
         wait_set.add_guard_condition(self._stop.handle)
-        is_following = max(found.follow_until_s for found in readers) > time.monotonic()
+        follow_until_s = max((found.follow_until_s for found in readers), default=-math.inf)
+        is_following = self.on_turn is not None or follow_until_s > time.monotonic()
         wait_set.wait(int(FOLLOW_PERIOD_S * 1e9) if is_following else -1)
         # all are taken before a callback is called, since the wait set holds their order
         reports = [(event, event.take_data()) for event in events if event.is_ready(wait_set)]

@@ -176,7 +176,7 @@ def test_verbose_logs_steps_and_quiet_none(inputs, tmp_path, caplog, capsys):
         printed = capsys.readouterr()
         assert logging.getLogger('surfel_mapper').level == level
         assert ('mapped 6 scans in ' in caplog.text) == (option != '-q')
-        assert printed.out.startswith('scans 6 ')
+        assert '\nscans 6 ' in printed.out
         assert printed.err == ''
 
 

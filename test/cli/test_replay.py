@@ -60,9 +60,10 @@ def test_a_replay_writes_map_picture_and_summary(bag, tmp_path, capsys):
     assert (output / 'map.png').read_bytes().startswith(PNG_MAGIC)
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
-    assert lines[0] == f'scans {NUM_SCANS}   points 27 k   surfels {summary["surfels"]}'
-    assert lines[1].startswith('read ')
-    assert lines[2] == f'digest {summary["digest"]}'
+    assert lines[0] == 'poses from tf: /tf has them'
+    assert lines[1] == f'scans {NUM_SCANS}   points 27 k   surfels {summary["surfels"]}'
+    assert lines[2].startswith('read ')
+    assert lines[3] == f'digest {summary["digest"]}'
     assert printed.err == ''  # no progress without a terminal
 
 
@@ -122,7 +123,8 @@ def test_dropped_scans_are_reported_by_cause(tmp_path, capsys):
     bag = write_rosbag2(tmp_path / 'drive', entries)
     assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 0
 
-    assert capsys.readouterr().out.startswith('scans 6 (1 dropped: empty frame id 1)   points 22')
+    line = capsys.readouterr().out.splitlines()[1]
+    assert line.startswith('scans 6 (1 dropped: empty frame id 1)   points 22')
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,11 @@ def chosen(path, config=None, **request):
     return {k: v for k, v in settings.items() if v != default[k]}, found['poses_reason']
 
 
+def plain(settings):
+    """Return settings with tuples for lists."""
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+
+
 def bag_of(tmp_path, *kept, entries=None):
     """Write the messages of a drive whose topic or type is among some."""
     rows = [row for row in entries or drive() if row[0] in kept or row[1] in kept]
@@ -52,10 +57,19 @@ def bag_of(tmp_path, *kept, entries=None):
 @pytest.mark.parametrize(
     ('kept', 'expected', 'says'),
     [
-        ((CLOUD, TF, ODOMETRY, POSE), {}, ''),
-        ((CLOUD, TF), {}, ''),
-        ((CLOUD, ODOMETRY, '/tf_static'), {'pose.source': 'odometry', **MOUNTED}, '/odom has'),
-        ((CLOUD, POSE, '/tf_static'), {'pose.source': 'pose', **MOUNTED}, '/pose has'),
+        ((CLOUD, TF, ODOMETRY, POSE), {'pose.source': 'tf'}, '/tf has them'),
+        ((CLOUD, TF), {'pose.source': 'tf'}, '/tf has them'),
+        (
+            (CLOUD, ODOMETRY, POSE, '/tf_static'),
+            {'pose.source': 'odometry', **MOUNTED},
+            '/odom has them (frames.base_to_sensor: [0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0]); not '
+            'from tf: /tf_static: none of them moves',
+        ),
+        (
+            (CLOUD, POSE, '/tf_static'),
+            {'pose.source': 'pose', **MOUNTED},
+            'not from odometry: no topic',
+        ),
         ((CLOUD,), {'pose.source': 'registration'}, 'the recording has no poses'),
         ((CLOUD, '/tf_static'), {'pose.source': 'registration'}, 'no topic gives the poses'),
         ((CLOUD, ODOMETRY), {'pose.source': 'registration'}, 'the place of lidar in base_link'),
@@ -64,9 +78,8 @@ def bag_of(tmp_path, *kept, entries=None):
 def test_the_first_source_that_covers_the_clouds_is_taken(tmp_path, kept, expected, says):
     settings, reason = chosen(bag_of(tmp_path, *kept))
 
-    assert {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()} == expected
+    assert plain(settings) == expected
     assert says in reason
-    assert bool(says) == bool(reason)
 
 
 def test_a_tree_with_another_root_is_taken_with_its_root(tmp_path):
@@ -77,17 +90,54 @@ def test_a_tree_with_another_root_is_taken_with_its_root(tmp_path):
 
     settings, reason = chosen(bag_of(tmp_path, CLOUD, TF, entries=entries))
 
-    assert settings == {'frames.fixed': 'world'}
+    assert settings == {'pose.source': 'tf', 'frames.fixed': 'world'}
     assert reason == '/tf has them (frames.fixed: world)'
 
 
 def test_settings_of_the_user_are_kept(tmp_path):
     bag = bag_of(tmp_path, CLOUD, TF, ODOMETRY)
-    assert chosen(bag, {'frames.fixed': 'map'}) == ({'frames.fixed': 'map'}, '')
+    mapped_in = {'pose.source': 'tf', 'frames.fixed': 'map'}
+    assert chosen(bag, mapped_in) == (mapped_in, '')
+    assert chosen(bag, {'pose.source': 'tf'}) == ({'pose.source': 'tf'}, '')
+    assert chosen(bag, {'pose.source': 'pose'}, poses_from='auto') == chosen(bag)
     assert chosen(bag, {'pose.source': 'identity'}) == ({'pose.source': 'identity'}, '')
     assert chosen(bag, poses_from='identity') == ({'pose.source': 'identity'}, '')
     assert chosen(bag, poses_from='registration') == ({'pose.source': 'registration'}, '')
     assert chosen(bag, poses_from='odometry')[0]['pose.source'] == 'odometry'
+
+
+@pytest.mark.parametrize(
+    ('kept', 'frames', 'source', 'reason'),
+    [
+        ((CLOUD, TF, ODOMETRY), MOUNTED, 'tf', '/tf has'),
+        ((CLOUD, '/tf', ODOMETRY), MOUNTED, 'tf', '/tf has'),
+        (
+            (CLOUD, '/tf', ODOMETRY),
+            {'frames.base': 'robot'},
+            'odometry',
+            '/odom has them; not from tf: no transforms lead from odom to lidar',
+        ),
+        (
+            (CLOUD, TF, POSE),
+            {'frames.fixed': 'map'},
+            'pose',
+            '/pose has them; not from tf: no transforms lead from map to lidar; not from '
+            'odometry: no topic',
+        ),
+    ],
+)
+def test_frames_of_the_user_are_kept_and_decide(tmp_path, kept, frames, source, reason):
+    settings, stated = chosen(bag_of(tmp_path, *kept), frames)
+
+    assert plain(settings) == {'pose.source': source, **frames}
+    assert stated.startswith(reason)
+
+
+def test_the_topic_of_the_poses_decides_their_source(tmp_path):
+    bag = bag_of(tmp_path, CLOUD, TF, ODOMETRY)
+    settings, reason = chosen(bag, pose_topic='/odom')
+    assert settings == {'pose.source': 'odometry'}
+    assert reason == '/odom has them; not from tf: no topic'
 
 
 def test_contradicting_sources_are_refused(tmp_path):

@@ -49,6 +49,18 @@ def test_a_publisher_that_cannot_be_heard_is_named_instead_of_another_remedy():
         assert 'alive' not in text
 
 
+def test_other_topics_of_clouds_are_the_remedy_if_the_default_has_no_publisher():
+    text = 'no publisher of /points; choose with -r points:=/velodyne_points'
+    assert found(ever_received=False, num_publishers=0, alternatives=text) == [
+        (WARN, f'no cloud on /points yet: {text}')
+    ]
+
+
+def test_missing_poses_are_a_warning():
+    text = 'pose.source auto takes registration: no topic gives the poses of the clouds'
+    assert found(received=20, poses=text) == [(WARN, text)]
+
+
 def test_silence_is_an_error_beyond_its_limit_only():
     assert found(silent_s=2.0) == []
     ((level, text),) = found(silent_s=2.1)

@@ -294,7 +294,7 @@ def test_an_unknown_parameter_gives_no_traceback(start):
 
 @pytest.mark.skipif(find_spec('tf2_msgs') is not None, reason='tf2_msgs is installed')
 def test_a_missing_tf2_msgs_ends_the_node_with_the_install_command(domain, capfd):
-    assert main(['node']) == 1
+    assert main(['node', '--ros-args', '-p', 'pose.source:=tf']) == 1
     assert 'sudo apt install ros-jazzy-tf2-msgs' in capfd.readouterr().err
 
 
