@@ -30,7 +30,7 @@ EXAMPLE = 'surfel-mapper extract scan.pcd --voxel-size 0.02 --output models/'
 
 MAPS = ('.npz', '.parquet')
 
-FORMATS = ('json', 'obj', 'parquet', 'dxf', 'step')
+FORMATS = ('json', 'parquet', 'obj', 'glb')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,9 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--formats',
         nargs='+',
         choices=FORMATS,
-        default=('json', 'obj'),
+        default=('json',),
         metavar='FORMAT',
-        help=f'of {", ".join(FORMATS)}; default json obj',
+        help=f'of {", ".join(FORMATS)}; default json',
     )
     parser.add_argument(
         '--voxel-size', type=real, metavar='M', help='m (0.04; for a map half its voxel size)'

@@ -128,5 +128,5 @@ register(
     'models',
     'surfel_mapper.layers.models:ModelsLayer',
     'layers.models.enabled',
-    {'dxf': 'models.dxf', 'step': 'models.step'},
+    {'obj': 'models.obj', 'glb': 'models.glb'},
 )

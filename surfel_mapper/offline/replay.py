@@ -69,7 +69,7 @@ class ReplayOptions:
         Close loops, and align all scans with each other at the end; the latter keeps all points
         in memory until then. By default loops are closed if poses come from registration.
     formats : tuple of str
-        Formats: ply, pcd, parquet, npz and bag of the map, dxf and step of the layer models.
+        Formats: ply, pcd, parquet, npz and bag of the map, obj and glb of the layer models.
     poses_out : Path, optional
         File for the poses of the scans, as TUM text.
     truth : Path, optional

@@ -3,7 +3,6 @@
 """Tables in text are read in steps of a piece, not of a line, and errors still name the line."""
 
 from fractions import Fraction
-import itertools
 import random
 import sys
 
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import pcd, ply
-from surfel_mapper.files.obj import read_obj
 from surfel_mapper.files.pose_rows import EXACT_SKEW, MAX_SKEW, rigid_poses
 from surfel_mapper.files.stamps import nanoseconds, read_dates, read_times
 from surfel_mapper.files.text_lines import num_decimals, read_lines, table_rows
@@ -246,60 +244,6 @@ def test_whole_numbers_among_decimals_refuse_no_last_one(tmp_path, last):
     numbers = ['0', *['0.500'] * 300, last]
     path.write_text('\n'.join(f'1 0 0 0 0 1 0 0 0 0 1 {number}' for number in numbers))
     assert len(read_trajectory(path)) == 302
-
-
-def slow_obj(text):
-    """Return vertices and triangles of an OBJ file, a line at a time."""
-    vertices, triangles = [], []
-    for line in text.splitlines():
-        kind, *words = line.split() or ['']
-        if kind == 'v':
-            vertices.append([float(word) for word in words[:3]])
-        elif kind == 'f':
-            corners = [int(word.split('/')[0]) for word in words]
-            corners = [c - 1 if c > 0 else len(vertices) + c for c in corners]
-            triangles += [(corners[0], *pair) for pair in itertools.pairwise(corners[1:])]
-    return vertices, triangles
-
-
-def test_polygons_of_obj_are_those_of_a_loop(tmp_path):
-    rng, lines, known = random.Random(4), ['# made', 'o a_b', 'v 0 0 0', 'v 1 0 0', 'v 0 1 0'], 3
-    for _ in range(3000):
-        if rng.random() < 0.5:
-            lines.append(
-                f'v {rng.random()} {rng.randrange(9)} -1e-3' + ' 0.5 0.5 1' * rng.randrange(2)
-            )
-            known += 1
-        else:
-            corners = rng.choices([*range(1, known + 1), *range(-known, 0)], k=rng.randrange(3, 7))
-            lines.append(' f ' + ' '.join(f'{c}{rng.choice(("", "/1", "//2"))}' for c in corners))
-        lines += rng.choice(([], ['vn 0 0 1'], ['']))
-    path = tmp_path / 'a.obj'
-    path.write_text('\n'.join(lines) + '\n')
-    vertices, triangles = slow_obj(path.read_text())
-    read_obj(path)  # imports
-    found, steps = steps_of(lambda: read_obj(path))
-    np.testing.assert_array_equal(found.vertices, vertices)
-    np.testing.assert_array_equal(found.triangles, triangles)
-    assert steps < 8 * len(lines)  # one for the slash of each corner
-
-
-@pytest.mark.parametrize(
-    ('line', 'problem'),
-    [
-        ('v 1 2', '2 numbers, expected 3'),
-        ('v 1 2 x', "could not convert string to float: 'x'"),
-        ('f 1 2 1.5', "'1.5' is no vertex"),
-        ('f 1 2 nan', "'nan' is no vertex"),
-        ('f 1 2 3_0', "'3_0' is no number"),
-        ('f 1 2 99999999999999999999', '.* is no vertex'),
-    ],
-)
-def test_damaged_lines_of_obj_are_named(tmp_path, line, problem):
-    path = tmp_path / 'a.obj'
-    path.write_text(f'v 0 0 0\n\n# a\nv 1 0 0\n{line}\nf 1 1 2\n')
-    with pytest.raises(FileFormatError, match=f'a.obj: line 5 is damaged: {problem}'):
-        read_obj(path)
 
 
 @pytest.mark.parametrize('write', [ply, pcd])

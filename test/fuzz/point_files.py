@@ -228,8 +228,6 @@ TABLES = {
     'c.tum': ('t,x,y,z,qx,qy,qz,qw\n', '{0},0,0,0,0,0,0,1'),
     'times': ('', '{0}'),
     'dates': ('', '2011-09-26 13:02:25.594360375'),
-    'a.obj': ('v 0 0 0\nv 1 0 0\nv 0 1 0\n', 'f 1 2 3'),
-    'b.obj': ('', 'v {0} 0 0'),
     'a.ply': (
         'ply\nformat ascii 1.0\nelement vertex {0}\nproperty float x\nproperty float y\n'
         'property float z\nend_header\n',

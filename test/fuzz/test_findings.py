@@ -41,7 +41,6 @@ from surfel_mapper.errors import (
 )
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.map_state import load_map, save_map
-from surfel_mapper.files.obj import read_obj
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.files.trajectory import read_trajectory
@@ -1127,13 +1126,3 @@ def test_pipes_and_devices_are_refused(tmp_path, name, kind):
     with pytest.raises(SurfelMapperError, match=r'not a regular file|no such file'):
         READERS[name](path)
     assert resident('VmHWM') - before < 64 << 20
-
-
-def test_a_line_of_a_model_without_end_is_refused(tmp_path):
-    path = tmp_path / 'a.obj'
-    path.write_bytes(b'v 0 0 0\n' + b'f' + b' 1' * 5_000_000)
-    reset_peak()
-    before = resident('VmRSS')
-    with pytest.raises(FileFormatError, match=r'a.obj:2: a line of over 65536 characters'):
-        read_obj(path)
-    assert resident('VmHWM') - before < 64 << 20  # was 800 MB
