@@ -52,6 +52,7 @@ HOMES = {
     'bond': ('ros/',),
     'builtin_interfaces': ('ros/',),
     'compression': ('bags/',),  # zstd from Python 3.14 on
+    'cryptography': ('cluster/',),
     'dask': ('cluster/',),
     'diagnostic_msgs': ('ros/',),
     'distributed': ('cluster/',),

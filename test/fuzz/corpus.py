@@ -250,9 +250,9 @@ def las() -> list[bytes]:
 
 def tile() -> list[bytes]:
     """Return a tile of a map."""
-    from surfel_mapper.files.parquet_tiles import write_tile
+    from surfel_mapper.files.parquet import write_map
 
-    return [written(lambda path: write_tile(path, small_map()[0]), 'a.parquet')]
+    return [written(lambda path: write_map(path, small_map()[0]), 'a.parquet')]
 
 
 def shown() -> list[bytes]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from surfel_mapper.errors import SurfelMapperError
 from surfel_mapper.files import ply
-from surfel_mapper.files.parquet_tiles import dataset_digest, read_part, split_map, tile_part
+from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.stamps import read_dates, read_times
 from surfel_mapper.files.trajectory import read_trajectory
@@ -281,13 +281,11 @@ def long_table(data: bytes) -> None:
 
 
 def tile(data: bytes) -> None:
-    """Read a file of a tiled map in each way, and the map that it is a tile of."""
+    """Read a map of one tile."""
     name = 'tile_i=0/tile_j=0/surfels.parquet'
     tiled = Path(folder().name, 'tiled')
     (tiled / name).parent.mkdir(parents=True, exist_ok=True)
-    refused(lambda path: read_part(tile_part(path)), f'tiled/{name}', data)
-    refused(lambda path: [*split_map(path)], f'tiled/{name}', data)
-    refused(lambda path: dataset_digest(tiled), f'tiled/{name}', data)
+    refused(lambda path: read_tiles(tiled), f'tiled/{name}', data)
 
 
 SHOWN = ('.obj', '.stl', '.glb')

@@ -498,21 +498,6 @@ def test_a_packed_file_of_empty_frames_is_refused(tmp_path, monkeypatch):
     assert (tmp_path / 'a').read_bytes() == b'abc' * 900
 
 
-def test_a_tile_that_does_not_state_its_voxels_is_refused(tmp_path):
-    """Statistics without a least value, as damage leaves them, were a TypeError."""
-    parquet = pytest.importorskip('pyarrow.parquet')
-    from surfel_mapper.files.parquet_tiles import dataset_digest, write_tile
-
-    surfel_map = SurfelMap(0.5)
-    surfel_map.add(np.random.default_rng(3).uniform(-1.0, 1.0, (30, 3)))
-    path = tmp_path / 'tile_i=0' / 'tile_j=0' / 'surfels.parquet'
-    path.parent.mkdir(parents=True)
-    write_tile(path, surfel_map)
-    parquet.write_table(parquet.read_table(path, partitioning=None), path, write_statistics=False)
-    with pytest.raises(FileFormatError, match='row group 0 does not state its smallest i'):
-        dataset_digest(tmp_path)
-
-
 @finding('LAZ of version 0.4, 766 bytes', before='1.7 GB', now='refused: below 10 MB')
 def test_las_of_another_version_is_refused(tmp_path):
     """Laspy takes the count of version 1.4 by the second number, and sizes of layers are read."""

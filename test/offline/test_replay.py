@@ -103,7 +103,6 @@ def test_a_stopped_replay_writes_the_scans_so_far(bag, tmp_path):
     [
         ({'formats': ('stl',)}, None, ConfigError, "formats: 'stl', expected some of ply"),
         ({'formats': ('glb',)}, None, ConfigError, 'layers.models.enabled: true'),
-        ({'formats': ('step',)}, None, ConfigError, 'step is written by the layer models'),
         ({}, {'frames.fixed': 'map'}, BagError, 'none of 6 clouds of /points was mapped'),
     ],
 )

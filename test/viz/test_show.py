@@ -15,7 +15,7 @@ from surfel_mapper import SurfelMap, Trajectory
 from surfel_mapper.cli.main import main
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.files.mesh_ply import write_mesh
-from surfel_mapper.files.parquet_tiles import Tile, write_tile
+from surfel_mapper.files.parquet_tiles import write_tiles
 from surfel_mapper.files.ply import write_points
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.viz.contents import contents
@@ -86,12 +86,7 @@ def test_exact_maps_are_shown_by_all_their_surfels(tmp_path, name):
     surfel_map = ground_map()
     if name == 'tiles':
         path = tmp_path / 'out'
-        for i, j in ((-1, -1), (-1, 0), (0, -1), (0, 0)):
-            index = surfel_map.moments().voxel_index
-            is_here = ((index[:, :2] >> 8) == (i, j)).all(axis=1)
-            part = SurfelMap(0.5)
-            part.insert(surfel_map.moments(index[is_here]))
-            write_tile(path / 'map' / Tile(i, j).path, part)
+        write_tiles(path / 'map', surfel_map)
     else:
         path = tmp_path / name
         surfel_map.save(path)
