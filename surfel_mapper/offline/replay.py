@@ -41,7 +41,6 @@ ALL_SCANS: Mapping[str, Any] = {
     'window.max_age_s': 0.0,
     'window.max_distance_m': 0.0,
     'window.max_bytes': 0,
-    'map.max_voxels': 0,
     'map.max_bytes': 0,
 }
 """Settings with which no scan leaves the map."""

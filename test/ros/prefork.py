@@ -121,14 +121,14 @@ def load():
 
     from rclpy.impl.rcutils_logger import CallerId
 
-    from surfel_mapper.config import Config
     from surfel_mapper.pipeline import Mapper
+    from test.fields import config_of
 
     for name in (*(f'cli.{verb}' for verb in VERBS), 'ros.main', 'ros.player', 'offline.replay'):
         import_module(f'surfel_mapper.{name}')
     outputs = import_module('surfel_mapper.ros.outputs')
     for settings in ({}, LAYERS, WITHOUT_POSES):
-        config = Config.from_mapping({'pose.source': 'odometry', **settings, **ONE_THREAD})
+        config = config_of({'pose.source': 'odometry', **settings, **ONE_THREAD})
         Mapper(config).warm_up()
         outputs.warm_up(config)
     load_type_supports()
