@@ -76,7 +76,7 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
         (('replay', 'a', '--seconds', '3'), 'error: no option --seconds\n'),
         (('info', 'a', '--jsn'), 'no option --jsn, did you mean --json?'),
         (('info', 'a', 'b'), 'too many arguments: b'),
-        (('merge', 'a', '--output', 'b', '--workers', '0'), 'a whole number of 1 or more'),
+        (('merge', 'a', '--output', 'b', '--min-points', '0'), 'a whole number of 1 or more'),
         (('view', 'a', '--at', '1', '2', 'nan'), "--at: 'nan', expected a finite number"),
         (('view', 'a', '--port', '0'), "--port: '0', expected a whole number of 1 or more"),
         (('view', 'a', '--port', '65535'), "--port: '65535', expected a port up to 65534"),
