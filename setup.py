@@ -49,14 +49,7 @@ ROS = [
 
 FORMATS = [
     'pyarrow>=14.0.1',  # maps as Parquet; 14.0.0 runs what a file tells it to, CVE-2023-47248
-    'ezdxf>=1.1',  # planes and surfaces as DXF, for CAD
     'python-neo-lzf>=0.3',  # scans in compressed PCD files
-]
-
-STEP = [
-    # models as STEP; Apache-2.0, Open CASCADE in it LGPL-2.1; 8 has other names, and no wheels for
-    # Python 3.10
-    'cadquery-ocp-novtk>=7.9.3.1,<8',
 ]
 
 CLUSTER = [
@@ -89,8 +82,8 @@ VIEWER = [
     'rerun-sdk>=0.27',  # view, replay --view and --rrd; 0.27 is the first that places the eye
 ]
 
-GLTF = [
-    'trimesh>=4.4',  # view --glb; MIT, Python alone, and numpy
+MESHES = [
+    'trimesh>=4.6',  # OBJ, STL and glTF; MIT, Python alone, and numpy
 ]
 
 NOTEBOOKS = [
@@ -110,11 +103,10 @@ TEST = [
     *FORMATS,
     *CLUSTER,
     *LAS,
-    *STEP,
     *LOOPS,
     *ALIGN,
     *VIEWER,
-    *GLTF,
+    *MESHES,
     *NOTEBOOKS,
     # an independent reader of trajectories, and judge of their errors; GPL-3, so it is used by the
     # tests alone, and nothing that is installed with the package imports it
@@ -188,11 +180,10 @@ setup(
         'cluster': CLUSTER,
         'las': LAS,
         'ouster': OUSTER,
-        'step': STEP,
         'align': ALIGN,
         'loops': LOOPS,
         'viewer': VIEWER,
-        'gltf': GLTF,
+        'meshes': MESHES,
         'notebooks': NOTEBOOKS,
         'ros': ROS,
         'test': TEST,

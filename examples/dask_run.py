@@ -17,9 +17,9 @@ import argparse
 from pathlib import Path
 
 from surfel_mapper import load_config
-from surfel_mapper.cluster.executors import open_executor
 from surfel_mapper.cluster.map_reduce import map_bags
 from surfel_mapper.cluster.shards import cut
+from surfel_mapper.cluster.workers import open_workers
 from surfel_mapper.offline.request import Request
 
 
@@ -36,13 +36,15 @@ def main() -> None:
     args = parser.parse_args()
 
     config = load_config(args.config)
-    shards = [shard for bag in args.bags for shard in cut(Request(path=bag), config, args.shard)]
-    with open_executor(args.workers, args.scheduler) as executor:
-        mapped = map_bags(shards, executor, args.output)
-    tiled = mapped.map
+    bags = [cut(Request(path=bag), config, args.shard) for bag in args.bags]
+    with open_workers(args.workers, args.scheduler) as workers:
+        mapped = map_bags(bags, workers)
+    surfel_map = mapped.mapper.map
+    args.output.mkdir(parents=True, exist_ok=True)
+    digest = surfel_map.save(args.output / 'map.npz')
     print(
-        f'{len(shards)} shards, {tiled.points} points, {tiled.surfels} surfels '
-        f'in {tiled.tiles} tiles of {tiled.directory}\ndigest {tiled.digest}'
+        f'{mapped.num_shards} shards, {surfel_map.num_points} points, '
+        f'{surfel_map.num_surfels(config.map.min_points)} surfels\ndigest {digest}'
     )
 
 

@@ -12,7 +12,14 @@ from __future__ import annotations
 from pathlib import Path
 import textwrap
 
-from surfel_mapper.config import allowed, declarations, settings_table, yaml_value
+from surfel_mapper.config import (
+    allowed,
+    declarations,
+    FIRST,
+    first_ones,
+    settings_table,
+    yaml_value,
+)
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / 'docs' / 'settings.md'
@@ -25,7 +32,8 @@ HEADER = """\
 # SPDX-License-Identifier: Apache-2.0
 
 # Every setting at its default, for the node (--params-file) and for replay (--config). Copy it
-# and keep only what you change. Written from surfel_mapper/config/ by `make settings`.
+# and keep only what you change; the first ten matter most. Written from the declarations in
+# surfel_mapper/config/ by `make settings`.
 # In a list write every number with a point: ROS refuses a file where 0 stands beside 0.5.
 
 /**:
@@ -36,17 +44,25 @@ HEADER = """\
 def default_yaml() -> str:
     """Return the content of default.yaml."""
     text, stage = HEADER, None
+    for declared in first_ones():
+        text += entry(declared, declared.name, '    ')
     for declared in declarations():
+        if declared.name in FIRST:
+            continue
         if declared.stage != stage:
-            text += '\n' if stage else ''
+            text += '\n'
             text += f'    {declared.stage}:\n' if declared.stage else ''
             stage = declared.stage
-        indent = '      ' if stage else '    '
-        comment = f'{declared.meaning} {allowed(declared)}'.strip()
-        lines = [f'# {line}' for line in textwrap.wrap(comment, 97 - len(indent))]
-        lines.append(f'{declared.key}: {yaml_value(declared.default)}')
-        text += textwrap.indent('\n'.join(lines), indent) + '\n'
+        text += entry(declared, declared.key, '      ' if stage else '    ')
     return text
+
+
+def entry(declared, key, indent):
+    """Return the lines of a setting in default.yaml."""
+    comment = f'{declared.meaning} {allowed(declared)}'.strip()
+    lines = [f'# {line}' for line in textwrap.wrap(comment, 97 - len(indent))]
+    lines.append(f'{key}: {yaml_value(declared.default)}')
+    return textwrap.indent('\n'.join(lines), indent) + '\n'
 
 
 def with_table(page: str) -> str:

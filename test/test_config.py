@@ -31,7 +31,6 @@ QUARTER_TURN = [1.0, 2.0, 3.0, 0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 UNITS = {'m', 's', 'deg', 'hz', 'voxels', 'weight', 'ratio', 'overlap'}
 
 # A stage may refuse a combination of values within bounds; these companions avoid that.
-LEVEL = {'layers.tsdf.weight_dropoff': False}
 COMPANIONS = {
     'align.every_scans': {'window.keep_points': True},
     'esdf.slice_min_m': {'esdf.slice_max_m': 1e5},
@@ -39,9 +38,8 @@ COMPANIONS = {
     'input.min_range_m': {'input.max_range_m': 0.0},
     'layers.tsdf.min_range_m': {'layers.tsdf.max_range_m': 1e5},
     'layers.tsdf.max_range_m': {'layers.tsdf.min_range_m': 0.001},
-    'layers.tsdf.voxel_size_m': LEVEL,
-    'layers.tsdf.truncation_m': LEVEL,
-    'layers.tsdf.dropoff_m': LEVEL,
+    'layers.tsdf.voxel_size_m': {'layers.tsdf.truncation_m': 1000.0},
+    'layers.tsdf.truncation_m': {'layers.tsdf.voxel_size_m': 0.001},
 }
 
 
@@ -169,7 +167,7 @@ def test_values_that_are_no_finite_number_are_refused_by_name():
     assert faults == []
 
 
-@pytest.mark.parametrize('name', ['map.min_points', 'window.max_scans', 'publish.max_markers'])
+@pytest.mark.parametrize('name', ['map.min_points', 'window.max_scans', 'map.threads'])
 def test_a_float_does_not_stand_for_a_whole_number(name):
     with pytest.raises(ConfigError, match=f'{name}: 5.0, expected a whole number'):
         configured(name, 5.0)

@@ -279,8 +279,7 @@ class LoopSearch:
         if overlap < settings.min_overlap_ratio or found.fit < settings.min_fit_ratio:
             return (
                 f'{overlap:.0%} of it overlaps and {found.fit:.0%} of that fits, expected '
-                f'{settings.min_overlap_ratio:.0%} and {settings.min_fit_ratio:.0%} '
-                '(loops.min_overlap_ratio, min_fit_ratio)'
+                f'{settings.min_overlap_ratio:.0%} and {settings.min_fit_ratio:.0%}'
             )
         if len(found.degenerate):
             return f'{len(found.degenerate)} of 6 directions are not determined'
@@ -301,7 +300,7 @@ class LoopSearch:
             self._refuse(as_candidate(loop), 'no loop between keyframes next to it confirms it')
 
     def _cells(self, key: int) -> Floats:
-        """Return means of the surfels around a keyframe, at most registration.max_cells."""
+        """Return means of the surfels around a keyframe, at most RegistrationConfig.max_cells."""
         cells = means(self._local_map(key).moments())
         step = -(-len(cells) // self._registration.config.max_cells) or 1
         return np.ascontiguousarray(cells[::step])

@@ -165,7 +165,7 @@ class Tracker:
         ------
         AlignmentError
             If the scan does not fit the map, fits it at two places about equally well, needs a
-            motion faster than ``registration.max_speed_m_s``, fits too poorly to be accepted at
+            motion faster than ``max_speed_m_s``, fits too poorly to be accepted at
             once (see ``doubtful``), or if much of it moves along and for LONGEST_UNTOLD_S
             nothing else has told the motion. The predicted velocity is halved then.
 
@@ -245,15 +245,14 @@ class Tracker:
             )
         if not self._registration.fits(found):
             return (
-                f'{said}, expected {config.min_overlap_ratio:.0%} and {config.min_fit_ratio:.0%} '
-                '(registration.min_overlap_ratio, min_fit_ratio)'
+                f'{said}, expected {config.min_overlap_ratio:.0%} and {config.min_fit_ratio:.0%}'
             )
         if not is_steady:
-            return f'{said}, but its pose has not settled (registration.max_iterations)'
+            return f'{said}, but its pose has not settled'
         if speed_m_s > config.max_speed_m_s:
             return (
                 f'{said}, but {speed_m_s:.0f} m/s lead there, expected at most '
-                f'{config.max_speed_m_s:g} (registration.max_speed_m_s)'
+                f'{config.max_speed_m_s:g}'
             )
         return ''
 

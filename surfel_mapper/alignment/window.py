@@ -62,7 +62,7 @@ LEEWAY = 10.0
 
 STEPS_A_ROUND = 2
 
-LITTLE_OVERLAP = 'too few of their surfels belong together (align.min_overlap)'
+LITTLE_OVERLAP = 'too few of their surfels belong together'
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

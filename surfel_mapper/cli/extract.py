@@ -35,9 +35,9 @@ MAPS = ('.npz', '.parquet')
 
 _log = logging.getLogger(__name__)
 
-FORMATS = ('json', 'obj', 'parquet', 'dxf', 'step')
+FORMATS = ('json', 'parquet', 'obj', 'glb')
 
-DEFAULT = ('json', 'obj')
+DEFAULT = ('json',)
 """Formats without --formats."""
 
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-``surfel-mapper merge``: finished maps into one, tile by tile, exactly.
+``surfel-mapper merge``: finished maps into one, exactly, written in tiles.
 
-The result has the digest of a map of all their scans. No process holds a whole map.
+The result has the digest of a map of all their scans.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
-from surfel_mapper.cli._arguments import add_overwrite, add_workers, positive_int
+from surfel_mapper.cli._arguments import add_overwrite, positive_int
 from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._verbosity import add_verbosity
@@ -21,10 +21,7 @@ from surfel_mapper.compilation import clock
 from surfel_mapper.errors import escaped
 from surfel_mapper.offline.summary import rounded
 
-if TYPE_CHECKING:
-    from surfel_mapper.cluster.tiles import TiledMap
-
-SUMMARY = 'Merge finished maps of one frame into one, tile by tile, exactly.'
+SUMMARY = 'Merge finished maps of one frame into one, exactly.'
 
 EXAMPLE = 'surfel-mapper merge monday_surfels tuesday_surfels --output week'
 
@@ -51,41 +48,47 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_open(parser, 'map.png')
     add('--json', action='store_true', help='print the summary as JSON')
     add_verbosity(parser)
-    add_workers(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Merge and report."""
-    from surfel_mapper.cluster.executors import open_executor
-    from surfel_mapper.cluster.tiles import merge_maps
     from surfel_mapper.files.atomic import check_free, write_json
+    from surfel_mapper.files.merging import merged
+    from surfel_mapper.files.parquet_tiles import check_dataset, tiles_in, write_tiles
     from surfel_mapper.viz.picture import draw_map
 
     check_free(args.output, args.overwrite)
     began = clock()
-    with open_executor(args.workers, args.scheduler) as executor:
-        tiled = merge_maps(args.maps, executor, args.output, args.min_points)
+    directory = args.output / 'map'
+    check_dataset(directory)
+    total = merged(args.maps)
+    write_tiles(directory, total)
+    surfels = total.surfels(args.min_points)
     summary = {
         'maps': [str(path) for path in args.maps],
-        'points': tiled.points,
-        **tiled.summary(),
+        'points': total.num_points,
+        'voxels': total.num_voxels,
+        'surfels': len(surfels),
+        'tiles': len(tiles_in(directory)),
+        'voxel_size_m': total.voxel_size_m,
+        'origin_m': total.origin_m.tolist(),
+        'digest': total.digest(),
         'seconds': clock() - began,
-        'peak_memory_mb': {'merging': tiled.peak_bytes // 10**6},
     }
     picture = args.output / 'map.png'
-    title = f'{len(args.maps)} maps: {rounded(tiled.points)} points, {tiled.surfels:,} surfels'
-    draw_map(tiled.drawn, picture, title, origin_m=summary['origin_m'])
+    title = f'{len(args.maps)} maps: {rounded(total.num_points)} points, {len(surfels):,} surfels'
+    draw_map(surfels, picture, title, origin_m=summary['origin_m'])
     write_json(args.output / 'summary.json', summary)
-    show_lines(json.dumps(summary) if args.json else report(tiled, summary, picture))
+    show_lines(json.dumps(summary) if args.json else report(summary, directory, picture))
     if args.open:
         open_file(picture)
     return 0
 
 
-def report(tiled: TiledMap, summary: dict[str, Any], picture: Path) -> str:
+def report(summary: dict[str, Any], directory: Path, picture: Path) -> str:
     """Return the summary as lines of text."""
     return (
-        f'{len(summary["maps"])} maps   points {rounded(tiled.points)}   '
-        f'surfels {tiled.surfels}   tiles {tiled.tiles}   {summary["seconds"]:.1f} s\n'
-        f'digest {tiled.digest}\n{escaped(f"{tiled.directory}   {picture}")}'
+        f'{len(summary["maps"])} maps   points {rounded(summary["points"])}   '
+        f'surfels {summary["surfels"]}   tiles {summary["tiles"]}   {summary["seconds"]:.1f} s\n'
+        f'digest {summary["digest"]}\n{escaped(f"{directory}   {picture}")}'
     )

@@ -4,7 +4,7 @@
 ``surfel-mapper replay``: a bag, or a folder of scans, into a map, its picture and summary.json.
 
 Ctrl-C or SIGTERM ends the recording early, and the scans mapped until then are written; Ctrl-C
-pressed again ends at once. Several bags, --workers and --scheduler make a map in tiles.
+pressed again ends at once. Several bags, --workers and --scheduler map parts that are added up.
 
 Exit code 3: done, but the recording is cut off and --strict was given. 4: done, but registration
 could not place some scans on the map, which became maps of their own, or the surroundings seem to
@@ -55,8 +55,8 @@ SUMMARY = 'Map a bag, or a folder of scans, and write the map, a picture and fig
 
 EXAMPLE = 'surfel-mapper replay street.mcap --config my.yaml --voxel-size 0.2 -o street/ --open'
 
-ONE_PROCESS = ('window', 'align', 'poses_out', 'truth', 'view', 'rrd', 'formats')
-"""Options that ask for the whole map, or all scans in order, in one process."""
+ONE_PROCESS = ('window', 'align', 'view', 'rrd')
+"""Options that ask for all scans in order, in one process."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -205,7 +205,17 @@ def run(args: argparse.Namespace) -> int:
 
 def replay_one(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     """Map a recording in this process."""
-    replay_options = ReplayOptions(
+    chosen = replay_options(args)
+    request = request_of(args, args.bags[0])
+    config = configured(args)
+    others = {'--poses-out': args.poses_out, '--rrd': args.rrd}
+    check_distinct(request.path, args.output, chosen.formats, others)
+    return replay(request, output=args.output, config=config, options=chosen, **options)
+
+
+def replay_options(args: argparse.Namespace) -> ReplayOptions:
+    """Return the options of a replay that the arguments ask for."""
+    return ReplayOptions(
         window=args.window,
         align=args.align,
         formats=args.formats or ReplayOptions().formats,
@@ -215,22 +225,17 @@ def replay_one(args: argparse.Namespace, options: dict[str, Any]) -> Any:
         rrd=args.rrd,
         overwrite=args.overwrite,
     )
-    request = request_of(args, args.bags[0])
-    config = with_filters(args)
-    others = {'--poses-out': args.poses_out, '--rrd': args.rrd}
-    check_distinct(request.path, args.output, replay_options.formats, others)
-    return replay(request, output=args.output, config=config, options=replay_options, **options)
 
 
 def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
-    """Map recordings into tiles, with the workers that were asked for."""
+    """Map recordings into one map, with the workers that were asked for."""
     from surfel_mapper.offline.replay import ALL_SCANS
 
     given = [name for name in ONE_PROCESS if getattr(args, name)]
     if given:
         raise UsageError(
-            f'--{given[0].replace("_", "-")}: not with several bags, --workers or --scheduler, '
-            'where no process holds the whole map'
+            f'--{given[0]}: not with several bags, --workers or --scheduler, where no process '
+            'maps all scans in order'
         )
     config = with_filters(args).replace(ALL_SCANS)
     output = output_directory(args.bags[0], args.output)
@@ -242,8 +247,7 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
         output,
         workers=args.workers,
         scheduler=args.scheduler,
-        align=args.align,
-        overwrite=args.overwrite,
+        options=replay_options(args),
         **options,
     )
 

@@ -5,8 +5,8 @@ Map: shards, which are bags cut by record time, each mapped on its own as a part
 
 A worker starts to read some time before its shard (the lead), so that poses and stamps are known
 when the shard begins. The state that decides about later scans is hashed at both ends
-(ShardMapper.outlook). If the end of one shard and the start of the next disagree, the next is
-mapped again with a longer lead.
+(ShardMapper.outlook): if the end of one shard and the start of the next agree, both make the map
+of a single process.
 """
 
 from __future__ import annotations
@@ -14,9 +14,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 import math
-from pathlib import Path
-import resource
-import sys
 import time
 from typing import Any
 
@@ -26,9 +23,10 @@ import numpy.typing as npt
 from surfel_mapper.bags.reader import BagMessage
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError
-from surfel_mapper.files.parquet_tiles import Part, Tile, write_shard
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.offline.bag_recording import add_cloud, add_poses, BagRecording
+from surfel_mapper.offline.outputs import ScanTrajectory
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.offline.request import Request
@@ -42,13 +40,14 @@ SLACK = 0.02
 """Share by which shards may be longer, to avoid one more short shard."""
 
 LEAD_S = 1.0
-"""First lead: time before the oldest pose that a worker may need, s."""
+"""Time before the oldest pose that a worker may need, s."""
 
-LEAD_GROWTH = 8.0
-"""Factor by which a lead grows if it was too short."""
-
-StampedPose = tuple[int, npt.NDArray[np.float64]]
-"""Stamp, ns, and T_map_sensor of a scan."""
+SETTINGS: dict[str, Any] = {
+    **ALL_SCANS,
+    'layers.tsdf.enabled': False,
+    'layers.models.enabled': False,
+}
+"""Settings of shards: all scans stay, and no layers are kept, as they are not added up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,36 +88,35 @@ class ShardResult:
 
     Attributes
     ----------
-    parts : dict of Tile to Part
-        Files of its map, by tile.
+    map : SurfelMap
+        Its part of the map.
+    config : Config
+        The settings, with the source of the poses.
     before, after : str, optional
         Outlook at its start and at its stop; None at the ends of the bag.
     counts : dict
         ``Counters.summary`` of this part alone.
     resets : int
         Times that the clock was set back, in its lead too.
-    recorded_s, seconds, core_s : float
-        Time from its start to its stop, wall time of mapping it, and processor time.
+    recorded_s, core_s : float
+        Time from its start to its stop, and processor time of mapping it.
     stamps_ns : (S,) int64
         Stamps of the mapped scans.
     poses : (S, 4, 4) float64
         Their T_map_sensor.
-    peak_bytes : int
-        Peak memory of the process until the end of the shard.
 
     """
 
-    parts: dict[Tile, Part]
+    map: SurfelMap
+    config: Config
     before: str | None
     after: str | None
     counts: dict[str, Any]
     resets: int
     recorded_s: float
-    seconds: float
     core_s: float
     stamps_ns: npt.NDArray[np.int64]
     poses: npt.NDArray[np.float64]
-    peak_bytes: int
 
 
 def shard_length_s(recorded_s: float, num_workers: int) -> float:
@@ -158,7 +156,7 @@ def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
             f'map.mode {config.map.mode!r}, map.load {config.map.load!r}: several processes '
             "begin with empty maps; expected 'live' and '', or a single process"
         )
-    whole = Shard(request=absolute(request), config=config.replace(ALL_SCANS))
+    whole = Shard(request=absolute(request), config=config.replace(SETTINGS))
     with open_recording(request, whole.config) as recording:
         if not isinstance(recording, BagRecording) or not may_be_cut(recording):
             return [whole]
@@ -185,95 +183,89 @@ def may_be_cut(recording: BagRecording) -> bool:
     return is_divisible(recording.config) and not by_number
 
 
-def map_shard(shard: Shard, path: str) -> ShardResult:
+def map_shard(shard: Shard) -> ShardResult:
     """
-    Map a shard and write its part of the map to a file; runs on a worker.
+    Map a shard; runs on a worker.
 
     Raises
     ------
     BagError
         If the recording cannot be read.
     FileFormatError
-        If a file cannot be read or written.
+        If a file cannot be read.
 
     """
-    began, began_core = time.perf_counter(), time.process_time()
+    began = time.process_time()
     keep_freed_memory()
-    start = ShardStart()
     with open_recording(shard.request, shard.config) as recording:
         mapper = ShardMapper(recording.config)
-        recorded_s = recording.recorded_s
+        trajectory = ScanTrajectory(mapper)
+        start = ShardStart()
         if shard.is_whole:
-            mapped = [stamped_pose(update) for update in recording.replay(mapper)]
+            updates = recording.replay(mapper)
         elif isinstance(recording, BagRecording):
-            start, mapped = map_middle(recording, mapper, shard)
+            updates = replay_middle(recording, mapper, shard, start)
+        else:
+            raise TypeError(f'{shard.request.path}: only bags are cut')
+        for update in updates:
+            trajectory.add(update)
+        recorded_s = recording.recorded_s
+        if isinstance(recording, BagRecording):
             first_ns, last_ns = recording.bounds_ns
             start_ns = first_ns if shard.start_ns is None else shard.start_ns
             recorded_s = ((shard.stop_ns or last_ns) - start_ns) / 1e9
-        else:
-            raise TypeError(f'{shard.request.path}: only bags are cut')
-    parts = write_shard(path, mapper.map)
     return ShardResult(
-        parts=parts,
+        map=mapper.map,
+        config=mapper.config,
         before=start.outlook,
         after=None if shard.stop_ns is None else mapper.outlook(),
         counts=difference(mapper.counters.summary(), start.counts),
         resets=mapper.counters.resets,
         recorded_s=recorded_s,
-        seconds=time.perf_counter() - began,
-        core_s=time.process_time() - began_core,
-        stamps_ns=np.array([stamp_ns for stamp_ns, _ in mapped], np.int64),
-        poses=np.array([pose for _, pose in mapped]).reshape(-1, 4, 4),
-        peak_bytes=peak_bytes(),
+        core_s=time.process_time() - began,
+        stamps_ns=np.array(trajectory.stamps_ns, np.int64),
+        poses=trajectory.matrices,
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ShardStart:
     """Outlook and counts of a mapper at the start of its shard."""
 
     outlook: str | None = None
     counts: dict[str, Any] = field(default_factory=dict)
 
-    @classmethod
-    def of(cls, mapper: ShardMapper) -> ShardStart:
-        """Return outlook and counts of a mapper."""
-        return cls(mapper.outlook(), mapper.counters.summary())
+    def record(self, mapper: ShardMapper) -> None:
+        """Take them from a mapper that maps from now on."""
+        self.outlook, self.counts = mapper.outlook(), mapper.counters.summary()
+        mapper.passes_over = False
 
 
-def map_middle(
-    recording: BagRecording, mapper: ShardMapper, shard: Shard
-) -> tuple[ShardStart, list[StampedPose]]:
-    """Map a shard after its lead; return the state at its start, and the poses of its scans."""
-    reader, poses, clouds = recording.reader, recording.poses, set(recording.topics)
+def replay_middle(
+    recording: BagRecording, mapper: ShardMapper, shard: Shard, start: ShardStart
+) -> Iterator[Update]:
+    """Feed a shard to a mapper after its lead, and record its start; yield the updates."""
     if recording.config.input.kind == 'depth':
-        raise BagError(f'{reader.path}: depth images are mapped by one process alone')
-    start, mapped = ShardStart(), []
+        raise BagError(f'{recording.reader.path}: depth images are mapped by one process alone')
+    reader, poses, clouds = recording.reader, recording.poses, set(recording.topics)
     mapper.passes_over = shard.start_ns is not None
-    for topic, place in poses.mounts.items():
+    for topic, mount in poses.mounts.items():
         base = mapper.config.frames.base
-        mapper.add_pose(base, topic, 0, place[:3], place[3:], static=True)
+        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
     for message in messages_of(recording, shard):
         if mapper.passes_over and message.record_ns >= (shard.start_ns or 0):
-            start = ShardStart.of(mapper)
-            mapper.passes_over = False
+            start.record(mapper)
         if message.topic not in clouds:
             add_poses(reader, mapper, message, poses)
         elif recording.span.holds(message.record_ns):
             add_cloud(reader, mapper, message, poses, 0)
-        mapped += [stamped_pose(update) for update in mapper.insert_ready()]
+        yield from mapper.insert_ready()
     if mapper.passes_over:  # no message was recorded since
-        start = ShardStart.of(mapper)
+        start.record(mapper)
     if shard.stop_ns is None:
         mapper.end_scans()
-        mapped += [stamped_pose(update) for update in mapper.insert_ready()]
+        yield from mapper.insert_ready()
         mapper.finish()
-    return start, mapped
-
-
-def stamped_pose(update: Update) -> StampedPose:
-    """Return the stamp, ns, and T_map_sensor of a mapped scan."""
-    return update.stamp_ns, update.T_map_sensor
 
 
 def messages_of(recording: BagRecording, shard: Shard) -> Iterator[BagMessage]:
@@ -302,14 +294,3 @@ def difference(now: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
         else:
             left[name] = value - before.get(name, 0)
     return left
-
-
-def peak_bytes() -> int:
-    """Return the peak memory of this process since its program began, bytes."""
-    status = Path('/proc/self/status')
-    for line in status.read_text().splitlines() if status.exists() else []:
-        if line.startswith('VmHWM:'):
-            return int(line.split()[1]) * 1024
-    # without /proc; on Linux this would include the memory of the parent
-    unit = 1 if sys.platform == 'darwin' else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

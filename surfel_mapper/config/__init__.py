@@ -11,16 +11,13 @@ a wrong type or a value out of bounds is a ConfigError.
 """
 
 from surfel_mapper.config.configuration import (
-    allowed,
     Config,
     declarations,
     load_config,
     load_layer_packages,
     register_stage,
-    settings_table,
     stage_fields,
     unregister_stage,
-    yaml_value,
 )
 from surfel_mapper.config.layers import (
     DynamicConfig,
@@ -58,6 +55,7 @@ from surfel_mapper.config.stages import (
     ViewerConfig,
     WindowConfig,
 )
+from surfel_mapper.config.tables import allowed, FIRST, first_ones, settings_table, yaml_value
 from surfel_mapper.config.yaml_files import parse_yaml, read_yaml
 
 __all__ = [
@@ -90,7 +88,9 @@ __all__ = [
     'WEIGHT_MODES',
     'WindowConfig',
     'allowed',
+    'FIRST',
     'declarations',
+    'first_ones',
     'flatten',
     'load_config',
     'load_layer_packages',

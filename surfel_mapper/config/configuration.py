@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Config: all settings together, read from a file, and listed as a table."""
+"""Config: all settings together, read from a file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import dataclasses
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import entry_points
-import json
 from pathlib import Path
 from typing import Any
 
@@ -53,9 +52,6 @@ LAYERS = 'surfel_mapper.layers'
 
 _LAYER_STAGES: dict[str, type[Stage]] = {}
 """Stages of layers of other packages, by name."""
-
-LARGE = 1e6
-"""Upper bounds from here on only keep numbers representable; the table leaves them out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,15 +128,7 @@ class Config:
             If a name is unknown (with the nearest known one), or a value is refused.
 
         """
-        stages: dict[str, dict[str, Any]] = {}
-        of_no_stage: dict[str, Any] = {}
-        known = {declared.name: declared for declared in declarations()}
-        for name, value in flatten(mapping):
-            if name not in known:
-                raise ConfigError(f'{name}: no such setting{near(name, known)}')
-            declared = known[name]
-            place = stages.setdefault(declared.stage, {}) if declared.stage else of_no_stage
-            place[declared.key] = value
+        stages, of_no_stage = by_stage(mapping)
         made = {
             part.name: part.default_factory(**stages.get(stage, {}))  # type: ignore[operator]
             for stage, part in stage_fields().items()
@@ -183,7 +171,32 @@ class Config:
 
     def replace(self, mapping: Mapping[str, Any]) -> Config:
         """Return a copy with some settings changed; see from_mapping."""
-        return Config.from_mapping({**self.to_mapping(), **dict(flatten(mapping))})
+        stages, of_no_stage = by_stage(mapping)
+        fields = {stage: part.name for stage, part in stage_fields().items()}
+        changed = {
+            fields[stage]: dataclasses.replace(getattr(self, fields[stage]), **values)
+            for stage, values in stages.items()
+            if stage in fields
+        }
+        more = {
+            name: dataclasses.replace(self.stage(name), **stages.get(name, {}))
+            for name in layer_stages()
+        }
+        return dataclasses.replace(self, **changed, **of_no_stage, more=more)
+
+
+def by_stage(mapping: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+    """Return settings by stage and key, and those of no stage; refuse unknown names."""
+    stages: dict[str, dict[str, Any]] = {}
+    of_no_stage: dict[str, Any] = {}
+    known = {declared.name: declared for declared in declarations()}
+    for name, value in flatten(mapping):
+        if name not in known:
+            raise ConfigError(f'{name}: no such setting{near(name, known)}')
+        declared = known[name]
+        values = stages.setdefault(declared.stage, {}) if declared.stage else of_no_stage
+        values[declared.key] = value
+    return stages, of_no_stage
 
 
 def stage_fields() -> dict[str, dataclasses.Field[Any]]:
@@ -288,29 +301,3 @@ def load_config(path: str | Path | None = None) -> Config:
         return Config.from_mapping(ros_parameters(content))
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}') from error
-
-
-def settings_table() -> str:
-    """Return the table in Markdown; * marks settings that can change while the node runs."""
-    rows = ['| setting | default | meaning |', '|---|---|---|']
-    for declared in declarations():
-        meaning = ' '.join(part for part in (declared.meaning, allowed(declared)) if part)
-        name = f'`{declared.name}`{" *" if declared.live else ""}'
-        rows.append(f'| {name} | `{yaml_value(declared.default)}` | {meaning} |')
-    return '\n'.join(rows) + '\n'
-
-
-def allowed(declared: Declaration) -> str:
-    """Return the bounds or choices as a sentence; empty if the meaning states them."""
-    if not all(choice in declared.meaning for choice in declared.choices):
-        return f'One of {", ".join(declared.choices)}.'
-    if not declared.is_number:
-        return ''
-    if declared.high >= LARGE:
-        return f'From {declared.low:g}.'
-    return f'From {declared.low:g} to {declared.high:g}.'
-
-
-def yaml_value(value: Any) -> str:
-    """Return a default in a form that ROS and YAML both read: JSON."""
-    return value if isinstance(value, str) and value else json.dumps(value)

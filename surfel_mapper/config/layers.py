@@ -52,35 +52,10 @@ class TsdfConfig(Stage):
     sensor_columns: int = setting(
         0, 'Azimuth steps of the lidar; 0: estimated from the first scan.', low=0, high=65536
     )
-    sensor_fov_deg: tuple[float, ...] = setting(
-        (),
-        'Elevation of the lowest and the highest beam of the lidar, deg; empty: estimated. Needs '
-        'sensor_rows.',
-    )
-    sensor_beams_deg: tuple[float, ...] = setting(
-        (), 'Elevation of every beam of the lidar, deg; empty: evenly spaced or estimated.'
-    )
-    sensor_center_m: tuple[float, ...] = setting(
-        (),
-        'Optical centre of the lidar in the frame of its clouds, x y z in m; empty: the origin. '
-        'For clouds that are not given in the frame of the lidar.',
-    )
     sensor_frame: str = setting(
         '',
         'Frame of the optical centre of the lidar, for clouds that are given in another, such as '
         'base_link; its pose: from TF or frames.base_to_sensor. Empty: the frame of the clouds.',
-    )
-    sensor_azimuth_deg: tuple[float, ...] = setting(
-        (),
-        'Azimuth of the last and the first column of a lidar that does not turn full circle, deg, '
-        'x ahead, y left; empty: full circle. Needs sensor_rows or sensor_beams_deg.',
-    )
-    fusion: str = setting(
-        'auto',
-        'How scans are fused: images, voxels are looked up in the range image of a sensor; '
-        'points, ray by ray, slower and for any cloud; auto, images if a model of the sensor with '
-        'at least 24 beams fits.',
-        choices=('auto', 'images', 'points'),
     )
     min_range_m: float = setting(
         0.5, 'Measurements nearer than this are ignored, m.', low=0.001, high=1e3
@@ -89,18 +64,12 @@ class TsdfConfig(Stage):
         50.0, 'Measurements beyond this only free the space up to it, m.', low=0.01, high=1e5
     )
     voxel_size_m: float = setting(0.1, 'Edge of a voxel, m.', low=0.001, high=100.0)
-    voxels_per_side: int = setting(
-        8, 'Voxels along the edge of a block, a power of two.', low=2, high=32
-    )
     truncation_m: float = setting(
         0.3,
         'Distances are kept up to this on both sides of a surface, m; at least two voxels and '
         'less than half of the thinnest wall.',
-        low=0.001,
+        low=0.002,
         high=1000.0,
-    )
-    max_blocks: int = setting(
-        0, 'At most this many blocks; 0: no such limit.', low=0, high=2**31 - 1
     )
     max_radius_m: float = setting(
         0.0,
@@ -117,12 +86,6 @@ class TsdfConfig(Stage):
         'Directory in which blocks that leave by max_radius_m or max_age_s are kept while the '
         'program runs, so that mesh.ply and saved maps have them; empty: they are dropped.',
     )
-    allocation: str = setting(
-        'band',
-        'Blocks that a scan updates: band, those its rays cross near a surface; frustum, all in '
-        'view.',
-        choices=('band', 'frustum'),
-    )
     carve: bool = setting(True, 'Also update the blocks between sensor and surface.')
     distance: str = setting(
         'along_ray',
@@ -130,48 +93,11 @@ class TsdfConfig(Stage):
         'angle of incidence, which closes the ground far from a lidar.',
         choices=DISTANCES,
     )
-    interpolation: str = setting(
-        'adaptive', 'Interpolation of the range image.', choices=INTERPOLATIONS
-    )
-    max_difference_m: float = setting(
-        0.2, 'Adaptive: pixels that differ by more are not interpolated, m.', low=0.0, high=1e6
-    )
-    max_difference_ratio: float = setting(
-        0.0,
-        'Adaptive: pixels that differ by more than this share of the range are not interpolated.',
-        low=0.0,
-        high=10.0,
-    )
-    max_ray_offset_voxels: float = setting(
-        0.5,
-        'Lidar: if pixels are not interpolated, voxels farther than this from the ray of their '
-        'nearest pixel are not updated, in voxels; 0: no such limit.',
-        low=0.0,
-        high=1e6,
-    )
     weight_mode: str = setting(
         'inverse_square',
         'Weight of a measurement: constant, 1; inverse_square, 1/depth^2; ray_density, rays per '
         'voxel face; ray_density_inv_sq, that over depth^2.',
         choices=WEIGHT_MODES,
-    )
-    weight_dropoff: bool = setting(True, 'Weights fall linearly to zero behind a surface.')
-    dropoff_m: float = setting(
-        0.0,
-        'Distance behind the surface at which weights start to fall, m; less than truncation_m; '
-        '0: one voxel.',
-        low=0.0,
-        high=1e3,
-    )
-    min_measurement_weight: float = setting(
-        1e-4, 'Least weight of a measurement.', low=0.0, high=1e6
-    )
-    max_weight: float = setting(
-        1e5,
-        'Largest weight of a voxel; the smaller, the faster it forgets: a measurement of weight w '
-        'then counts w / (max_weight + w).',
-        low=1e-6,
-        high=1e9,
     )
     forget_s: float = setting(
         10.0,
@@ -180,15 +106,6 @@ class TsdfConfig(Stage):
         'follow as fast; 0: only as max_weight says. Needs stamps.',
         low=0.0,
         high=1e9,
-    )
-    extra_distance_m: float = setting(
-        0.0, 'Depth behind the band in which voxels take -truncation_m, m.', low=0.0, high=1e3
-    )
-    extra_labels: tuple[float, ...] = setting(
-        (), 'Labels to which extra_distance_m applies; empty: all.'
-    )
-    skip_extra_channels: bool = setting(
-        False, 'Write neither colours nor labels to voxels behind the band.'
     )
     color: bool = setting(False, 'Keep a colour for each voxel.')
     color_topic: str = setting(
@@ -205,12 +122,6 @@ class TsdfConfig(Stage):
         low=0.0,
         high=10.0,
     )
-    tracking: bool = setting(False, 'Keep the first and last stamp of every voxel.')
-    label_map: tuple[float, ...] = setting(
-        (),
-        'Labels to replace before anything else: pairs of the label of the sensor and the one to '
-        'keep, -1 for unknown. Others stay.',
-    )
     semantics: str = setting(
         'none',
         'How labels are fused: none; majority of counts; weights of the first_k labels; single, '
@@ -218,15 +129,8 @@ class TsdfConfig(Stage):
         choices=SEMANTICS,
     )
     num_labels: int = setting(0, 'Majority: labels are 0 to num_labels - 1.', low=0, high=4096)
-    first_k: int = setting(5, 'first_k: labels kept for each voxel.', low=1, high=64)
-    min_label_weight: float = setting(
-        0.0, 'first_k: the heaviest label must exceed this weight.', low=0.0, high=1e9
-    )
     dynamic_labels: tuple[float, ...] = setting(
         (), 'Labels of moving objects: they free space and leave no surface.'
-    )
-    invalid_labels: tuple[float, ...] = setting(
-        (), 'Further labels that free space and leave no surface: sky, the robot.'
     )
     mesh_rate_hz: float = setting(
         1.0,
@@ -241,26 +145,84 @@ class TsdfConfig(Stage):
     slice_height_m: float = setting(
         0.5, 'Height of ~/tsdf_slice in the fixed frame, m.', low=-1e5, high=1e5, live=True
     )
-    mesh_min_weight: float = setting(
-        1e-4, 'The mesh uses voxels of at least this weight.', low=0.0, high=1e9
-    )
-    mesh_max_step_voxels: float = setting(
-        0.0,
-        'The mesh has no faces where distances of neighbours across the surface differ by more, '
-        'in voxels, as at the edge of a shadow; 0: no such limit. With distance to_plane use the '
-        'truncation in voxels plus 1.25.',
-        low=0.0,
-        high=1e3,
-    )
-    mesh_color: str = setting(
-        'auto',
-        'Colour of the mesh: color, that of the voxels; label, one for each label; slope, shaded '
-        'by direction; auto, the first of these that is kept.',
-        choices=('auto', 'color', 'label', 'slope'),
-    )
-    threads: int = setting(
-        0, 'Threads; 0: one for each core that the process may use.', low=0, high=1024
-    )
+
+    # No settings: callers of the library may change the fields.
+    voxels_per_side: int = 8
+    """Voxels along the edge of a block, a power of two."""
+
+    max_blocks: int = 0
+    """At most this many blocks; 0: no such limit."""
+
+    allocation: str = 'band'
+    """Blocks that a scan updates: band, those its rays cross near a surface; frustum, all in view.
+    """
+
+    interpolation: str = 'adaptive'
+    """Interpolation of the range image."""
+
+    max_difference_m: float = 0.2
+    """Adaptive: pixels that differ by more are not interpolated, m."""
+
+    max_difference_ratio: float = 0.0
+    """Adaptive: pixels that differ by more than this share of the range are not interpolated."""
+
+    weight_dropoff: bool = True
+    """Weights fall linearly to zero behind a surface."""
+
+    dropoff_m: float = 0.0
+    """Distance behind the surface at which weights start to fall, m; less than truncation_m; 0:
+    one voxel."""
+
+    min_measurement_weight: float = 1e-4
+    """Least weight of a measurement."""
+
+    max_weight: float = 1e5
+    """Largest weight of a voxel; the smaller, the faster it forgets: a measurement of weight w
+    then counts w / (max_weight + w)."""
+
+    extra_distance_m: float = 0.0
+    """Depth behind the band in which voxels take -truncation_m, m."""
+
+    extra_labels: tuple[float, ...] = ()
+    """Labels to which extra_distance_m applies; empty: all."""
+
+    skip_extra_channels: bool = False
+    """Write neither colours nor labels to voxels behind the band."""
+
+    tracking: bool = False
+    """Keep the first and last stamp of every voxel."""
+
+    label_map: tuple[float, ...] = ()
+    """Labels to replace before anything else: pairs of the label of the sensor and the one to
+    keep, -1 for unknown. Others stay."""
+
+    first_k: int = 5
+    """first_k: labels kept for each voxel."""
+
+    min_label_weight: float = 0.0
+    """first_k: the heaviest label must exceed this weight."""
+
+    invalid_labels: tuple[float, ...] = ()
+    """Further labels that free space and leave no surface: sky, the robot."""
+
+    max_ray_offset_voxels: float | None = None
+    """Lidar: if pixels are not interpolated, voxels farther than this from the ray of their
+    nearest pixel are not updated, in voxels; 0: no such limit. None: 0.4 by distance to_plane,
+    else 0.5."""
+
+    mesh_min_weight: float | None = None
+    """The mesh uses voxels of at least this weight. None: 0.2 with constant weights, else 1e-4."""
+
+    mesh_max_step_voxels: float | None = None
+    """The mesh has no faces where distances of neighbours across the surface differ by more, in
+    voxels; 0: no such limit. None: the truncation and 1.25 by distance to_plane, else no limit."""
+
+    mesh_color: str = 'auto'
+    """Colour of the mesh: color, that of the voxels; label, one for each label; slope, shaded by
+    direction; auto, the first of these that is kept."""
+
+    threads: int = 0
+    """Threads; 0: one for each core that the process may use."""
 
     def check(self, stage: str) -> None:
         """Check conditions on several settings."""
@@ -268,10 +230,9 @@ class TsdfConfig(Stage):
         checks = (
             ('voxels_per_side', side & (side - 1) == 0, 'a power of two'),
             (
-                'dropoff_m',
+                'truncation_m',
                 not self.weight_dropoff or self.dropoff_start_m < self.truncation_m,
-                f'less than truncation_m = {self.truncation_m}; 0 stands for one voxel, '
-                f'{self.voxel_size_m}',
+                f'more than {self.dropoff_start_m}, a voxel',
             ),
             (
                 'skip_extra_channels',
@@ -290,7 +251,6 @@ class TsdfConfig(Stage):
                 'another where label_topic is given',
             ),
             ('num_labels', self.semantics != 'majority' or self.num_labels > 0, 'positive'),
-            *self._sensor_conditions(),
             *self._label_and_mesh_conditions(),
         )
         for name, holds, expected in checks:
@@ -302,56 +262,6 @@ class TsdfConfig(Stage):
                     raise ConfigError(
                         f'{stage}.{name}: {label}, expected whole numbers from 0 to {MAX_LABEL}'
                     )
-
-    def _sensor_conditions(self) -> tuple[tuple[str, bool, str], ...]:
-        """Return the conditions on the model of the sensor: setting, whether met, expectation."""
-        return (
-            (
-                'sensor_fov_deg',
-                not self.sensor_fov_deg
-                or (
-                    len(self.sensor_fov_deg) == 2
-                    and -90.0 < self.sensor_fov_deg[0] < self.sensor_fov_deg[1] < 90.0
-                ),
-                'two ascending angles between -90 and 90',
-            ),
-            (
-                'sensor_fov_deg',
-                not self.sensor_fov_deg or self.sensor_rows >= 2,
-                'empty without sensor_rows',
-            ),
-            (
-                'sensor_beams_deg',
-                not self.sensor_beams_deg
-                or (
-                    len(set(self.sensor_beams_deg)) == len(self.sensor_beams_deg) >= 2
-                    and max(map(abs, self.sensor_beams_deg)) < 90.0
-                    and self.sensor_rows in (0, len(self.sensor_beams_deg))
-                ),
-                'two or more different angles between -90 and 90, one for each of sensor_rows',
-            ),
-            ('sensor_center_m', len(self.sensor_center_m) in (0, 3), 'x y z or empty'),
-            (
-                'sensor_center_m',
-                not (self.sensor_center_m and self.sensor_frame),
-                'empty where sensor_frame is given',
-            ),
-            (
-                'sensor_azimuth_deg',
-                not self.sensor_azimuth_deg
-                or (
-                    len(self.sensor_azimuth_deg) == 2
-                    and -360.0 <= self.sensor_azimuth_deg[0] < self.sensor_azimuth_deg[1] <= 360.0
-                    and self.sensor_azimuth_deg[1] - self.sensor_azimuth_deg[0] <= 360.0
-                ),
-                'two ascending angles between -360 and 360, at most 360 apart',
-            ),
-            (
-                'sensor_azimuth_deg',
-                not self.sensor_azimuth_deg or bool(self.sensor_rows or self.sensor_beams_deg),
-                'empty without sensor_rows or sensor_beams_deg',
-            ),
-        )
 
     def _label_and_mesh_conditions(self) -> tuple[tuple[str, bool, str], ...]:
         """Return the conditions on labels and the mesh, in the same form."""
@@ -403,9 +313,31 @@ class TsdfConfig(Stage):
         return self.truncation_m + self.extra_distance_m
 
     @property
+    def ray_offset_voxels(self) -> float:
+        """Largest distance of a voxel from the ray of its pixel, in voxels; 0: any."""
+        if self.max_ray_offset_voxels is not None:
+            return self.max_ray_offset_voxels
+        return 0.4 if self.distance == 'to_plane' else 0.5
+
+    @property
+    def least_mesh_weight(self) -> float:
+        """Least weight of a voxel in the mesh; voxels behind a surface have little."""
+        if self.mesh_min_weight is not None:
+            return self.mesh_min_weight
+        return 0.2 if self.weight_mode == 'constant' else 1e-4
+
+    @property
     def mesh_max_step_m(self) -> float:
-        """Largest difference of the distances of neighbouring voxels in the mesh, m; inf: any."""
-        return self.mesh_max_step_voxels * self.voxel_size_m or math.inf
+        """
+        Largest difference of the distances of neighbouring voxels in the mesh, m; inf: any.
+
+        By distance to_plane it leaves out faces along the shadows of poles and cars.
+        """
+        if self.mesh_max_step_voxels is not None:
+            return self.mesh_max_step_voxels * self.voxel_size_m or math.inf
+        if self.distance != 'to_plane':
+            return math.inf
+        return self.truncation_m + 1.25 * self.voxel_size_m
 
     @property
     def votes_per_voxel(self) -> int:
@@ -430,9 +362,6 @@ class EsdfConfig(Stage):
         low=0.001,
         high=1e4,
     )
-    radius_m: float = setting(
-        20.0, 'Distances are kept within this of the sensor, m; 0: everywhere.', low=0.0, high=1e6
-    )
     slice_min_m: float = setting(
         0.3,
         'Lowest height of obstacles in ~/esdf_slice, fixed frame, m; choose it above the ground.',
@@ -445,6 +374,10 @@ class EsdfConfig(Stage):
         low=-1e5,
         high=1e5,
     )
+
+    # No settings: callers of the library may change the fields.
+    radius_m: float = 20.0
+    """Distances are kept within this of the sensor, m; 0: everywhere."""
 
     def check(self, stage: str) -> None:
         """Check that the heights ascend."""
@@ -544,45 +477,37 @@ class ModelsLayerConfig(Stage):
         low=0.0,
         high=1e6,
     )
-    min_points: int = setting(
-        10, 'Voxels of fewer points are not used yet.', low=3, high=1_000_000
-    )
-    flat_thickness_m: float = setting(
-        0.0,
-        'A voxel is flat if 6 sigma along its normal are less, m; 0: a fifth of its edge, 0.02 at '
-        'least.',
-        low=0.0,
-        high=10.0,
-    )
-    noise_m: float = setting(
-        0.0,
-        'Noise of the sensor, sigma, m, allowed on top of the thickness; 0: estimated from the '
-        'map, 0.02 at most.',
-        low=0.0,
-        high=1.0,
-    )
-    max_angle_deg: float = setting(
-        15.0, 'Angle between normals of neighbours on one plane, at most, deg.', low=0.1, high=89.0
-    )
-    arc_angle_deg: float = setting(
-        30.0, 'Angle between normals of neighbours on one arc, at most, deg.', low=0.1, high=89.0
-    )
-    fold_angle_deg: float = setting(
-        60.0, 'A surface that bends farther from its mean normal is cut, deg.', low=1.0, high=89.0
-    )
-    reach_voxels: int = setting(
-        1, 'Largest distance of neighbours, in voxels; 2 for lidars of few beams.', low=1, high=2
-    )
-    min_voxels: int = setting(
-        4,
-        'Planes and surfaces of fewer voxels become Gaussians; curved ones of fewer than 15 '
-        'voxels and 1,000 points, too.',
-        low=1,
-        high=100_000,
-    )
-    absorb: bool = setting(
-        True, 'Patches grow over sparse and rough voxels that lie on them, and join across these.'
-    )
+
+    # No settings: callers of the library may change the fields.
+    reach_voxels: int = 1
+    """Largest distance of neighbours, in voxels, 1 or 2."""
+
+    min_points: int = 10
+    """Voxels of fewer points are not used yet."""
+
+    flat_thickness_m: float = 0.0
+    """A voxel is flat if 6 sigma along its normal are less, m; 0: a fifth of its edge, 0.02 at
+    least."""
+
+    noise_m: float = 0.0
+    """Noise of the sensor, sigma, m, allowed on top of the thickness; 0: estimated from the map,
+    0.02 at most."""
+
+    max_angle_deg: ClassVar[float] = 15.0
+    """Angle between normals of neighbours on one plane, at most, deg."""
+
+    arc_angle_deg: ClassVar[float] = 30.0
+    """Angle between normals of neighbours on one arc, at most, deg."""
+
+    fold_angle_deg: float = 60.0
+    """A surface that bends farther from its mean normal is cut, deg."""
+
+    min_voxels: int = 4
+    """Planes and surfaces of fewer voxels become Gaussians; curved ones of fewer than 15 voxels
+    and 1,000 points, too."""
+
+    absorb: bool = True
+    """Patches grow over sparse and rough voxels that lie on them, and join across these."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -590,19 +515,14 @@ class DynamicConfig(Stage):
     """Clearing of voxels that later rays pass through."""
 
     clear: bool = setting(False, 'Remove voxels of the surfel map that later scans see through.')
-    min_scans: int = setting(
-        5,
-        'Remove a voxel after this many scans saw through it without one hitting it.',
-        low=1,
-        high=10**6,
-    )
-    margin_m: float = setting(
-        0.0,
-        'A ray passes through a voxel if it ends farther than this behind its centre, m; 0: the '
-        'diagonal of a voxel.',
-        low=0.0,
-        high=1e3,
-    )
+
+    # No settings: callers of the library may change the fields.
+    min_scans: int = 5
+    """Remove a voxel after this many scans saw through it without one hitting it."""
+
+    margin_m: float = 0.0
+    """A ray passes through a voxel if it ends farther than this behind its centre, m; 0: the
+    diagonal of a voxel."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -627,10 +547,7 @@ class GridConfig(Stage):
         high=100.0,
         live=True,
     )
-    clearance_m: float = setting(
-        2.0,
-        'Obstacles higher above the ground of their cell than this are ignored, m.',
-        low=0.0,
-        high=1000.0,
-        live=True,
-    )
+
+    # No settings: callers of the library may change the fields.
+    clearance_m: float = 2.0
+    """Obstacles higher above the ground of their cell than this are ignored, m."""

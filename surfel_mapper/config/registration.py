@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import ClassVar
 
 from surfel_mapper.config.settings import setting, Stage
 from surfel_mapper.errors import ConfigError
@@ -24,24 +25,6 @@ class RegistrationConfig(Stage):
         (),
         'Initial pose of the base in the fixed frame, x y z in m, qx qy qz qw; empty: the origin.',
     )
-    cell_m: float = setting(
-        0.0,
-        'Points of a scan are replaced by their means in cells of this edge, m; '
-        '0: half of map.voxel_size_m.',
-        low=0.0,
-        high=1000.0,
-        live=True,
-    )
-    max_cells: int = setting(
-        40_000,
-        'At most this many cells of a scan are aligned, an even selection of them.',
-        low=100,
-        high=10**7,
-        live=True,
-    )
-    min_points: int = setting(
-        5, 'Scans are not aligned to surfels of fewer points.', low=3, high=2**31 - 1, live=True
-    )
     noise_m: float = setting(
         0.02,
         'Standard deviation of a range, m; the least assumed thickness of a surface.',
@@ -49,64 +32,47 @@ class RegistrationConfig(Stage):
         high=10.0,
         live=True,
     )
-    max_deviation_m: float = setting(
-        1.0,
-        'Largest initial distance of points from their prediction, m; later scans use the '
-        'deviations of the last ones.',
-        low=0.001,
-        high=1000.0,
-        live=True,
-    )
-    coarse_levels: int = setting(
-        2,
-        'If deviations exceed a voxel, registration starts with voxels up to 2^this times larger.',
-        low=0,
-        high=3,
-        live=True,
-    )
-    max_iterations: int = setting(
-        30, 'At most this many iterations on each level.', low=1, high=10_000, live=True
-    )
-    min_overlap_ratio: float = setting(
-        0.03,
-        'A scan is dropped unless this share of its cells match surfels that constrain them.',
-        low=0.0,
-        high=1.0,
-        live=True,
-    )
-    min_fit_ratio: float = setting(
-        0.6,
-        'A scan is dropped unless this share of the matched cells fit.',
-        low=0.0,
-        high=1.0,
-        live=True,
-    )
-    search_deg: float = setting(
-        60.0,
-        'If a scan fits worse than usual, headings up to this to both sides are tried, deg.',
-        low=0.0,
-        high=180.0,
-        live=True,
-    )
-    max_speed_m_s: float = setting(
-        70.0,
-        'A pose that implies a higher speed since the last scan is rejected, m/s.',
-        low=0.01,
-        high=1e5,
-        live=True,
-    )
-    min_information_ratio: float = setting(
-        0.003,
-        'A direction of motion with less than this share of the total information is degenerate: '
-        'the prediction is kept along it.',
-        low=0.0,
-        high=1.0,
-        live=True,
-    )
 
     publish_tf: bool = setting(
         True, 'The node publishes the transform from the fixed frame to the frame it localises.'
     )
+
+    # No settings: callers of the library may change the fields.
+    cell_m: float = 0.0
+    """Points of a scan are replaced by their means in cells of this edge, m; 0: half of
+    map.voxel_size_m."""
+
+    max_cells: int = 40_000
+    """At most this many cells of a scan are aligned, an even selection of them."""
+
+    min_points: int = 5
+    """Scans are not aligned to surfels of fewer points."""
+
+    max_deviation_m: ClassVar[float] = 1.0
+    """Largest initial distance of points from their prediction, m; later scans use the deviations
+    of the last ones."""
+
+    coarse_levels: int = 2
+    """If deviations exceed a voxel, registration starts with voxels up to 2^this times larger."""
+
+    max_iterations: int = 30
+    """At most this many iterations on each level."""
+
+    min_overlap_ratio: ClassVar[float] = 0.03
+    """A scan is dropped unless this share of its cells match surfels that constrain them."""
+
+    min_fit_ratio: float = 0.6
+    """A scan is dropped unless this share of the matched cells fit."""
+
+    search_deg: float = 60.0
+    """If a scan fits worse than usual, headings up to this to both sides are tried, deg."""
+
+    max_speed_m_s: ClassVar[float] = 70.0
+    """A pose that implies a higher speed since the last scan is rejected, m/s."""
+
+    min_information_ratio: ClassVar[float] = 0.003
+    """A direction of motion with less than this share of the total information is degenerate: the
+    prediction is kept along it."""
 
     def check(self, stage: str) -> None:
         """Refuse a start that is not a pose."""
@@ -134,74 +100,43 @@ class AlignConfig(Stage):
     voxel_size_m: float = setting(
         1.0, 'Edge of the voxels whose surfels are matched between scans, m.', low=0.01, high=100.0
     )
-    key_distance_m: float = setting(
-        1.0,
-        'Distance travelled between keyframes, m; scans between them move with them. '
-        '0: every scan is a keyframe.',
-        low=0.0,
-        high=1e6,
-        live=True,
-    )
-    max_distance_m: float = setting(
-        1.0, 'Surfels farther apart are not matched, m.', low=1e-3, high=1e3, live=True
-    )
-    max_angle_deg: float = setting(
-        30.0,
-        'Surfels whose normals differ by more are not matched, deg.',
-        low=1.0,
-        high=180.0,
-        live=True,
-    )
-    min_overlap: float = setting(
-        0.2,
-        'Two scans are compared if at least this share of the surfels of one match the other.',
-        low=0.0,
-        high=1.0,
-        live=True,
-    )
-    loop_distance_m: float = setting(
-        10.0,
-        'Scans nearer to each other than this are compared as loop closures, m; 0: no loops.',
-        low=0.0,
-        high=1e6,
-        live=True,
-    )
-    max_rounds: int = setting(
-        20, 'At most this many rounds of matching.', low=1, high=1000, live=True
-    )
-    settled_m: float = setting(
-        0.002,
-        'Poses have converged when none moves by more in a round, m.',
-        low=1e-6,
-        high=1.0,
-        live=True,
-    )
-    settled_deg: float = setting(
-        0.01,
-        'Poses have converged when none turns by more in a round, deg.',
-        low=1e-6,
-        high=10.0,
-        live=True,
-    )
-    move_m: float = setting(
-        0.002,
-        'Scans that the alignment moves by more are moved in the map, m.',
-        low=0.0,
-        high=1e3,
-        live=True,
-    )
-    move_deg: float = setting(
-        0.01,
-        'Scans that the alignment turns by more are moved in the map, deg.',
-        low=0.0,
-        high=180.0,
-        live=True,
-    )
     map_frame: str = setting(
         '',
         'Frame of the map if alignment moves scans; its transform to frames.fixed is published. '
         'Empty: the map stays in frames.fixed, without such a transform.',
     )
+
+    # No settings: callers of the library may change the fields.
+    loop_distance_m: float = 10.0
+    """Scans nearer to each other than this are compared as loop closures, m; 0: no loops."""
+
+    key_distance_m: float = 1.0
+    """Distance travelled between keyframes, m; scans between them move with them. 0: every scan is
+    a keyframe."""
+
+    max_distance_m: float = 1.0
+    """Surfels farther apart are not matched, m."""
+
+    max_angle_deg: float = 30.0
+    """Surfels whose normals differ by more are not matched, deg."""
+
+    min_overlap: ClassVar[float] = 0.2
+    """Two scans are compared if at least this share of the surfels of one match the other."""
+
+    max_rounds: ClassVar[int] = 20
+    """At most this many rounds of matching."""
+
+    settled_m: ClassVar[float] = 0.002
+    """Poses have converged when none moves by more in a round, m."""
+
+    settled_deg: ClassVar[float] = 0.01
+    """Poses have converged when none turns by more in a round, deg."""
+
+    move_m: float = 0.002
+    """Scans that the alignment moves by more are moved in the map, m."""
+
+    move_deg: float = 0.01
+    """Scans that the alignment turns by more are moved in the map, deg."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,55 +148,38 @@ class LoopsConfig(Stage):
         'Keep the points of all scans in a file, to close loops on request: at the end of a '
         'replay, or by ~/align.',
     )
-    key_distance_m: float = setting(
-        5.0, 'Distance travelled between keyframes, m.', low=0.1, high=1e4
-    )
-    recognise_distance_m: float = setting(
-        25.0,
-        'Distance travelled between keyframes that are compared with all earlier ones, m.',
-        low=0.1,
-        high=1e4,
-    )
-    near_distance_m: float = setting(
-        10.0,
-        'Keyframes nearer to each other by their poses are compared too, m.',
-        low=0.0,
-        high=1e4,
-    )
-    local_map_m: float = setting(
-        40.0, 'Length of the path whose scans make up the map of a keyframe, m.', low=1.0, high=1e4
-    )
-    odometry_map_m: float = setting(
-        100.0,
-        'With pose.source registration, scans are registered only to scans at most this far back '
-        'along the path, m, so that earlier passes of a place do not affect them.',
-        low=1.0,
-        high=1e6,
-    )
-    min_votes: int = setting(
-        5, 'A place is recognised if this many features agree.', low=3, high=10_000
-    )
-    min_overlap_ratio: float = setting(
-        0.7,
-        'A loop is refused unless this share of a local map overlaps the other.',
-        low=0.0,
-        high=1.0,
-    )
-    min_fit_ratio: float = setting(
-        0.8,
-        'A loop is refused unless this share of the overlap fits.',
-        low=0.0,
-        high=1.0,
-    )
-    drift_ratio: float = setting(
-        0.01,
-        'Standard deviation of a step of the poses that come in, as a share of its length.',
-        low=1e-5,
-        high=1.0,
-    )
-    max_rounds: int = setting(
-        5, 'At most this many rounds of comparing keyframes near each other.', low=0, high=1000
-    )
     directory: str = setting(
         '', 'Directory of the file with the points; empty: that of temporary files.'
     )
+
+    # No settings: callers of the library may change the fields.
+    key_distance_m: ClassVar[float] = 5.0
+    """Distance travelled between keyframes, m."""
+
+    recognise_distance_m: float = 25.0
+    """Distance travelled between keyframes that are compared with all earlier ones, m."""
+
+    near_distance_m: float = 10.0
+    """Keyframes nearer to each other by their poses are compared too, m."""
+
+    local_map_m: float = 40.0
+    """Length of the path whose scans make up the map of a keyframe, m."""
+
+    odometry_map_m: float = 100.0
+    """With pose.source registration, scans are registered only to scans at most this far back
+    along the path, m, so that earlier passes of a place do not affect them."""
+
+    min_votes: ClassVar[int] = 5
+    """A place is recognised if this many features agree."""
+
+    min_overlap_ratio: ClassVar[float] = 0.7
+    """A loop is refused unless this share of a local map overlaps the other."""
+
+    min_fit_ratio: ClassVar[float] = 0.8
+    """A loop is refused unless this share of the overlap fits."""
+
+    drift_ratio: ClassVar[float] = 0.01
+    """Standard deviation of a step of the poses that come in, as a share of its length."""
+
+    max_rounds: ClassVar[int] = 5
+    """At most this many rounds of comparing keyframes near each other."""

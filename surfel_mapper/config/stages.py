@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import ClassVar
 
 from surfel_mapper.config.settings import read_number, setting, Stage
 from surfel_mapper.errors import ConfigError
@@ -39,13 +40,6 @@ class MapConfig(Stage):
     voxel_size_m: float = setting(0.5, 'Edge of a voxel, m.', low=0.001, high=1000.0)
     min_points: int = setting(
         5, 'Surfels of fewer points are not published.', low=1, high=2**31 - 1, live=True
-    )
-    max_voxels: int = setting(
-        0,
-        'The oldest scans are evicted while the map holds more voxels; 0: no such limit.',
-        low=0,
-        high=2**31 - 1,
-        live=True,
     )
     mode: str = setting(
         'live',
@@ -324,9 +318,6 @@ class PublishConfig(Stage):
         low=0,
         high=8,
     )
-    max_markers: int = setting(
-        20_000, 'At most this many surfels are drawn in ~/markers.', low=1, high=10**7, live=True
-    )
     marker_color: str = setting(
         'planarity',
         'Colour of the discs of ~/markers; age: of the newest scan that saw the voxel.',
@@ -343,6 +334,10 @@ class PublishConfig(Stage):
         1.0, 'Rate of /diagnostics, Hz; 0: never.', low=0.0, high=100.0
     )
 
+    # No settings: callers of the library may change the fields.
+    max_markers: int = 20_000
+    """At most this many surfels are drawn in ~/markers."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewerConfig(Stage):
@@ -355,8 +350,13 @@ class ViewerConfig(Stage):
     port: int = setting(
         9090, 'Port of the page; the data are on the next one.', low=1024, high=65534
     )
-    rate_hz: float = setting(2.0, 'At most this many scans are shown, Hz.', low=0.1, high=100.0)
-    color: str = setting('normal', 'Colour of the surfels.', choices=VIEWER_COLORS)
+
+    # No settings: callers of the library may change the fields.
+    rate_hz: float = 2.0
+    """At most this many scans are shown, Hz."""
+
+    color: ClassVar[str] = 'normal'
+    """Colour of the surfels."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -411,6 +411,7 @@ class DeskewConfig(Stage):
         'Unit of these times; auto: s for floating point values of plausible size, else ns.',
         choices=TIME_UNITS,
     )
+
     reference: str = setting(
         'auto',
         'Times count from the stamp of the scan (stamp) or from 1970 (epoch).',
@@ -467,24 +468,13 @@ class DiagnosticsConfig(Stage):
         high=1e6,
         live=True,
     )
-    error_latency_s: float = setting(
-        1.0,
-        'Report an error if the 99th percentile of that time exceeds this, s; 0: never.',
-        low=0.0,
-        high=1e6,
-        live=True,
-    )
-    warn_dropped_ratio: float = setting(
-        0.0,
-        'Warn if a larger share of the clouds since the last report was dropped.',
-        low=0.0,
-        high=1.0,
-        live=True,
-    )
-    error_dropped_ratio: float = setting(
-        0.5,
-        'Report an error if a larger share of the clouds since the last report was dropped.',
-        low=0.0,
-        high=1.0,
-        live=True,
-    )
+
+    # No settings: callers of the library may change the fields.
+    error_latency_s: float = 1.0
+    """An error is reported if the 99th percentile of that time exceeds this, s; 0: never."""
+
+    warn_dropped_ratio: float = 0.0
+    """Warn if a larger share of the clouds since the last report was dropped."""
+
+    error_dropped_ratio: float = 0.5
+    """Report an error if a larger share of the clouds since the last report was dropped."""

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import map_state, parquet, pcd, ply
 from surfel_mapper.files.latest_map import DRAWABLE, map_in, TILES
-from surfel_mapper.files.parquet_tiles import dataset_digest, tiles_in
+from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 Floats = npt.NDArray[np.float64]
@@ -80,7 +80,9 @@ def load_discs(path: str | Path, min_points: int) -> Discs:
             f'{path}: no map in this directory; expected map/tile_i=*/tile_j=*/ or one of '
             f'{", ".join(form for form in DRAWABLE if form != TILES)}'
         )
-    return load_tiles(found, min_points) if found.is_dir() else load_file(found, min_points)
+    return (
+        of_map(read_tiles(found), min_points) if found.is_dir() else load_file(found, min_points)
+    )
 
 
 def load_file(path: Path, min_points: int) -> Discs:
@@ -94,22 +96,6 @@ def load_file(path: Path, min_points: int) -> Discs:
     if path.suffix == '.pcd':
         return of_columns(path, pcd.read_points(path))
     raise FileFormatError(f'{path}: expected a directory, .parquet, .npz, .ply or .pcd')
-
-
-def load_tiles(directory: Path, min_points: int) -> Discs:
-    """Return the surfels of a dataset, tile by tile."""
-    parts: list[Discs] = []
-    size_m = 0.0
-    for tile in tiles_in(directory).values():
-        surfel_map = parquet.read_map(tile)
-        parts.append(of_map(surfel_map, min_points))
-        size_m = surfel_map.voxel_size_m
-    return Discs(
-        np.concatenate([part.position for part in parts]),
-        np.concatenate([part.normal for part in parts if part.normal is not None]),
-        size_m,
-        dataset_digest(directory),
-    )
 
 
 def of_map(surfel_map: SurfelMap, min_points: int) -> Discs:

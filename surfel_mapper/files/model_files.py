@@ -1,18 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Models as files: complete as JSON, a row per primitive as Parquet, geometry as OBJ, DXF and STEP.
+Models as files: complete as JSON, a row per primitive as Parquet, triangles as OBJ and GLB.
 
-OBJ is for viewers, DXF for CAD; each plane and surface is an object of its own there, without
-Gaussians. DXF is that of AutoCAD 2000 and later, in metres, with outlines as closed polylines and
-faces as meshes. ezdxf writes it, because readers expect tables and headers beside the entities
-that are easily wrong when written by hand.
+Each plane and surface is an object of its own in OBJ and GLB; Gaussians are left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-import io
 import itertools
 import json
 from pathlib import Path
@@ -21,15 +17,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import DependencyError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.files.model_step import write_step
 from surfel_mapper.files.parquet import import_pyarrow
+from surfel_mapper.files.triangles import GLTF, import_trimesh, write_scene, Y_UP
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.outlines import outline
 from surfel_mapper.models.shapes import shape_of
 
 FORMAT, VERSION = 'surfel_mapper models', 1
+
+TRIANGLES = ('obj', 'glb')
 
 
 def write_models(
@@ -39,7 +36,9 @@ def write_models(
     versions: Mapping[int, int] | None = None,
 ) -> list[Path]:
     """
-    Write models as ``models`` in some formats: json, obj, parquet, dxf, step; return the files.
+    Write models as ``models`` in some formats; return the files.
+
+    Without planes and surfaces there is no file of triangles.
 
     Parameters
     ----------
@@ -48,7 +47,7 @@ def write_models(
     model : MultiModel
         The models.
     formats : sequence of str
-        Any of json, obj, parquet, dxf, step.
+        Any of json, parquet, obj, glb.
     versions : mapping of int to int, optional
         Versions of the primitives, by id; written to JSON and Parquet.
 
@@ -57,21 +56,19 @@ def write_models(
     FileFormatError
         If a file cannot be written.
     DependencyError
-        If pyarrow, ezdxf or cadquery-ocp is needed and not installed.
+        If pyarrow or trimesh is needed and not installed.
 
     """
-    paths = [directory / f'models.{name}' for name in formats]
-    for name, path in zip(formats, paths, strict=True):
+    has_triangles = len(model.patches) > 0
+    names = [name for name in formats if has_triangles or name not in TRIANGLES]
+    paths = [directory / f'models.{name}' for name in names]
+    for name, path in zip(names, paths, strict=True):
         if name == 'json':
             write_json(path, model, versions)
         elif name == 'parquet':
             write_parquet(path, model, versions)
-        elif name == 'obj':
-            write_obj(path, model)
-        elif name == 'step':
-            write_step(path, model)
         else:
-            write_dxf(path, model)
+            write_meshes(path, model)
     return paths
 
 
@@ -207,75 +204,24 @@ def write_parquet(
         parquet.write_table(arrow.table(table), file, compression='zstd')
 
 
-def write_obj(path: str | Path, model: MultiModel) -> None:
+def write_meshes(path: Path, model: MultiModel) -> None:
     """
-    Write planes and surfaces as triangles, one OBJ object each, named by kind and id.
+    Write planes and surfaces as triangles, OBJ or GLB: an object each, named by kind and id.
 
     Raises
     ------
     FileFormatError
-        If the file cannot be written.
-
-    """
-    begin = 1  # OBJ counts vertices from 1, through all objects
-    with replace_file(path) as file:
-        file.write(b'# surfel_mapper models, m\n')
-        for patch in model.patches:
-            shape = shape_of(patch)
-            kind = 'surface' if shape.is_curved else 'plane'
-            file.write(f'o {kind}_{patch.id}\n'.encode())
-            np.savetxt(file, shape.vertices, 'v %.6f %.6f %.6f')
-            np.savetxt(file, shape.faces + begin, 'f %d %d %d')
-            begin += len(shape.vertices)
-
-
-LAYERS = {
-    'plane_outlines': 1,
-    'planes': 8,
-    'surface_outlines': 5,
-    'surfaces': 8,
-}
-"""Layers and their AutoCAD colours: red, grey, blue, grey."""
-
-
-def write_dxf(path: str | Path, model: MultiModel) -> None:
-    """
-    Write planes and surfaces, each kind on two layers: outlines, and faces.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be written.
+        If there are none, or the file cannot be written.
     DependencyError
-        If ezdxf is not installed.
+        If trimesh is not installed.
 
     """
-    ezdxf = import_ezdxf()
-    drawing = ezdxf.new('R2000', units=ezdxf.units.M)
-    for layer, color in LAYERS.items():
-        drawing.layers.add(layer, color=color)
-    space = drawing.modelspace()
+    trimesh = import_trimesh()
+    scene = trimesh.Scene(base_frame='map')
+    turn = Y_UP if path.suffix in GLTF else None
     for patch in model.patches:
         shape = shape_of(patch)
-        kind = 'surface' if shape.is_curved else 'plane'
-        for ring in shape.rings:
-            attributes = {'layer': f'{kind}_outlines'}
-            space.add_polyline3d(ring.tolist(), close=True, dxfattribs=attributes)
-        with space.add_mesh(dxfattribs={'layer': f'{kind}s'}).edit_data() as mesh:
-            mesh.vertices, mesh.faces = shape.vertices.tolist(), shape.faces.tolist()
-    text = io.StringIO()
-    drawing.write(text)
-    with replace_file(path) as file:
-        file.write(text.getvalue().encode())
-
-
-def import_ezdxf() -> Any:
-    """Return ezdxf."""
-    try:
-        import ezdxf
-    except ImportError as error:
-        raise DependencyError(
-            f'ezdxf cannot be loaded ({error}). It writes DXF; install it with '
-            "`pip install 'surfel_mapper[formats]'` or `pip install ezdxf`"
-        ) from error
-    return ezdxf
+        name = f'{"surface" if shape.is_curved else "plane"}_{patch.id}'
+        mesh = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+        scene.add_geometry(mesh, node_name=name, geom_name=name, transform=turn)
+    write_scene(path, scene)

@@ -12,7 +12,7 @@ columns by name. Reading and writing are one module because they share the names
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 import itertools
 import json
 import os
@@ -221,13 +221,7 @@ def read_rows(file: Any, footer: Any, surfel_map: SurfelMap) -> Columns:
     return parts
 
 
-def check_size(
-    content: Any,
-    names: tuple[str, ...],
-    path: str | Path,
-    file_size: int,
-    groups: Iterable[int] | None = None,
-) -> None:
+def check_size(content: Any, names: tuple[str, ...], path: str | Path, file_size: int) -> None:
     """
     Raise FileFormatError if columns have a wrong type or are too large for their file.
 
@@ -243,8 +237,6 @@ def check_size(
         Named in errors.
     file_size : int
         Size of the file, bytes.
-    groups : iterable of int, optional
-        Row groups to be read; by default all.
 
     """
     schema, footer = content.schema_arrow, content.metadata
@@ -252,16 +244,16 @@ def check_size(
         types = [str(schema.field(i).type) for i in schema.get_all_field_indices(name)]
         if types not in (['int64'], ['int32']):
             raise FileFormatError(f'{path}: column {name}: {types or "missing"}, expected int64')
-    chosen = range(footer.num_row_groups) if groups is None else list(groups)
-    num_rows = sum(footer.row_group(group).num_rows for group in chosen)
-    num_bytes = sum(footer.row_group(group).total_byte_size for group in chosen)
+    groups = [footer.row_group(group) for group in range(footer.num_row_groups)]
+    num_rows = sum(group.num_rows for group in groups)
+    num_bytes = sum(group.total_byte_size for group in groups)
     budget = Budget(path, file_size, FileFormatError)
     budget.take(max(num_rows, 0) * len(names) * ROW_BYTES, f'{num_rows} rows')
     budget.take(max(num_bytes, 0), 'unpacked pages')
 
 
-def attributes_of(surfel_map: SurfelMap, *, digest: bool = True) -> dict[str, Any]:
-    """Return the attributes of a map for a file; the digest is optional."""
+def attributes_of(surfel_map: SurfelMap) -> dict[str, Any]:
+    """Return the attributes of a map for a file."""
     return {
         'kind': KIND,
         'version': VERSION,
@@ -269,16 +261,16 @@ def attributes_of(surfel_map: SurfelMap, *, digest: bool = True) -> dict[str, An
         'level': surfel_map.level,
         'columns': surfel_map.columns,
         'origin_m': surfel_map.origin_m.tolist(),
-        **({'digest': surfel_map.digest()} if digest else {}),
+        'digest': surfel_map.digest(),
     }
 
 
-def map_columns(surfel_map: SurfelMap, *, derived: bool = True) -> Columns:
-    """Return the columns of the file, sorted by voxel; the derived ones are optional."""
+def map_columns(surfel_map: SurfelMap) -> Columns:
+    """Return the columns of the file, sorted by voxel."""
     moments = surfel_map.moments()
     columns: Columns = {
         **named(INDEX, moments.voxel_index),
-        **(derived_columns(surfel_map) if derived else {}),
+        **derived_columns(surfel_map),
         'num_points': moments.count,
         **named(SUMS, moments.total),
         **named(PRODUCTS, moments.product),
@@ -366,17 +358,6 @@ def int64_column(table: Any, name: str) -> npt.NDArray[np.int64]:
     if column.null_count or str(column.type) not in ('int64', 'int32'):
         raise ValueError(f'column {name}: {column.type} with {column.null_count} missing')
     return np.asarray(column, np.int64)
-
-
-def fill(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> None:
-    """Insert the moments in the columns of a file into a map."""
-    try:
-        parts = moment_arrays(len(columns['i']), surfel_map)
-        fill_rows(parts, slice(None), columns, surfel_map)
-        moments = checked_moments(parts, surfel_map, 'rows')
-    except (ValueError, TypeError) as error:
-        raise FileFormatError(f'{path}: damaged: {error}') from error
-    insert(surfel_map, moments, path)
 
 
 def insert(surfel_map: SurfelMap, moments: ScanMoments, path: str | Path) -> None:

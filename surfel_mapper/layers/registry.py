@@ -133,5 +133,5 @@ register(
     'models',
     'surfel_mapper.layers.models:ModelsLayer',
     'layers.models.enabled',
-    {'dxf': 'models.dxf', 'step': 'models.step'},
+    {'obj': 'models.obj', 'glb': 'models.glb'},
 )

@@ -88,7 +88,7 @@ class SensorModels:
     Parameters
     ----------
     config : TsdfConfig
-        Rows, columns, angles and ranges of the sensors, as far as configured.
+        Rows, columns and ranges of the sensors, as far as configured.
     transforms : TransformBuffer, optional
         Tree of frames, in which ``sensor_frame`` is looked up.
 
@@ -163,7 +163,7 @@ class SensorModels:
             if scan.frame_id not in self.frames and len(self.frames) >= MAX_LIDARS:
                 del self.frames[next(iter(self.frames))]
             frame = self.frames.setdefault(scan.frame_id, FrameModel())
-            if config.sensor_rows or config.sensor_beams_deg:
+            if config.sensor_rows:
                 self._check_configured(frame, scan)
             else:
                 self._check_fitted(frame, scan)
@@ -185,10 +185,6 @@ class SensorModels:
         config = self._config
         if scan.camera:
             return None
-        if config.sensor_center_m:
-            T = np.eye(4)
-            T[:3, 3] = config.sensor_center_m
-            return T
         if not config.sensor_frame or self._transforms is None:
             return None
         try:
@@ -231,43 +227,23 @@ class SensorModels:
             frame.share = self._share(frame.model, scan)
             if frame.share < MISFIT:
                 logger.warning(
-                    'layers.tsdf.sensor_rows, sensor_beams_deg, sensor_fov_deg: only %.0f %% of '
-                    'the points in %s fit this sensor; expected %.0f %%. Correct them, or leave '
-                    'them out to have the sensor fitted',
+                    'layers.tsdf.sensor_rows, sensor_columns: only %.0f %% of the points in %s '
+                    'fit this sensor; expected %.0f %%. Correct them, or leave them out to have '
+                    'the sensor fitted',
                     *(100.0 * frame.share, scan.frame_id, 100.0 * LEAST_FIT),
                 )
         else:
             frame.share = self._share(frame.model, scan)
 
     def _configured(self, scan: Scan) -> LidarModel:
-        """Return the model of the configured angles; missing ones are fitted to a scan."""
-        config = self._config
-        fitted = fitted_lidar(
+        """Return the model of the configured rows and columns, fitted to a scan."""
+        return fitted_lidar(
             scan.points,
             scan.columns.get('ring'),
-            rows=config.sensor_rows or len(config.sensor_beams_deg),
-            columns=config.sensor_columns,
+            rows=self._config.sensor_rows,
+            columns=self._config.sensor_columns,
             **self._ranges,
         )
-        angles: dict[str, Any] = {
-            'rows': fitted.rows,
-            'columns': fitted.columns,
-            'first_azimuth_deg': fitted.first_azimuth_deg,
-        }
-        if config.sensor_azimuth_deg:
-            last, first = config.sensor_azimuth_deg
-            share = (first - last) / 360.0
-            columns = config.sensor_columns or max(round(fitted.columns * share), 2)
-            angles |= {'columns': columns, 'horizontal_fov_deg': first - last}
-            angles['first_azimuth_deg'] = first
-        if config.sensor_beams_deg:
-            beams = tuple(sorted(config.sensor_beams_deg, reverse=True))
-            return LidarModel(beam_elevations_deg=beams, **angles, **self._ranges)
-        if config.sensor_fov_deg:
-            low, high = config.sensor_fov_deg
-            angles |= {'vertical_fov_deg': high - low, 'vertical_fov_top_deg': high}
-            return LidarModel(**angles, **self._ranges)
-        return replace(fitted, **angles)
 
     def _check_fitted(self, frame: FrameModel, scan: Scan) -> None:
         """Check the model of a frame on a scan; fit it again if the scan does not fit."""
@@ -320,16 +296,7 @@ def seen_from(T_scan_sensor: Transform, scan: Scan) -> Scan:
 
 def without_sensor(config: TsdfConfig) -> TsdfConfig:
     """Return settings that say nothing about the sensor: any is fitted, about its origin."""
-    return replace(
-        config,
-        sensor_rows=0,
-        sensor_columns=0,
-        sensor_fov_deg=(),
-        sensor_beams_deg=(),
-        sensor_azimuth_deg=(),
-        sensor_frame='',
-        sensor_center_m=(),
-    )
+    return replace(config, sensor_rows=0, sensor_columns=0, sensor_frame='')
 
 
 def range_image(

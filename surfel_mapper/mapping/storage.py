@@ -96,7 +96,7 @@ class Slab:
         except OSError as error:
             raise MapLimitError(
                 f'no memory for a map of {num_bytes / 2**20:.0f} MiB ({error}); '
-                'set map.max_voxels or a window limit'
+                'set a limit of the window'
             ) from error
         memory[: len(self._memory)] = self._memory[:]
         return memory

@@ -32,14 +32,18 @@ if TYPE_CHECKING:
 BAG = 'bag'
 """Format that is written while mapping: a bag of normals in the directory ``normals``."""
 
+TILES = 'tiles'
+"""Format of a Parquet dataset in the directory ``map``."""
+
 MAP_FORMATS = {
     'ply': 'map.ply',
     'pcd': 'map.pcd',
     'parquet': 'map.parquet',
+    TILES: 'map',
     'npz': 'map.npz',
     BAG: 'normals',
 }
-"""File of each format of the map; npz and parquet are exact, to be loaded again.
+"""File of each format of the map; npz, parquet and tiles are exact, to be loaded again.
 
 In the order of writing: of several maps in a directory the one written last is read."""
 
@@ -175,17 +179,21 @@ def check_formats(formats: Sequence[str], output: Path) -> None:
         If a file of the output directory cannot be written.
 
     """
-    if 'parquet' in formats:
+    if 'parquet' in formats or TILES in formats:
         from surfel_mapper.files.parquet import import_pyarrow
 
         import_pyarrow()
     from surfel_mapper.files.trajectory import TRAJECTORY
 
     files = known_formats()
-    names = [files[name] for name in formats if name != BAG]
+    names = [files[name] for name in formats if name not in (BAG, TILES)]
     for name in [*names, TRAJECTORY, 'map.png', 'report.html', 'summary.json']:
         if (output / name).exists():
             check_writable(output / name)
+    if TILES in formats:
+        from surfel_mapper.files.parquet_tiles import check_dataset
+
+        check_dataset(output / files[TILES])
     if BAG in formats and (output / files[BAG]).is_file():
         raise FileFormatError(f'{output / files[BAG]}: a file, expected a bag or nothing')
 
@@ -309,7 +317,7 @@ def write_files(
     mapper: Mapper,
     trajectory: ScanTrajectory,
     summary: dict[str, Any],
-    history: History,
+    history: History | None = None,
 ) -> list[Path]:
     """
     Write layers, picture, report and summary, after the map.
@@ -371,5 +379,9 @@ def write_map(path: Path, name: str, mapper: Mapper, *, window: bool = False) ->
         pcd.write_surfels(path, surfels, mapper.map.origin_m)
     elif name == 'parquet':
         parquet.write_map(path, mapper.map)
+    elif name == TILES:
+        from surfel_mapper.files.parquet_tiles import write_tiles
+
+        write_tiles(path, mapper.map)
     elif name == 'npz':
         save_mapper(path, mapper, with_window=window)

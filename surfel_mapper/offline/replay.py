@@ -41,7 +41,6 @@ ALL_SCANS: Mapping[str, Any] = {
     'window.max_age_s': 0.0,
     'window.max_distance_m': 0.0,
     'window.max_bytes': 0,
-    'map.max_voxels': 0,
     'map.max_bytes': 0,
 }
 """Settings with which no scan leaves the map."""
@@ -69,7 +68,7 @@ class ReplayOptions:
         Close loops, and align all scans with each other at the end; the latter keeps all points
         in memory until then. By default loops are closed if poses come from registration.
     formats : tuple of str
-        Formats: ply, pcd, parquet, npz and bag of the map, dxf and step of the layer models.
+        Formats: ply, pcd, parquet, npz and bag of the map, obj and glb of the layer models.
     poses_out : Path, optional
         File for the poses of the scans, as TUM text.
     truth : Path, optional

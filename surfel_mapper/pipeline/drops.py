@@ -35,7 +35,7 @@ REMEDIES = {
     'filter': 'compare the filters with the fields of the clouds',
     'filtered_out': 'are the limits of the filters too narrow?',
     INTERNAL: 'the map is unchanged by it and mapping goes on; please report it, unless memory is '
-    'short (window.max_bytes, layers.tsdf.max_blocks)',
+    'short (window.max_bytes, layers.tsdf.max_radius_m)',
     'map_limit': 'poses in UTM or ECEF need map.origin: auto; otherwise use a frame nearer to the '
     'robot, or larger voxels (map.voxel_size_m)',
     'missing_column': 'switch map.intensity or map.color off',

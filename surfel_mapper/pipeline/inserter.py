@@ -133,7 +133,6 @@ class Inserter:
         """Set the limits of the window."""
         wanted = config.map.max_bytes
         self.window.config = config.window
-        self.window.max_voxels = config.map.max_voxels
         self.window.max_total_bytes = machine_bytes() // 2 if wanted < 0 else wanted
         self.window.keeps_scans = wanted > 0
 

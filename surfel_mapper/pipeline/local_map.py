@@ -33,7 +33,7 @@ class LocalMap:
     Parameters
     ----------
     config : Config
-        Voxel size, columns, and ``loops.odometry_map_m``.
+        Voxel size, columns, and ``LoopsConfig.odometry_map_m``.
 
     Attributes
     ----------

@@ -212,9 +212,9 @@ def warm_up_stages(config: Config) -> list[CompileStage]:
         CompileStage('adding scans', partial(compile_adding, config)),
         CompileStage('deriving surfels', partial(compile_deriving, config)),
     ]
-    window, limits = config.window, config.map
+    window = config.window
     of_window = window.max_scans, window.max_age_s, window.max_distance_m, window.max_bytes
-    if any((*of_window, limits.max_voxels, limits.max_bytes)):
+    if any((*of_window, config.map.max_bytes)):
         stages.append(CompileStage('removing scans', partial(compile_removing, config)))
     return stages
 

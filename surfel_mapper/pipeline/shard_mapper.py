@@ -81,14 +81,16 @@ def is_divisible(config: Config) -> bool:
     """
     Return whether a recording can be mapped in parts.
 
-    With poses from registration, alignment of the window, or a motion gate a scan depends on the
-    map and on all scans before it; then the recording can only be mapped in one go.
+    With poses from registration, alignment of the window, a motion gate, or clearing of moving
+    objects a scan depends on the map and on all scans before it; then the recording can only be
+    mapped in one go.
     """
     settings: dict[str, Any] = config.to_mapping()
     neutral = {
         'window.gate_distance_m': 0.0,
         'window.gate_angle_deg': 0.0,
         'align.every_scans': 0,
+        'dynamic.clear': False,
     }
     return config.pose.source != 'registration' and all(
         settings[name] == value for name, value in neutral.items()

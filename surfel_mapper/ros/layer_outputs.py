@@ -33,7 +33,6 @@ from surfel_mapper.layers import Layer, Moment, Publication
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.ros.base_node import result_of, steady_timer
 from surfel_mapper.ros.mapping_thread import MappingThread
-from surfel_mapper.ros.serialized import publish_serialized
 from surfel_mapper.threads import yield_to_others
 
 GRID = 'nav_msgs/msg/OccupancyGrid'
@@ -251,7 +250,7 @@ class LayerTopic:
                     return
                 if number:
                     self._publisher.wait_for_all_acked(PATIENCE)
-                publish_serialized(self._publisher, message)
+                self._publisher.publish(message)
         except Exception as error:
             self._thread.post(partial(fail, error))  # counted there, as of any other topic
 

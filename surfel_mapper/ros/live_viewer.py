@@ -3,7 +3,7 @@
 """
 LiveViewer: the page on which a node shows its map, ``viewer.enabled``.
 
-The mapping thread only copies what is shown, at ``viewer.rate_hz`` and if the last copy has been
+The mapping thread only copies what is shown, at ``rate_hz`` and if the last copy has been
 sent; triangles are made and sent in a thread of its own, so that mapping does not wait for it.
 """
 

@@ -326,7 +326,7 @@ def image_settings(config: TsdfConfig, image: RangeImage) -> Float32:
     found[kernels.LIMIT] = image.largest_m + reach_behind_m(config, image)
     found[kernels.MAX_DIFFERENCE] = config.max_difference_m
     found[kernels.MAX_DIFFERENCE_RATIO] = config.max_difference_ratio
-    found[kernels.MAX_OFFSET] = config.max_ray_offset_voxels * config.voxel_size_m * is_lidar
+    found[kernels.MAX_OFFSET] = config.ray_offset_voxels * config.voxel_size_m * is_lidar
     found[kernels.COLUMN_RAD] = sensor.pitch_rad[1]
     if config.weight_mode.startswith('ray_density'):
         found[kernels.WEIGHT] = sensor.density * config.voxel_size_m**2

@@ -78,7 +78,7 @@ def settings(config: TsdfConfig) -> Float32:
     found[kernels.MIN_WEIGHT] = config.min_measurement_weight
     found[kernels.MAX_WEIGHT] = config.max_weight
     found[kernels.CONTRADICTS] = 0.5 * config.voxel_size_m
-    found[kernels.LEAST] = max(config.mesh_min_weight, 1e-30)
+    found[kernels.LEAST] = max(config.least_mesh_weight, 1e-30)
     return found
 
 

@@ -270,7 +270,7 @@ class Mesher:
         """Run marching cubes over blocks and return their meshes; None without triangles."""
         config = self._blocks.config
         bits = np.empty((len(changes.field), changes.field.shape[2]), np.uint8)
-        describe(changes.field, config.mesh_min_weight, bits)
+        describe(changes.field, config.least_mesh_weight, bits)
         found: list[BlockMesh | None] = []
         for first in range(0, len(changes.keys), BATCH):
             part = slice(first, first + BATCH)

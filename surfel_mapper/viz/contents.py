@@ -12,22 +12,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files import map_state, parquet, ply
 from surfel_mapper.files.latest_map import DRAWABLE, map_in
-from surfel_mapper.files.obj import read_obj
 from surfel_mapper.files.parquet_tiles import tiles_in
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.scan_files import SUFFIXES as CLOUDS
 from surfel_mapper.files.trajectory import read_trajectory, Trajectory
+from surfel_mapper.files.triangles import read_triangles
+from surfel_mapper.files.triangles import SUFFIXES as TRIANGLES
 from surfel_mapper.mapping.moments import joined_moments, ScanMoments, unpack_keys
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.tsdf.mesh import Mesh
@@ -37,12 +36,9 @@ Array = npt.NDArray[np.float64]
 
 EXACT = ('.npz', '.parquet')
 
-ASSETS = ('.glb', '.gltf', '.stl')
-"""Files of triangles that rerun reads itself."""
-
 TRAJECTORIES = ('.tum', '.csv', '.txt', '.kitti')
 
-BESIDE = ('mesh.ply', 'models.obj', 'trajectory.tum')
+BESIDE = ('mesh.ply', 'models.obj', 'models.glb', 'trajectory.tum')
 """Further files of a replay that are shown."""
 
 NORMALS = (('nx', 'ny', 'nz'), ('normal_x', 'normal_y', 'normal_z'))
@@ -99,14 +95,6 @@ class ShownMesh:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Asset:
-    """A file that rerun reads itself."""
-
-    name: str
-    path: Path
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Way:
     """Poses in the fixed frame."""
 
@@ -114,7 +102,7 @@ class Way:
     trajectory: Trajectory
 
 
-Content = ExactMap | Cloud | ShownMesh | Asset | Way
+Content = ExactMap | Cloud | ShownMesh | Way
 
 
 def is_shown(path: Path) -> bool:
@@ -122,7 +110,7 @@ def is_shown(path: Path) -> bool:
     if path.is_dir():
         named = any((path / name).is_file() for name in BESIDE)
         return named or map_in(path, DRAWABLE) is not None
-    return path.suffix in (*EXACT, *ASSETS, *TRAJECTORIES, *CLOUDS, '.obj')
+    return path.suffix in (*EXACT, *TRIANGLES, *TRAJECTORIES, *CLOUDS)
 
 
 def contents(path: Path, name: str = '') -> Iterator[Content]:
@@ -156,11 +144,8 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
     elif path.suffix == '.parquet':
         moments, empty = parquet.read_moments(path)
         yield ExactMap(name, moments, empty.origin_m)
-    elif path.suffix == '.obj':
-        yield ShownMesh(name, read_obj(path))
-    elif path.suffix in ASSETS:
-        check_asset(path)
-        yield Asset(name, path)
+    elif path.suffix in TRIANGLES:
+        yield ShownMesh(name, read_triangles(path))
     elif path.suffix in TRAJECTORIES:
         yield Way(name, read_trajectory(path))
     elif path.suffix == '.ply' and (mesh := ply.read_mesh(path)) is not None:
@@ -170,18 +155,8 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
     else:
         raise FileFormatError(
             f'{path}: expected a bag, a folder, or a file ending in '
-            f'{", ".join(dict.fromkeys([*EXACT, *CLOUDS, ".obj", *ASSETS, *TRAJECTORIES]))}'
+            f'{", ".join(dict.fromkeys([*EXACT, *CLOUDS, *TRIANGLES, *TRAJECTORIES]))}'
         )
-
-
-def check_asset(path: Path) -> None:
-    """Raise FileFormatError if rerun could not read a file, or not in the memory there is."""
-    try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            Budget(path, size, FileFormatError).take(3 * size, 'its copies for the viewer')
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
 
 
 def in_directory(path: Path, name: str) -> Iterator[Content]:

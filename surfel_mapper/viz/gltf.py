@@ -17,18 +17,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import DependencyError, FileFormatError
-from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.triangles import import_trimesh, write_scene, Y_UP
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.discs import Colouring, CORNERS, DrawnDiscs
 from surfel_mapper.viz.mesh import GREY, vertex_normals
 
 Array = npt.NDArray[np.float64]
-
-Y_UP = np.array(
-    [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-)
-"""Turns a frame with z upwards to one with y upwards."""
 
 
 class GltfScene:
@@ -83,11 +78,6 @@ class GltfScene:
         colours = mesh.colors if len(mesh.colors) else grey
         self._add(path, mesh.vertices, mesh.triangles, vertex_normals(mesh), colours)
 
-    def asset(self, path: str, file: Path) -> None:
-        """Add a file of triangles, glTF or STL."""
-        for name, geometry in self._trimesh.load_scene(file).geometry.items():
-            self._place(f'{path}/{name}', geometry)
-
     def points(
         self,
         path: str,
@@ -136,11 +126,7 @@ class GltfScene:
             If nothing was shown, or the file cannot be written.
 
         """
-        if not self._scene.geometry:
-            raise FileFormatError(f'{self.path}: nothing to write')
-        content = self._scene.export(file_type='glb')
-        with replace_file(self.path) as file:
-            file.write(content)
+        write_scene(self.path, self._scene)
 
     def _add(
         self,
@@ -169,16 +155,3 @@ def linear(colours: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     low = shares <= 0.04045
     found = np.where(low, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
     return np.rint(255.0 * found).astype(np.uint8)
-
-
-def import_trimesh() -> Any:
-    """Return the module trimesh, or raise DependencyError with the command to install it."""
-    try:
-        import trimesh
-        import trimesh.path
-    except ImportError as error:
-        raise DependencyError(
-            f'trimesh cannot be loaded ({error}). It writes glTF; install it with '
-            "`pip install 'surfel_mapper[gltf]'` or `pip install trimesh`"
-        ) from error
-    return trimesh

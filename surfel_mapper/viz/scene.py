@@ -257,10 +257,6 @@ class Scene:
         )
         self._stream.log(path, shown, static=static)
 
-    def asset(self, path: str, file: Path) -> None:
-        """Show a file of triangles that rerun reads itself."""
-        self._stream.log(path, self._rerun.Asset3D(path=file), static=True)
-
     def points(
         self,
         path: str,

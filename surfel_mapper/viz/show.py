@@ -18,7 +18,7 @@ import numpy.typing as npt
 from surfel_mapper.mapping.ages import Ages, ages_s
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.contents import Asset, Cloud, Content, ExactMap, ShownMesh, Way
+from surfel_mapper.viz.contents import Cloud, Content, ExactMap, ShownMesh, Way
 from surfel_mapper.viz.detail import DetailedMap
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
 from surfel_mapper.viz.gltf import GltfScene
@@ -105,9 +105,6 @@ def show_contents(
             about[other.name] = f'{len(other.mesh):,} triangles'
             if path in hidden:  # it would flicker through the discs on the same surfaces
                 about[other.name] += ', hidden: its eye in the panel of the viewer shows them'
-        elif isinstance(other, Asset):
-            scene.asset(f'map/{other.name}', other.path)
-            about[other.name] = 'triangles as rerun reads them'
         elif isinstance(other, Way):
             about[other.name] = show_way(scene, other, origin_m)
     scene.flush()

@@ -11,15 +11,15 @@ import pytest
 
 from surfel_mapper.alignment.loop_search import key_numbers, LoopSearch
 from surfel_mapper.alignment.recognition import Candidate, Recognition
-from surfel_mapper.config import Config
 from surfel_mapper.errors import DependencyError
 from test.alignment.circuit import circuit, drifted, gap, SAME_WAY, THERE_AND_BACK
+from test.fields import config_of
 
 SETTINGS = {'loops.recognise_distance_m': 20.0}
 
 
 def search(scans, poses, **changed):
-    config = Config().replace({**SETTINGS, **changed})
+    config = config_of({**SETTINGS, **changed})
     voxel_size_m = config.map.voxel_size_m
     return LoopSearch(scans, poses, config.loops, config.registration, voxel_size_m)
 
@@ -105,7 +105,7 @@ def test_keyframes_of_two_sensors_follow_the_path_of_each():
     poses = np.tile(np.eye(4), (82, 1, 1))
     poses[:, 0, 3] = 0.25 * np.repeat(np.arange(41), 2)  # 10 m
     poses[1::2, 0, 3] -= 3.0
-    config = Config()
+    config = config_of({})
 
     found = LoopSearch(
         (), poses, config.loops, config.registration, 0.5, frame_ids=['front', 'rear'] * 41

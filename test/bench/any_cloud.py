@@ -195,11 +195,7 @@ def street_clouds(options: Options) -> Iterator[Case]:
     T_base_sensor[:3, 3] = (0.0, 0.0, 1.8)
     mounted = [ringed(replace(s, points=s.points + np.float32([0.0, 0.0, 1.8]))) for s in scans]
     at_base = [pose @ np.linalg.inv(T_base_sensor) for pose in poses]
-    for name, settings in (
-        ('street in base_link', {}),
-        ('street in base_link, centre set', {'sensor_center_m': [0.0, 0.0, 1.8]}),
-    ):
-        yield Case(name=name, scans=mounted, poses=at_base, checked=checked, settings=settings)
+    yield Case(name='street in base_link', scans=mounted, poses=at_base, checked=checked)
 
 
 def missing_of(scan: Scan) -> npt.NDArray[np.bool_]:

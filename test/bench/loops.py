@@ -26,7 +26,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from surfel_mapper.cluster.shards import peak_bytes
 from surfel_mapper.config import Config
 from surfel_mapper.evaluation.trajectory_errors import absolute_errors
 from surfel_mapper.memory import keep_freed_memory
@@ -34,7 +33,7 @@ from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.simulation import Drive, Lidar, Simulation, World
-from test.bench.machine import one_core
+from test.bench.machine import one_core, peak_bytes
 from test.bench.options import Options
 from test.bench.peers import LOOP_PEERS
 from test.bench.peers.run import environment, output, PeerError, ROOT, run_odometry

@@ -11,6 +11,7 @@ import mmap
 import os
 from pathlib import Path
 import platform
+import resource
 from typing import Any
 
 
@@ -82,3 +83,8 @@ def one_core() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, before)
+
+
+def peak_bytes() -> int:
+    """Return the peak memory of this process, bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -4,7 +4,7 @@
 
 import pytest
 
-from surfel_mapper.cluster.executors import SerialExecutor
+from surfel_mapper.cluster.workers import Workers
 from surfel_mapper.offline.request import Request
 from test.bench.offline import recorded
 from test.bench.options import Options
@@ -12,11 +12,11 @@ from test.bench.street import Street
 from test.bench.workers import by, check_equal, holds_from, in_one_process
 
 
-def test_one_process_and_tiles_make_the_same_map(tmp_path):
+def test_one_process_and_shards_make_the_same_map(tmp_path):
     options = Options(scans=4, beams=8, columns=64, cache=tmp_path)
     requests = [Request(path=recorded(Street(options), options))] * 2
 
-    ways = [in_one_process(requests), by(SerialExecutor(), requests)]
+    ways = [in_one_process(requests), by(Workers(), requests)]
 
     check_equal({digest for digest, _, _ in ways})
     assert ways[0][1] == ways[1][1] > 0.5

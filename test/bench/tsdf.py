@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config import Config, TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import depth_points, PinholeCamera
@@ -54,6 +54,7 @@ from test.bench.peers.tsdf import (
 )
 from test.bench.report import Row, spread
 from test.bench.street import Street
+from test.fields import config_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -133,7 +134,7 @@ def layer_rows(case: Case) -> list[Row]:
     for name, ours in settings.items():
         mapping = {f'layers.tsdf.{key}': value for key, value in ours.items()}
         mapping |= {'layers.tsdf.enabled': True, 'layers.tsdf.threads': 1}
-        layer, found = Mapper(Config.from_mapping(mapping)).tsdf, []
+        layer, found = Mapper(config_of(mapping)).tsdf, []
         for number, (path, pose) in enumerate(zip(case.files, case.poses, strict=True)):
             scan = Scan(points=np.load(path), stamp_ns=number * 10**8, frame_id='lidar')
             busy = process_time()
@@ -306,9 +307,6 @@ def street_cases(options: Options, scans: int) -> list[Case]:
             ours=dict(
                 distance='to_plane',
                 weight_mode='constant',
-                max_ray_offset_voxels=0.4,
-                mesh_min_weight=0.2,
-                mesh_max_step_voxels=4.25,
             ),
         )
         for carve in (False, True)

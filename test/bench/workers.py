@@ -3,12 +3,11 @@
 """
 Bags with one process and two workers: speed, start, and memory for more input.
 
-``speed``: one bag, four times; ``one process`` maps them without writing, workers end with a
-dataset of tiles and its digest. Kernels are loaded. They take turns and the fastest run of each
-counts. ``start``: until a fresh process, or its workers, have loaded all that mapping needs.
-``holds from`` is the least length of a recording at which workers, their start included, reach
-the required speed-up, by these figures. ``memory``: a quarter, a half and all of the drive, with
-shards of one quarter, in fresh processes; the peak of any process. All digests are compared.
+``speed``: one bag, four times, mapped without writing. Kernels are loaded. They take turns and the
+fastest run of each counts. ``start``: until a fresh process, or its workers, have loaded all that
+mapping needs. ``holds from`` is the least length of a recording at which workers, their start
+included, reach the required speed-up, by these figures. ``memory``: a quarter, a half and all of
+the drive, with shards of one quarter, in fresh processes. All digests are compared.
 """
 
 from __future__ import annotations
@@ -20,12 +19,11 @@ import multiprocessing
 from pathlib import Path
 import subprocess
 import sys
-import tempfile
 from time import perf_counter, process_time, time
 
-from surfel_mapper.cluster.executors import Executor, open_executor
-from surfel_mapper.cluster.map_reduce import map_bags, MapReduceResult
-from surfel_mapper.cluster.shards import cut, peak_bytes, shard_length_s
+from surfel_mapper.cluster.map_reduce import map_bags, MappedBags
+from surfel_mapper.cluster.shards import cut, shard_length_s
+from surfel_mapper.cluster.workers import open_workers, Workers
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.memory import keep_freed_memory
@@ -33,6 +31,7 @@ from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.offline.request import Request
 from surfel_mapper.pipeline import Mapper
+from test.bench.machine import peak_bytes
 from test.bench.offline import recorded
 from test.bench.options import Options
 from test.bench.report import Row
@@ -54,9 +53,8 @@ BUDGET_RATIO = 1.6
 STARTS = {
     'one process': 'from surfel_mapper.pipeline import Mapper\nMapper().warm_up()\nsay()',
     'two workers': (
-        'from surfel_mapper.cluster.executors import open_executor, start_forkserver\n'
-        'start_forkserver()\n'
-        'from surfel_mapper.cluster import map_reduce\nwith open_executor(workers=2):\n    say()'
+        'from surfel_mapper.cluster.workers import open_workers\n'
+        'from surfel_mapper.cluster import map_reduce\nwith open_workers(workers=2):\n    say()'
     ),
 }
 """Programs that print when they are ready to map."""
@@ -83,7 +81,7 @@ def speed_rows(bag: Path) -> list[Row]:
         found[name] = way()
         seconds.setdefault(name, []).append(perf_counter() - start)
 
-    with open_executor(workers=2) as two:
+    with open_workers(workers=2) as two:
         by(two, requests[:1])  # pyarrow and the file are loaded
         for _ in range(RUNS):
             timed('two workers', lambda: by(two, requests))
@@ -141,22 +139,19 @@ def in_one_process(requests: list[Request]) -> tuple[str, float, float]:
     return total.digest(), recorded_s, process_time() - start
 
 
-def by(executor: Executor, requests: list[Request]) -> tuple[str, float, float]:
+def by(executor: Workers, requests: list[Request]) -> tuple[str, float, float]:
     """Map drives with workers; return digest, seconds recorded and seconds of processors."""
     lengths = []
     for request in requests:
         with open_recording(request, CONFIG) as recording:
             lengths.append(recording.recorded_s)
-    mapped = tiled(executor, requests, shard_length_s(sum(lengths), executor.num_workers))
-    core_s = sum(result.core_s for result in mapped.results) + mapped.map.core_s
-    return mapped.map.digest, sum(lengths), core_s
+    mapped = summed(executor, requests, shard_length_s(sum(lengths), executor.num_workers))
+    return mapped.mapper.map.digest(), sum(lengths), mapped.core_s
 
 
-def tiled(executor: Executor, requests: list[Request], shard_s: float) -> MapReduceResult:
-    """Map drives into temporary tiles."""
-    shards = [shard for request in requests for shard in cut(request, CONFIG, shard_s)]
-    with tempfile.TemporaryDirectory() as directory:
-        return map_bags(shards, executor, Path(directory))
+def summed(executor: Workers, requests: list[Request], shard_s: float) -> MappedBags:
+    """Map drives into one map."""
+    return map_bags([cut(request, CONFIG, shard_s) for request in requests], executor)
 
 
 def memory_rows(bag: Path) -> list[Row]:
@@ -169,14 +164,14 @@ def memory_rows(bag: Path) -> list[Row]:
         context = multiprocessing.get_context('spawn')
         with ProcessPoolExecutor(1, mp_context=context) as alone:
             digest, peak = alone.submit(peak_of_one, requests).result()
-        with open_executor(workers=2) as executor:
-            mapped = tiled(executor, requests, 0.25 * whole_s * 1.001)
-        check_equal({digest, mapped.map.digest})
-        common = {'what': 'memory', 'recorded_s': share * whole_s, 'voxels': mapped.map.voxels}
+        with open_workers(workers=2) as executor:
+            mapped = summed(executor, requests, 0.25 * whole_s * 1.001)
+            of_workers = executor.client.run(peak_bytes).values()
+        surfel_map = mapped.mapper.map
+        check_equal({digest, surfel_map.digest()})
+        common = {'what': 'memory', 'recorded_s': share * whole_s, 'voxels': surfel_map.num_voxels}
         rows.append({**common, 'who': 'one process', 'peak_MB': peak / 1e6})
-        largest = max(result.peak_bytes for result in mapped.results)
-        rows.append({**common, 'who': 'a worker that maps', 'peak_MB': largest / 1e6})
-        rows.append({**common, 'who': 'the same, merging', 'peak_MB': mapped.map.peak_bytes / 1e6})
+        rows.append({**common, 'who': 'a worker', 'peak_MB': max(of_workers) / 1e6})
     return rows
 
 

@@ -18,7 +18,7 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from test import extras
 from test.models.scenes import room, sheet, VIEW
 
-FILES = ('models.json', 'models.obj', 'models.png')
+FILES = ('models.json', 'models.png')
 
 
 def write_cloud(path, points):
@@ -37,12 +37,10 @@ def test_a_cloud_becomes_models_and_a_picture(tmp_path, capsys):
     assert all((tmp_path / 'out' / name).stat().st_size > 0 for name in FILES)
     assert main(['extract', *arguments, '--formats', 'json']) == 0
     assert 'planes' in capsys.readouterr().out
-    extras.load('ezdxf')
-    assert main(['extract', *arguments, '--formats', 'dxf']) == 0
-    assert (tmp_path / 'out' / 'models.dxf').stat().st_size > 0
-    extras.load('OCP')
-    assert main(['extract', *arguments, '--formats', 'step']) == 0
-    assert (tmp_path / 'out' / 'models.step').stat().st_size > 0
+    extras.load('trimesh')
+    assert main(['extract', *arguments, '--overwrite', '--formats', 'obj,glb']) == 0
+    assert (tmp_path / 'out' / 'models.obj').stat().st_size > 0
+    assert (tmp_path / 'out' / 'models.glb').stat().st_size > 0
 
 
 def test_a_map_becomes_models_of_its_surfels(tmp_path, capsys):

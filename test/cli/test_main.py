@@ -95,7 +95,7 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
         (('merge', 'a', '-output=b'), 'no option -output, did you mean --output?'),
         (('replay', 'a', '--po', 'b'), 'ambiguous option: --po could match --pose-topic, '),
         (('info', 'a', 'b'), 'too many arguments: b'),
-        (('merge', 'a', '--output', 'b', '--workers', '0'), 'a whole number of 1 or more'),
+        (('merge', 'a', '--output', 'b', '--min-points', '0'), 'a whole number of 1 or more'),
         (('view', 'a', '--at', '1', '2', 'nan'), "--at: 'nan', expected a finite number"),
         (('view', 'a', '--port', '0'), "--port: '0', expected a whole number of 1 or more"),
         (('view', 'a', '--port', '65535'), "--port: '65535', expected a port up to 65534"),

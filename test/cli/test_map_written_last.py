@@ -12,7 +12,7 @@ import pytest
 from surfel_mapper.cli.extract import read
 from surfel_mapper.cli.main import main
 from surfel_mapper.files.latest_map import DRAWABLE, map_in
-from surfel_mapper.files.parquet_tiles import read_part, write_shard, write_tile
+from surfel_mapper.files.parquet_tiles import write_tiles
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.offline.outputs import ScanTrajectory, write_maps
 from surfel_mapper.pipeline.saved_state import load_mapper
@@ -40,8 +40,7 @@ def written(directory, newest, forms):
     maps = {form: floor(LENGTHS_M[form]) for form in forms}
     for form, surfel_map in maps.items():
         if form == 'tiles':
-            for tile, part in write_shard(directory.parent / 'shard', surfel_map).items():
-                write_tile(directory / 'map' / tile.path, read_part(part))
+            write_tiles(directory / 'map', surfel_map)
         else:
             surfel_map.save(directory / form)
     for path in filter(os.path.isfile, directory.rglob('*')):

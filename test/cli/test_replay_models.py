@@ -16,7 +16,7 @@ from test import extras
 from test.bags.recorded import drive, HEIGHT_M, MOUNT_M, write_rosbag2
 from test.viz.test_report import Parsed
 
-FORMATS = 'ply,parquet,dxf'
+FORMATS = 'ply,parquet,obj'
 
 
 @pytest.fixture(scope='module')
@@ -27,7 +27,7 @@ def bag(tmp_path_factory):
 @pytest.fixture(scope='module')
 def output(bag, tmp_path_factory):
     """Return the output directory of a replay with models."""
-    extras.load('ezdxf')
+    extras.load('trimesh')
     extras.load('pyarrow')
     extras.load('rerun')
     output = tmp_path_factory.mktemp('out') / 'map'
@@ -65,15 +65,6 @@ def test_summary_json_and_parquet_agree_to_the_end_of_the_recording(output):
     assert [name for name in names if name.startswith('o plane')] == expected
 
 
-def test_the_drawing_has_an_outline_for_every_ring(output):
-    import ezdxf
-
-    found = json.loads((output / 'models.json').read_text())
-    lines = ezdxf.readfile(output / 'models.dxf').modelspace().query('POLYLINE')
-    rings = [ring for kind in ('planes', 'surfaces') for p in found[kind] for ring in p['outline']]
-    assert [line.is_closed for line in lines] == [True] * len(rings)
-
-
 def test_report_picture_and_recording_show_them(output):
     parsed = Parsed((output / 'report.html').read_text(encoding='utf-8'))
     assert [text for tag, _, text in parsed.text if tag == 'option'][:2] == ['surfels', 'models']
@@ -85,8 +76,8 @@ def test_report_picture_and_recording_show_them(output):
         assert f'/map/models/{entity}' in printed
 
 
-def test_a_drawing_is_refused_without_models(bag, tmp_path, capsys):
-    arguments = ['replay', str(bag), '--formats', 'dxf', '--output', str(tmp_path / 'out')]
+def test_triangles_are_refused_without_models(bag, tmp_path, capsys):
+    arguments = ['replay', str(bag), '--formats', 'glb', '--output', str(tmp_path / 'out')]
     assert main(arguments) == 1
     assert 'layers.models.enabled' in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()

@@ -12,7 +12,7 @@ import pytest
 
 from surfel_mapper.budget import VARIABLE
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.files.parquet_tiles import split_map
+from surfel_mapper.files.parquet import read_map
 from surfel_mapper.messages.compressed_image import unpacked
 from surfel_mapper.messages.pointcloud2 import parse_cloud
 from test import extras
@@ -38,7 +38,7 @@ def test_a_tile_is_not_taken_for_damaged(tmp_path, wrong):
     extras.load('pyarrow')
     (tmp_path / 'a.parquet').write_bytes(corpus.parquet()[0])
     with pytest.raises(ConfigError, match='4G'):
-        next(split_map(tmp_path / 'a.parquet'))
+        read_map(tmp_path / 'a.parquet')
 
 
 def test_a_cloud_is_not_taken_for_damaged(wrong):

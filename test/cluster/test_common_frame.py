@@ -89,7 +89,7 @@ def test_two_recordings_are_mapped_in_the_frame_of_the_first(placed):
 def test_the_printed_stages_of_workers_are_parts_of_the_wall_time(placed):
     (line,) = [text for text in as_text(placed.summary, []).splitlines() if 'real time' in text]
     printed = dict(re.findall(r'(\w+) (-?[\d.]+) s', line))
-    stages = ['survey', 'start', 'register', 'map', 'merge', 'stop', 'other', 'total']
+    stages = ['survey', 'start', 'register', 'map', 'stop', 'other', 'total']
     assert list(printed) == stages
     *parts, total = map(float, printed.values())
     assert min(parts) >= 0.0

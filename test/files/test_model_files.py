@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""JSON, Parquet, OBJ and DXF files agree with the models."""
+"""JSON, Parquet, OBJ and GLB files agree with the models."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ import pytest
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.model_files import (
-    LAYERS,
-    write_dxf,
     write_json,
+    write_meshes,
     write_models,
-    write_obj,
     write_parquet,
 )
+from surfel_mapper.files.triangles import read_triangles
 from surfel_mapper.models import fit
 from surfel_mapper.models.outlines import areas
 from surfel_mapper.models.shapes import shape_of
@@ -58,7 +57,8 @@ def test_parquet_has_a_row_for_every_primitive(model, tmp_path):
 
 
 def test_obj_has_an_object_for_every_patch_and_faces_within_its_vertices(model, tmp_path):
-    write_obj(tmp_path / 'models.obj', model)
+    extras.load('trimesh')
+    write_meshes(tmp_path / 'models.obj', model)
     lines = (tmp_path / 'models.obj').read_text().splitlines()
     names = [line[2:] for line in lines if line.startswith('o ')]
     assert names == [f'plane_{p.id}' for p in model.planes] + [
@@ -94,7 +94,7 @@ def test_ids_and_versions_of_live_models_are_kept(model, tmp_path):
 def test_empty_models_are_written(tmp_path):
     empty = fit(np.empty((0, 3)))
     write_json(tmp_path / 'a.json', empty)
-    write_obj(tmp_path / 'a.obj', empty)
+    assert write_models(tmp_path, empty, ('obj', 'glb')) == []
     assert json.loads((tmp_path / 'a.json').read_text())['planes'] == []
 
 
@@ -103,51 +103,16 @@ def test_a_missing_directory_is_refused(model, tmp_path):
         write_json(tmp_path / 'none' / 'models.json', model)
 
 
-@pytest.fixture(scope='module')
-def ezdxf():
-    return extras.load('ezdxf')
-
-
-@pytest.fixture(scope='module')
-def written(tmp_path_factory, ezdxf):
-    model = fit(room(160, 120)[0], ModelsConfig(voxel_size_m=A), VIEW)
-    path = tmp_path_factory.mktemp('dxf') / 'models.dxf'
-    write_dxf(path, model)
-    return model, ezdxf.readfile(path)
-
-
-def test_the_drawing_is_in_metres_and_passes_the_audit(ezdxf, written):
-    drawing = written[1]
-    assert drawing.units == ezdxf.units.M
-    audit = drawing.audit()
-    assert not audit.errors
-    assert not audit.fixes
-    assert set(LAYERS) <= {layer.dxf.name for layer in drawing.layers}
-
-
-@pytest.mark.parametrize('kind', ['plane', 'surface'])
-def test_outlines_are_closed_rings_and_faces_have_their_area(written, kind):
-    model, drawing = written
-    patches = model.planes if kind == 'plane' else model.surfaces
-    shapes = [shape_of(patch) for patch in patches]
-    space = drawing.modelspace()
-    lines = list(space.query(f'POLYLINE[layer=="{kind}_outlines"]'))
-    rings = [ring for shape in shapes for ring in shape.rings]
-    assert len(lines) == len(rings) > 0
-    for line, ring in zip(lines, rings, strict=True):
-        assert line.is_closed
-        assert np.array([*line.points()]) == pytest.approx(ring, abs=1e-9)
-    meshes = list(space.query(f'MESH[layer=="{kind}s"]'))
-    for mesh, shape in zip(meshes, shapes, strict=True):
-        corners = np.array([*mesh.vertices])[np.array([*mesh.faces])]
-        assert areas(corners).sum() == pytest.approx(shape.area_m2)
-
-
-def test_empty_models_give_an_empty_drawing(ezdxf, tmp_path):
-    write_dxf(tmp_path / 'a.dxf', fit(np.empty((0, 3))))
-    assert len(ezdxf.readfile(tmp_path / 'a.dxf').modelspace()) == 0
-
-
-def test_dxf_in_a_missing_directory_is_refused(tmp_path):
-    with pytest.raises(FileFormatError, match='none'):
-        write_dxf(tmp_path / 'none' / 'a.dxf', fit(np.empty((0, 3))))
+@pytest.mark.parametrize('suffix', ['obj', 'glb'])
+def test_triangles_have_the_places_and_areas_of_the_patches(model, tmp_path, suffix):
+    extras.load('trimesh')
+    path = tmp_path / f'models.{suffix}'
+    write_meshes(path, model)
+    mesh = read_triangles(path)
+    corners = mesh.vertices[mesh.triangles]
+    shapes = [shape_of(patch) for patch in model.patches]
+    assert areas(corners).sum() == pytest.approx(sum(shape.area_m2 for shape in shapes), rel=1e-4)
+    box = [np.concatenate([shape.vertices for shape in shapes]), mesh.vertices]
+    low, high = zip(*((each.min(axis=0), each.max(axis=0)) for each in box), strict=True)
+    np.testing.assert_allclose(low[0], low[1], atol=1e-5)
+    np.testing.assert_allclose(high[0], high[1], atol=1e-5)

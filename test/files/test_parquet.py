@@ -12,7 +12,6 @@ from surfel_mapper import SurfelMap
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import parquet
 from surfel_mapper.files.parquet import METADATA, read_map, write_map
-from surfel_mapper.files.parquet_tiles import write_tile
 from test import extras
 
 pa = extras.load('pyarrow')
@@ -51,7 +50,9 @@ def test_threads_read_groups_of_rows_of_one_file(tmp_path, monkeypatch):
     surfel_map = SurfelMap(0.5)
     surfel_map.add(np.arange(256)[:, None] * [0.5, 0.0, 0.0])
     path = tmp_path / 'tile.parquet'
-    write_tile(path, surfel_map)  # 8 groups of rows
+    write_map(path, surfel_map)
+    table = pq.read_table(path)
+    pq.write_table(table, path, row_group_size=32)  # 8 groups of rows
     monkeypatch.setattr(parquet, 'usable_cores', lambda: 4)
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)

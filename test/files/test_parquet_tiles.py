@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a map in files add up to the map, and its digest is computed tile by tile."""
+"""A dataset of tiles is the map, whole or as before it was written."""
 
+import errno
+from pathlib import Path
 import shutil
 
 import numpy as np
@@ -11,19 +13,12 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import parquet_tiles
 from surfel_mapper.files.parquet import read_map, write_map
 from surfel_mapper.files.parquet_tiles import (
-    BLOCK_BITS,
-    dataset_digest,
     dataset_in,
-    Part,
-    read_part,
     read_tiles,
-    split_map,
     Tile,
     TILE_BITS,
-    tile_part,
     tiles_in,
-    write_shard,
-    write_tile,
+    write_tiles,
 )
 from surfel_mapper.mapping.moments import pack_keys, ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -44,9 +39,7 @@ def scattered(num=4000, seed=1, voxel_size_m=0.5, columns=()):
 
 
 def dataset(directory, surfel_map):
-    parts = write_shard(directory / 'shard.parquet', surfel_map)
-    for tile, part in parts.items():
-        write_tile(directory / 'map' / tile.path, read_part(part))
+    write_tiles(directory / 'map', surfel_map)
     return directory / 'map'
 
 
@@ -62,17 +55,6 @@ def with_intensity(tmp_path_factory):
     """Return the same with a column."""
     surfel_map = scattered(columns=('intensity',))
     return surfel_map, dataset(tmp_path_factory.mktemp('tiles'), surfel_map)
-
-
-@pytest.mark.parametrize(
-    ('which', 'rows_read'), [('written', 1), ('written', 900), ('with_intensity', 10**6)]
-)
-def test_the_digest_of_a_dataset_is_that_of_the_map(request, monkeypatch, which, rows_read):
-    monkeypatch.setattr(parquet_tiles, 'ROWS_READ', rows_read)
-    surfel_map, directory = request.getfixturevalue(which)
-
-    assert len(tiles_in(directory)) > 8
-    assert dataset_digest(directory) == surfel_map.digest()
 
 
 @pytest.mark.parametrize('which', ['written', 'with_intensity'])
@@ -115,42 +97,6 @@ def test_other_tools_read_a_dataset_by_tile(written):
     np.testing.assert_array_equal(table.column('tile_i').to_numpy(), index[:, 0] >> TILE_BITS)
 
 
-def test_a_row_group_of_a_tile_holds_a_few_voxels_in_i(written):
-    from pyarrow import parquet
-
-    for path in tiles_in(written[1]).values():
-        blocks = []
-        with parquet.ParquetFile(path) as file:
-            for group in range(file.metadata.num_row_groups):
-                i = file.read_row_group(group, columns=['i']).column('i').to_numpy()
-                blocks.append(set(i >> BLOCK_BITS))
-        assert all(len(block) == 1 for block in blocks)
-        assert len(set.union(*blocks)) == len(blocks)
-
-
-def test_a_map_in_one_file_is_split_without_loading_it(tmp_path, monkeypatch):
-    surfel_map = scattered()
-    write_map(tmp_path / 'map.parquet', surfel_map)
-    monkeypatch.setattr(parquet_tiles, 'ROWS_READ', 1000)
-
-    pieces = list(split_map(tmp_path / 'map.parquet'))
-
-    assert len(pieces) > 3
-    assert max(map(len, pieces)) <= 1000
-    again = SurfelMap(0.5)
-    for piece in pieces:
-        again.merge(piece)
-    assert again == surfel_map
-
-
-def test_a_tile_as_a_part_is_complete(written):
-    (tile, path), *_ = tiles_in(written[1]).items()
-    part = tile_part(path)
-    assert read_part(part) == read_map(path)
-    assert part.num_voxels == len(read_map(path))
-    assert Tile(tile.i, tile.j).path == path.relative_to(written[1])
-
-
 def test_voxels_at_the_corners_of_space_have_tiles_too(tmp_path):
     far = 2**20 - 1
     index = np.array([[-far - 1, far, 0], [far, -far - 1, far], [0, -1, 0], [-1, 0, 0]])
@@ -167,40 +113,108 @@ def test_voxels_at_the_corners_of_space_have_tiles_too(tmp_path):
         )
     )
     directory = dataset(tmp_path, surfel_map)
-    assert dataset_digest(directory) == surfel_map.digest()
+    assert read_tiles(directory).digest() == surfel_map.digest()
     assert Tile(-1, 0) in tiles_in(directory)
 
 
-def test_an_empty_map_makes_a_shard_without_tiles(tmp_path):
-    assert write_shard(tmp_path / 'shard.parquet', SurfelMap(0.5)) == {}
+def test_an_empty_map_has_no_tiles(tmp_path):
+    assert not dataset(tmp_path, SurfelMap(0.5)).exists()
 
 
 def test_a_directory_without_tiles_and_tiles_of_two_maps_are_refused(written, tmp_path):
-    with pytest.raises(FileFormatError, match='no tiles of a map'):
-        dataset_digest(tmp_path)
     with pytest.raises(FileFormatError, match='no tiles of a map'):
         read_tiles(tmp_path)
     first = shutil.copytree(written[1], tmp_path / 'map')
     other = SurfelMap(0.2)
     other.add(np.full((3, 3), 900.0))
-    write_tile(first / Tile(99, 99).path, other)
-    with pytest.raises(FileFormatError, match='tiles of different maps'):
-        dataset_digest(first)
+    path = first / Tile(99, 99).path
+    path.parent.mkdir(parents=True)
+    write_map(path, other)
     with pytest.raises(FileFormatError, match='voxel'):
         read_tiles(first)
 
 
-@pytest.mark.parametrize('damage', ['empty', 'cut', 'other', 'gone'])
-def test_a_damaged_file_is_refused_by_name(tmp_path, damage):
-    parts = write_shard(tmp_path / 'shard.parquet', scattered())
-    part = next(iter(parts.values()))
-    path = tmp_path / 'shard.parquet'
+def test_an_earlier_dataset_is_replaced_and_something_else_is_left_alone(tmp_path):
+    for seed in (1, 2):
+        surfel_map = scattered(seed=seed)
+        directory = dataset(tmp_path, surfel_map)
+    assert read_tiles(directory) == surfel_map
+    assert [*tmp_path.iterdir()] == [directory]
+    (directory / 'thesis.txt').write_text('mine')
+    with pytest.raises(FileFormatError, match='holds something else'):
+        write_tiles(directory, surfel_map)
+
+
+@pytest.mark.parametrize('damage', ['empty', 'cut'])
+def test_a_damaged_tile_is_refused_by_name(written, tmp_path, damage):
+    path = next(iter(tiles_in(shutil.copytree(written[1], tmp_path / 'map')).values()))
     content = path.read_bytes()
-    if damage == 'gone':
-        path.unlink()
-    elif damage == 'other':
-        part = Part(str(path), (10_000,), 1)
-    else:
-        path.write_bytes(content[: len(content) // 2 if damage == 'cut' else 0])
-    with pytest.raises(FileFormatError, match=r'shard\.parquet'):
-        read_part(part)
+    path.write_bytes(content[: len(content) // 2 if damage == 'cut' else 0])
+    with pytest.raises(FileFormatError, match=str(path)):
+        read_tiles(tmp_path / 'map')
+
+
+@pytest.fixture
+def datasets(tmp_path):
+    """Return a fresh dataset and an earlier one of the name wanted."""
+    fresh, wanted = tmp_path / 'fresh', tmp_path / 'map'
+    for directory, content in ((fresh, 'new'), (wanted, 'old')):
+        (directory / 'tile_i=0').mkdir(parents=True)
+        (directory / 'tile_i=0' / 'a').write_text(content)
+    return fresh, wanted
+
+
+def test_a_dataset_that_cannot_take_its_name_leaves_the_earlier_one(datasets, monkeypatch):
+    """It kept a hidden name."""
+    fresh, wanted = datasets
+    rename = Path.rename
+
+    def failing(path, target):
+        if path == fresh:
+            raise OSError(errno.ENOSPC, 'no space')
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, 'rename', failing)
+    with pytest.raises(FileFormatError, match='no space'):
+        parquet_tiles.take_name(fresh, wanted)
+    assert (wanted / 'tile_i=0' / 'a').read_text() == 'old'
+    monkeypatch.undo()
+    parquet_tiles.take_name(fresh, wanted)
+    assert (wanted / 'tile_i=0' / 'a').read_text() == 'new'
+    assert [*wanted.parent.iterdir()] == [wanted]
+
+
+@pytest.mark.parametrize('renamed', ['map', 'fresh'])
+def test_an_interrupt_after_a_rename_leaves_one_whole_dataset(datasets, monkeypatch, renamed):
+    """After the first rename there was none of that name."""
+    fresh, wanted = datasets
+    rename, sources = Path.rename, []
+
+    def interrupted(path, target):
+        found = rename(path, target)
+        sources.append(path.name)
+        if path.name == renamed and sources.count(renamed) == 1:
+            raise KeyboardInterrupt
+        return found
+
+    monkeypatch.setattr(Path, 'rename', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        parquet_tiles.take_name(fresh, wanted)
+    expected = {'map': 'old', 'fresh': 'new'}[renamed]
+    assert (wanted / 'tile_i=0' / 'a').read_text() == expected
+
+
+def test_a_dataset_that_has_its_name_is_no_failure(datasets, monkeypatch):
+    """An error of the last sync was reported, and the earlier dataset kept a hidden name."""
+    fresh, wanted = datasets
+    sync = parquet_tiles.sync_directory
+
+    def failing(directory):
+        if directory == wanted.parent:
+            raise OSError(errno.EMFILE, 'too many open files')
+        sync(directory)
+
+    monkeypatch.setattr(parquet_tiles, 'sync_directory', failing)
+    parquet_tiles.take_name(fresh, wanted)
+    assert (wanted / 'tile_i=0' / 'a').read_text() == 'new'
+    assert [*wanted.parent.iterdir()] == [wanted]

@@ -309,21 +309,6 @@ def test_keys_that_are_no_integers_are_refused(keys):
         SurfelMap(0.5).find(keys)
 
 
-def test_a_tile_that_does_not_state_its_voxels_is_refused(tmp_path):
-    """Statistics without a least value, as damage leaves them, were a TypeError."""
-    parquet = extras.load('pyarrow.parquet')
-    from surfel_mapper.files.parquet_tiles import dataset_digest, write_tile
-
-    surfel_map = SurfelMap(0.5)
-    surfel_map.add(np.random.default_rng(3).uniform(-1.0, 1.0, (30, 3)))
-    path = tmp_path / 'tile_i=0' / 'tile_j=0' / 'surfels.parquet'
-    path.parent.mkdir(parents=True)
-    write_tile(path, surfel_map)
-    parquet.write_table(parquet.read_table(path, partitioning=None), path, write_statistics=False)
-    with pytest.raises(FileFormatError, match='row group 0 does not state its smallest i'):
-        dataset_digest(tmp_path)
-
-
 def test_las_of_another_version_is_refused(tmp_path):
     """Laspy takes the count of version 1.4 by the second number, and sizes of layers are read."""
     laspy = pytest.importorskip('laspy')

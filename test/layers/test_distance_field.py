@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.queries import labels_of
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
+from test.fields import config_of
 
 S = 10**9
 RADIUS_M = 5.0
@@ -42,7 +42,7 @@ RING = np.repeat(np.arange(LIDAR.rows), LIDAR.columns)
 
 
 def mapper_with(**settings):
-    return Mapper(Config.from_mapping({**SETTINGS, **settings}))
+    return Mapper(config_of({**SETTINGS, **settings}))
 
 
 def insert(mapper, number, xyz=(0.0, 0.0, 0.0), **columns):
@@ -129,7 +129,6 @@ def test_kernels_compile_for_any_sensor(number, caplog):
     mapper = mapper_with(
         **{
             'dynamic.clear': True,
-            'layers.tsdf.sensor_center_m': [1.0, 0.4, 1.8],
             'layers.tsdf.sensor_rows': number,
         }
     )
@@ -177,19 +176,6 @@ def test_scan_that_fits_no_lidar_is_fused_point_by_point(caplog):
     assert summary['scans'] == summary['scans_by_points'] == 1
     assert summary['sensors'] == {'lidar': 'none'}
     assert mapper.counters.messages_ignored == {}
-
-
-def test_cloud_about_another_origin_is_fused_about_the_optical_centre():
-    mounted = np.array([1.0, 0.4, 1.8])
-    name = 'layers.tsdf.sensor_center_m'
-    mapper = mapper_with(**{name: mounted.tolist()})
-    mapper.add_pose('odom', 'lidar', S, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    scan = sphere(ring=RING)
-    mapper.add_scan(replace(scan, points=scan.points + mounted, stamp_ns=S))
-    assert len(list(mapper.insert_ready())) == 1
-    assert np.abs(radii(mapper.tsdf.mesh(), mounted) - RADIUS_M).max() < 0.02
-    with pytest.raises(ConfigError, match=r'sensor_center_m: .*x y z'):
-        mapper_with(**{name: [1.0, 2.0]})
 
 
 def test_the_optical_centre_of_a_cloud_in_base_link_comes_from_its_frame():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.parquet_tiles import read_part, write_shard, write_tile
+from surfel_mapper.files.parquet_tiles import write_tiles
 from surfel_mapper.files.ply import read_points
 from surfel_mapper.pipeline.checkpoints import checkpoint_paths, Checkpoints, duplicate, load_start
 from surfel_mapper.pipeline.regions import Box
@@ -66,8 +66,7 @@ def test_the_field_of_an_earlier_run_is_not_loaded_with_newer_tiles(tmp_path):
     save_mapper(tmp_path / 'map.npz', mapper)
     os.utime(tmp_path / 'map.npz', ns=(0, 0))
     insert(later, 1, (30.0, 0.0, 0.0))
-    for tile, part in write_shard(tmp_path / 'shard', later.map).items():
-        write_tile(tmp_path / 'map' / tile.path, read_part(part))
+    write_tiles(tmp_path / 'map', later.map)
     load_mapper(tmp_path, mapper)
     assert mapper.map.digest() == later.map.digest()
     assert mapper.tsdf.blocks.num_blocks == 0

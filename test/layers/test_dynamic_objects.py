@@ -13,7 +13,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from surfel_mapper.config import Config
 from surfel_mapper.layers import Surroundings
 from surfel_mapper.layers.dynamic_objects import DynamicObjectsLayer
 from surfel_mapper.layers.sensor_models import SensorModels
@@ -23,6 +22,7 @@ from surfel_mapper.mapping.window import SlidingWindow
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.sensors import LidarModel
+from test.fields import config_of
 
 S = 10**9
 LIDAR = LidarModel(rows=64, columns=512, vertical_fov_deg=60.0)
@@ -75,7 +75,7 @@ def scan_of(number, has_box=True, missing_wall=None):
 def driven(missing_wall=None, center_m=(0.0, 0.0, 0.0), **settings):
     """Return a mapper that has seen the box pass, in clouds with the lidar at a place."""
     mapper = Mapper(
-        Config.from_mapping(
+        config_of(
             {
                 'pose.source': 'odometry',
                 'frames.base': 'lidar',
@@ -136,9 +136,9 @@ CENTER_M = (1.0, 0.5, 1.5)
     'settings',
     [
         {'sensor_frame': 'top', 'enabled': True, 'carve': False},
-        {'sensor_center_m': CENTER_M, 'sensor_rows': 64, 'sensor_fov_deg': (-30.0, 30.0)},
+        {'sensor_frame': 'top', 'sensor_rows': 64},
     ],
-    ids=['its frame', 'its place and beams'],
+    ids=['its frame', 'its frame and rows'],
 )
 def test_voxels_are_seen_from_the_place_of_the_sensor_in_the_cloud(
     settings, with_clearing, caplog
@@ -220,7 +220,7 @@ def counting(max_range_m=None, **settings):
     """Return the layer of a map that stays empty, without a pipeline."""
     ranges = {} if max_range_m is None else {'layers.tsdf.max_range_m': max_range_m}
     stage = {f'dynamic.{name}': value for name, value in settings.items()}
-    config = Config.from_mapping({'dynamic.clear': True, **stage, **ranges})
+    config = config_of({'dynamic.clear': True, **stage, **ranges})
     surfel_map = SurfelMap(SIZE_M)
     around = Surroundings(
         surfel_map=surfel_map,
@@ -265,7 +265,7 @@ def test_rays_that_end_within_the_margin_clear_nothing():
 
 
 def test_scan_that_fits_no_sensor_clears_nothing_and_is_mapped(caplog):
-    mapper = Mapper(Config.from_mapping({'pose.source': 'identity', 'dynamic.clear': True}))
+    mapper = Mapper(config_of({'pose.source': 'identity', 'dynamic.clear': True}))
     flat = np.array([[1.0, 0.0, 0.0], [2.0, 1.0, 0.0]])
     mapper.add_scan(Scan(points=flat, stamp_ns=S, frame_id='lidar'))
     assert len(list(mapper.insert_ready())) == 1

@@ -14,6 +14,7 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from test.alignment.street import drifted, street_scans
+from test.fields import config_of
 from test.models.live_scenes import groups, ids, live
 from test.models.scenes import room, VIEW
 
@@ -35,7 +36,7 @@ def street():
 
 def mapper_with(**settings):
     settings = {name.replace('__', '.'): value for name, value in settings.items()}
-    return Mapper(Config.from_mapping({**SETTINGS, **settings}))
+    return Mapper(config_of({**SETTINGS, **settings}))
 
 
 def feed(mapper, scans, poses):

@@ -103,8 +103,7 @@ def test_a_stopped_replay_writes_the_scans_so_far(bag, tmp_path):
     ('options', 'config', 'error', 'says'),
     [
         ({'formats': ('stl',)}, None, ConfigError, "formats: 'stl', expected some of ply"),
-        ({'formats': ('dxf',)}, None, ConfigError, 'layers.models.enabled: true'),
-        ({'formats': ('step',)}, None, ConfigError, 'step is written by the layer models'),
+        ({'formats': ('glb',)}, None, ConfigError, 'layers.models.enabled: true'),
         ({}, {'frames.fixed': 'map'}, BagError, 'none of 6 clouds of /points was mapped'),
     ],
 )

@@ -19,6 +19,7 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.pipeline.window_aligner import WindowAligner
 from test.alignment.street import drifted, relative_errors, street_scans
+from test.fields import config_of
 
 NUM_SCANS = 8
 
@@ -38,7 +39,7 @@ def drive():
 
 def mapped(drive, settings=(), number=NUM_SCANS):
     """Return a mapper that has mapped scans where drifting odometry has them."""
-    mapper = Mapper(Config.from_mapping({**SETTINGS, **dict(settings)}))
+    mapper = Mapper(config_of({**SETTINGS, **dict(settings)}))
     return mapper, feed(mapper, drive, range(number))
 
 

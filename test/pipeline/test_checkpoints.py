@@ -11,7 +11,7 @@ import pytest
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.map_state import load_map
-from surfel_mapper.files.parquet_tiles import read_part, write_shard, write_tile
+from surfel_mapper.files.parquet_tiles import write_tiles
 from surfel_mapper.pipeline import checkpoints, saved_state
 from surfel_mapper.pipeline.checkpoints import checkpoint_paths, Checkpoints, load_start
 from test.pipeline.made_scans import add_pose, insert, mapper_with, scan_at
@@ -176,8 +176,7 @@ def test_a_map_in_tiles_is_a_start_too(tmp_path):
     pytest.importorskip('pyarrow')
     mapper = mapper_in(tmp_path)
     drive(mapper, 1.0, 2.0)
-    for tile, part in write_shard(tmp_path / 'shard.parquet', mapper.map).items():
-        write_tile(tmp_path / 'tiled' / 'map' / tile.path, read_part(part))
+    write_tiles(tmp_path / 'tiled' / 'map', mapper.map)
     after = mapper_in(tmp_path, map__load=str(tmp_path / 'tiled'))
     load_start(after)
     assert after.map.digest() == mapper.map.digest()

@@ -26,6 +26,7 @@ from surfel_mapper.pipeline.saved_state import load_mapper, save_mapper
 from surfel_mapper.scan import Scan
 from test.alignment.circuit import circuit, drifted, gap, SAME_WAY
 from test.alignment.test_registration import map_of, NOISE_M, ROOM
+from test.fields import config_of
 from test.pipeline.test_registered_poses import feed, pose_at
 from test.pipeline.test_registered_poses import scan_at as room_scan
 
@@ -45,7 +46,7 @@ def fed(mapper, points, poses, first=0):
 
 def mapper_of(**changed):
     odometry = {'pose.source': 'odometry', 'frames.base': 'lidar'}
-    return Mapper(Config().replace({**odometry, **ALL_SCANS, **changed}))
+    return Mapper(config_of({**odometry, **ALL_SCANS, **changed}))
 
 
 def digest_at(points, poses):
@@ -399,9 +400,7 @@ def test_a_frozen_map_moves_no_scan():
 def test_registration_follows_the_last_metres_alone():
     seen = circuit(SAME_WAY)
     mapper = Mapper(
-        Config().replace(
-            {'pose.source': 'registration', 'loops.odometry_map_m': 20.0, **ALL_SCANS}
-        )
+        config_of({'pose.source': 'registration', 'loops.odometry_map_m': 20.0, **ALL_SCANS})
     )
     for number, points in enumerate(seen.scans[:30]):
         mapper.add_scan(Scan(points=points, stamp_ns=10**9 + number * 10**8, frame_id='lidar'))

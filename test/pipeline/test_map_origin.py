@@ -17,6 +17,7 @@ from surfel_mapper.pipeline.checkpoints import load_start
 from surfel_mapper.pipeline.saved_state import load_mapper, save_mapper
 from surfel_mapper.scan import Scan
 from test.alignment.street import drifted, street_scans
+from test.fields import config_of
 
 UTM = np.array([400_000.0, 5_400_000.0, 250.0])
 ECEF = np.array([4_157_312.5, 664_128.25, 4_774_777.0])
@@ -37,7 +38,7 @@ def text_of(origin):
 
 def mapped(origin='', shift=(0.0, 0.0, 0.0), number=6, **settings):
     """Return a mapper that mapped scans between poses, all shifted by an exact amount."""
-    mapper = Mapper(Config.from_mapping({**SETTINGS, 'map.origin': origin, **settings}))
+    mapper = Mapper(config_of({**SETTINGS, 'map.origin': origin, **settings}))
     drive(mapper, shift, number)
     return mapper
 
@@ -85,7 +86,7 @@ def test_auto_is_no_origin_near_that_of_the_frame():
 
 
 def test_without_an_origin_utm_is_beyond_the_range_of_the_map():
-    mapper = Mapper(Config.from_mapping(SETTINGS))
+    mapper = Mapper(config_of(SETTINGS))
     mapper.add_pose('utm', 'base_link', 0, UTM, (0, 0, 0, 1))
     mapper.add_scan(Scan(points=np.ones((9, 3)), stamp_ns=0, frame_id='lidar'))
     list(mapper.insert_ready())
@@ -97,7 +98,7 @@ def test_poses_of_the_fixed_frame_in_another_are_shifted_too():
     # the tree is base_link -> utm, as some localisations publish it
     expected = mapped(number=1)
     for origin in (text_of(UTM), 'auto'):
-        mapper = Mapper(Config.from_mapping({**SETTINGS, 'map.origin': origin}))
+        mapper = Mapper(config_of({**SETTINGS, 'map.origin': origin}))
         mapper.add_pose('earth', 'utm', 0, (5.0, 6.0, 7.0), (0, 0, 0, 1), static=True)
         drive(mapper, UTM, 1)
         place = mapper.T_map_of('earth', 0)[:3, 3]
@@ -112,7 +113,7 @@ def test_clouds_in_the_fixed_frame_are_moved_exactly(origin):
     maps = []
     for where, cloud in ((origin, points + ECEF), ('', None)):
         settings = {'pose.source': 'identity', 'map.origin': where, 'input.max_range_m': 0.0}
-        mapper = Mapper(Config.from_mapping(settings))
+        mapper = Mapper(config_of(settings))
         cloud = points + ECEF - maps[0].origin_m if cloud is None else cloud
         mapper.add_scan(Scan(points=cloud, stamp_ns=1, frame_id='odom'))
         list(mapper.insert_ready())
@@ -124,7 +125,7 @@ def test_clouds_in_the_fixed_frame_are_moved_exactly(origin):
 def test_auto_is_found_among_the_points_that_an_origin_can_have():
     cloud = np.full((100, 3), ECEF, np.float64)
     cloud[:3] = np.array([np.finfo(np.float32).max, np.nan, -1e9])[:, None]
-    mapper = Mapper(Config.from_mapping({'pose.source': 'identity', 'map.origin': 'auto'}))
+    mapper = Mapper(config_of({'pose.source': 'identity', 'map.origin': 'auto'}))
 
     mapper.add_scan(Scan(points=cloud, stamp_ns=1, frame_id='odom'))
     (update,) = mapper.insert_ready()
@@ -151,9 +152,7 @@ def test_an_alignment_corrects_in_the_map():
     settings = {'window.keep_points': True, 'align.key_distance_m': 0.0, 'frames.base': 'lidar'}
     mappers = []
     for shift in (np.zeros(3), UTM):
-        mapper = Mapper(
-            Config.from_mapping({**SETTINGS, **settings, 'map.origin': text_of(shift)})
-        )
+        mapper = Mapper(config_of({**SETTINGS, **settings, 'map.origin': text_of(shift)}))
         for scan, pose in zip(scans[:4], poses, strict=True):
             mapper.add_pose('utm', 'lidar', scan.stamp_ns, pose[:3, 3] + shift, q_xyzw(pose))
             mapper.add_scan(scan)
@@ -189,14 +188,14 @@ def test_bad_origins_are_refused_by_name(text):
 
 def test_an_origin_with_poses_by_registration_is_refused():
     with pytest.raises(ConfigError, match=r'map\.origin: .* with pose\.source registration'):
-        Mapper(Config.from_mapping({'map.origin': '1 2 3', 'pose.source': 'registration'}))
+        Mapper(config_of({'map.origin': '1 2 3', 'pose.source': 'registration'}))
 
 
 def test_a_saved_window_is_loaded_and_evicted(tmp_path):
     window = {'window.max_scans': 4}
     mapper = mapped(text_of(UTM), UTM, **window)
     save_mapper(tmp_path / 'map.npz', mapper)
-    again = Mapper(Config.from_mapping({**SETTINGS, 'map.origin': 'auto', **window}))
+    again = Mapper(config_of({**SETTINGS, 'map.origin': 'auto', **window}))
 
     load_mapper(tmp_path / 'map.npz', again)
 
@@ -217,7 +216,7 @@ def test_a_loaded_map_gives_its_origin_and_goes_on(tmp_path):
     digest = save_map(tmp_path / 'map.npz', mapper.map)
     load = {'map.load': str(tmp_path / 'map.npz')}
     for origin in ('auto', text_of(UTM)):
-        again = Mapper(Config.from_mapping({**SETTINGS, 'map.origin': origin, **load}))
+        again = Mapper(config_of({**SETTINGS, 'map.origin': origin, **load}))
         load_start(again)
         assert again.map == mapper.map
         assert again.map.digest() == digest
@@ -228,7 +227,7 @@ def test_a_loaded_map_gives_its_origin_and_goes_on(tmp_path):
         ('', 'map.origin: auto and this map'),
         ('0 0 8', "'400000 5400000 250'"),
     ):
-        again = Mapper(Config.from_mapping({**SETTINGS, 'map.origin': origin, **load}))
+        again = Mapper(config_of({**SETTINGS, 'map.origin': origin, **load}))
         with pytest.raises(MapError, match=reason):
             load_start(again)
         assert again.map.num_voxels == 0

@@ -148,7 +148,7 @@ def test_live_settings_hold_from_the_next_scan_on():
     (update,) = insert(mapper, scan_at(9.0))
     assert len(mapper.window) == 2
     assert update.changed.num_points.min() >= 3
-    mapper.reconfigure(new.replace({'map.max_voxels': 1}))
+    mapper.reconfigure(new.replace({'window.max_bytes': 1}))
     insert(mapper, scan_at(10.0))
     assert len(mapper.window) == 1
 

@@ -17,6 +17,7 @@ from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.scan import Scan
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.alignment.test_registration import CORRIDOR, map_of, NOISE_M, points_on, ROOM, TRUE
+from test.fields import config_of
 
 STEP_NS = 10**8
 TWIST = np.array([0.8, 0.1, 0.0, 0.0, 0.02, 0.3])
@@ -26,7 +27,7 @@ MOUNT = (0.3, -0.1, 0.5, 0.0, 0.0, 0.6, 0.8)
 def mapper_with(**changes):
     settings = {'pose.source': 'registration', 'registration.noise_m': NOISE_M}
     changes = {name.replace('__', '.'): value for name, value in changes.items()}
-    return Mapper(Config.from_mapping({**settings, **changes}))
+    return Mapper(config_of({**settings, **changes}))
 
 
 def frozen(**changes):
@@ -371,7 +372,8 @@ def test_live_settings_of_the_registration_hold_from_the_next_scan_on():
     mapper = mapper_with()
     feed(mapper, [scan_at(0)])
 
-    mapper.reconfigure(mapper.config.replace({'registration.min_fit_ratio': 1.0}))
+    changed = replace(mapper.config.registration, min_fit_ratio=1.0)
+    mapper.reconfigure(replace(mapper.config, registration=changed))
 
     assert feed(mapper, [scan_at(1)]) == []
     mapper.finish()

@@ -115,7 +115,6 @@ def test_every_stage_is_timed():
         ({'window__max_age_s': 2.5}, 3),
         ({'window__max_distance_m': 1.3}, 3),
         ({'window__max_bytes': 1}, 1),
-        ({'map__max_voxels': 1}, 1),
         ({'window__max_scans': 4, 'window__max_age_s': 1.5}, 2),
     ],
 )

@@ -122,14 +122,14 @@ def load():
     from rclpy.impl.rcutils_logger import CallerId
 
     from surfel_mapper.compilation import run_stages
-    from surfel_mapper.config import Config
     from surfel_mapper.pipeline import Mapper
     from surfel_mapper.pipeline.warm_up import node_stages
+    from test.fields import config_of
 
     for name in (*(f'cli.{verb}' for verb in VERBS), 'ros.main', 'ros.player', 'offline.replay'):
         import_module(f'surfel_mapper.{name}')
     for settings in ({}, LAYERS, WITHOUT_POSES):
-        config = Config.from_mapping({'pose.source': 'odometry', **settings, **ONE_THREAD})
+        config = config_of({'pose.source': 'odometry', **settings, **ONE_THREAD})
         run_stages(node_stages(Mapper(config)))
     load_type_supports()
     CallerId()  # of the first message of a log: finds the files of all modules, .05 s in each node

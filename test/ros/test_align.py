@@ -32,7 +32,6 @@ SETTINGS = {
     'pose.source': 'odometry',
     'frames.base': 'lidar',
     'window.keep_points': True,
-    'align.key_distance_m': 0.0,
     'align.map_frame': 'map',
     'publish.diagnostics_rate_hz': 20.0,
 }
@@ -144,7 +143,6 @@ def test_a_loop_moves_the_map_and_the_odometry_goes_on(start, peer, tmp_path):
     settings = {
         'loops.enabled': True,
         'loops.directory': str(tmp_path),
-        'loops.recognise_distance_m': 20.0,
         'window.max_scans': 0,
         'window.keep_points': False,
     }

@@ -10,7 +10,7 @@ import pytest
 from surfel_mapper.cli.main import main
 from surfel_mapper.config import Config
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.parquet_tiles import dataset_digest
+from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.checkpoints import load_start
 from surfel_mapper.scan import Scan
@@ -42,7 +42,7 @@ def test_a_saved_map_is_merged_extracted_evaluated_and_loaded(saved, name, tmp_p
     path, digest = str(directory / name), mapper.map.digest()
 
     assert main(['merge', path, '--output', str(tmp_path / 'sum')]) == 0
-    assert dataset_digest(tmp_path / 'sum' / 'map') == digest
+    assert read_tiles(tmp_path / 'sum' / 'map').digest() == digest
     assert main(['extract', path, '--output', str(tmp_path / 'models')]) == 0
     assert (tmp_path / 'models' / 'models.json').is_file()
     capsys.readouterr()

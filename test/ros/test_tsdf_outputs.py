@@ -98,7 +98,7 @@ def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
 
 def test_distances_to_obstacles_come_as_cloud_and_slice(start, peer):
     rates = {'esdf.rate_hz': 10.0, 'esdf.slice_rate_hz': 10.0, 'esdf.max_m': 1.0}
-    start_node(start, peer, **SETTINGS, **rates, **{'esdf.radius_m': 0.0})
+    start_node(start, peer, **SETTINGS, **rates)
     clouds = peer.collect(PointCloud2, f'{BASE}/esdf', LATCHED)
     slices = peer.collect(OccupancyGrid, f'{BASE}/esdf_slice', LATCHED)
     directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)

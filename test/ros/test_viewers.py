@@ -86,7 +86,7 @@ def command_lines():
 
 def test_a_node_serves_a_page_of_its_map(start, peer, tmp_path):
     port = free_port()
-    settings = {'viewer.enabled': True, 'viewer.port': port, 'viewer.rate_hz': 100.0}
+    settings = {'viewer.enabled': True, 'viewer.port': port}
     node = start('node', *arguments(**settings))
     node.wait_for_output(f'the map is shown at http://127.0.0.1:{port}/')
     changed = peer.collect(PointCloud2, f'{NODE}/changed')

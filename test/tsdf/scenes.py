@@ -70,7 +70,7 @@ def zero_crossings(blocks):
         part = tuple(slice(b, b + m) for b in block)
         D[part] = blocks.distance[row].reshape(m, m, m).T
         W[part] = blocks.weight[row].reshape(m, m, m).T
-    least = np.float32(config.mesh_min_weight)  # as weights are
+    least = np.float32(config.least_mesh_weight)  # as weights are
     seen = least <= W
     cube = np.ones(np.array(shape) - 1, bool)
     for corner in np.ndindex(2, 2, 2):

@@ -289,7 +289,7 @@ def test_a_short_truncation_is_warned_of(caplog):
     ('settings', 'message'),
     [
         ({'voxels_per_side': 6}, 'voxels_per_side: 6, expected a power of two'),
-        ({'truncation_m': 0.05}, 'dropoff_m: .*less than truncation_m'),
+        ({'truncation_m': 0.05}, 'truncation_m: 0.05, expected more than 0.1, a voxel'),
         ({'semantics': 'majority'}, 'num_labels: 0, expected positive'),
         ({'extra_labels': [1.5]}, 'extra_labels: 1.5, expected whole'),
         ({'dynamic_labels': [-1.0]}, 'dynamic_labels: -1.0, expected whole'),

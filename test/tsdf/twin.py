@@ -80,9 +80,9 @@ def look_up(config, sensor, image, p, u, v):
     j, i = int(np.floor(v + 0.5)), int(np.floor(u + 0.5))
     if not (0 <= j < sensor.rows and 0 <= i < columns):
         return 0.0, []
-    if not hasattr(sensor, 'fx') and config.max_ray_offset_voxels > 0:
+    if not hasattr(sensor, 'fx') and config.ray_offset_voxels > 0:
         b = ray(sensor, i, j)
-        if np.linalg.norm(p - (p @ b) * b) > config.max_ray_offset_voxels * config.voxel_size_m:
+        if np.linalg.norm(p - (p @ b) * b) > config.ray_offset_voxels * config.voxel_size_m:
             return 0.0, []
     return float(image[j, i]), [(j, i, 1.0)]
 

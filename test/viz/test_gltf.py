@@ -20,7 +20,7 @@ from test.viz.test_mesh import sphere
 from test.viz.test_show import ground, ground_map, UTM
 
 pytestmark = pytest.mark.skipif(
-    find_spec('trimesh') is None, reason='trimesh is not installed (extra gltf)'
+    find_spec('trimesh') is None, reason='trimesh is not installed (extra meshes)'
 )
 
 TYPES = {5120: 'i1', 5121: 'u1', 5123: '<u2', 5125: '<u4', 5126: '<f4'}
@@ -147,5 +147,5 @@ def test_without_the_library_the_extra_is_named(tmp_path, capsys, monkeypatch):
     surfel_map.save(tmp_path / 'map.npz')
     monkeypatch.setitem(sys.modules, 'trimesh', None)
     assert main(['view', str(tmp_path / 'map.npz'), '--glb', str(tmp_path / 'map.glb')]) == 1
-    assert 'surfel_mapper[gltf]' in capsys.readouterr().err
+    assert 'surfel_mapper[meshes]' in capsys.readouterr().err
     assert not (tmp_path / 'map.glb').exists()

@@ -23,7 +23,6 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config, TsdfConfig
-from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.files.mesh_ply import write_mesh_parts
 from surfel_mapper.files.tsdf_archive import BlockArchive, joined
 from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf, save_tsdf_parts
@@ -227,8 +226,8 @@ class TsdfLayer(Layer):
 
     def warm_up(self) -> None:
         """Compile the kernels, for points of either type."""
-        for fusion in ('images', 'points'):
-            tsdf = replace(without_sensor(self.config.tsdf), fusion=fusion)
+        for rows in (2, 0):  # as an image, and point by point
+            tsdf = replace(without_sensor(self.config.tsdf), sensor_rows=rows)
             config = replace(self.config, tsdf=tsdf)
             for dtype in (np.float32, np.float64):
                 around = replace(self.around, sensors=SensorModels(tsdf))
@@ -356,18 +355,8 @@ class TsdfLayer(Layer):
 
     def _sensor(self, scan: Scan) -> CameraModel | LidarModel | None:
         """Return the model of the sensor of a scan; None if it is fused point by point."""
-        config = self.config.tsdf
-        if config.fusion == 'points':
-            return None
         sensor = self.around.sensors.of(scan)
-        if config.fusion == 'images':
-            if sensor is None:
-                raise CloudFormatError(
-                    f'no model of a lidar fits the points in {scan.frame_id}; set '
-                    'layers.tsdf.sensor_rows, or layers.tsdf.fusion to auto'
-                )
-            return sensor
-        is_configured = config.sensor_rows or config.sensor_beams_deg
+        is_configured = self.config.tsdf.sensor_rows > 0
         if isinstance(sensor, LidarModel) and not is_configured and sensor.rows < SPARSE_ROWS:
             return None
         return sensor
@@ -396,7 +385,7 @@ def cleared(blocks: Blocks, *, config: TsdfConfig, contains: Contains) -> Blocks
     """Return blocks whose voxels in a region are unknown, without those that become empty."""
     found = []
     while len(blocks):  # a block may occur several times
-        one = BlockMap(replace(config, max_blocks=0))
+        one = BlockMap(config)
         _, first = np.unique(block_keys(blocks.index), return_index=True)
         one.insert(blocks.part(first))
         one.clear_region(contains)

@@ -13,7 +13,6 @@ two slabs of regions, not by the length of a drive.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -83,7 +82,7 @@ def merged_regions(blocks: BlockMap, archive: BlockArchive) -> Iterator[tuple[Re
     places = blocks.index(rows) // REGION
     regions = archive.regions() | {(x, y, z) for x, y, z in np.unique(places, axis=0).tolist()}
     for region in sorted(regions, reverse=True):
-        found = BlockMap(replace(blocks.config, max_blocks=0))
+        found = BlockMap(blocks.config)
         for archived in archive.region(region):
             found.merge(archived)
         found.merge(blocks.copied(rows[(places == region).all(axis=1)]))

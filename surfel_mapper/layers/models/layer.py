@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config
-from surfel_mapper.files.model_files import import_ezdxf, write_models
-from surfel_mapper.files.model_step import import_ocp
+from surfel_mapper.files.model_files import TRIANGLES, write_models
+from surfel_mapper.files.triangles import import_trimesh
 from surfel_mapper.layers.drawings import Drawing, PointsPicture, Section
 from surfel_mapper.layers.layer import InsertedScan, Layer, Moment, Publication, Surroundings
 from surfel_mapper.layers.models.pictures import drawings_of, panels_of, section_of
@@ -128,15 +128,13 @@ class ModelsLayer(Layer):
 
     @classmethod
     def check_formats(cls, formats: Sequence[str]) -> None:
-        """Raise DependencyError if ezdxf or cadquery-ocp is needed and not installed."""
-        if 'dxf' in formats:
-            import_ezdxf()
-        if 'step' in formats:
-            import_ocp()
+        """Raise DependencyError if trimesh is needed and not installed."""
+        if not {*TRIANGLES}.isdisjoint(formats):
+            import_trimesh()
 
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
-        """Write models.json and models.obj, and Parquet, DXF and STEP if asked for."""
-        wanted = ['json', 'obj', *(name for name in ('parquet', 'dxf', 'step') if name in formats)]
+        """Write models.json, and Parquet, OBJ and GLB if asked for."""
+        wanted = ['json', *(name for name in ('parquet', *TRIANGLES) if name in formats)]
         model = self.models.model.translated(self.around.surfel_map.origin_m)
         return write_models(directory, model, wanted, self.models.versions)
 

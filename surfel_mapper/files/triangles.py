@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Triangles in files of other programs: OBJ, STL and glTF, read and written by trimesh.
+
+glTF has y upwards, so its triangles are turned on the way in and out.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+
+from surfel_mapper.budget import Budget, open_regular
+from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.files.atomic import replace_file
+
+if TYPE_CHECKING:
+    from surfel_mapper.tsdf.mesh import Mesh
+
+GLTF = ('.glb', '.gltf')
+
+SUFFIXES = ('.obj', '.stl', *GLTF)
+
+Y_UP = np.array(
+    [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""Turns a frame with z upwards to one with y upwards."""
+
+COPIES = 3
+"""Size of the arrays of a mesh, in sizes of its file."""
+
+
+def read_triangles(path: Path) -> Mesh:
+    """
+    Return the triangles of a file (OBJ, STL, GLB, glTF) in a frame with z upwards.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, or has no triangles.
+    DependencyError
+        If trimesh is not installed.
+
+    """
+    from surfel_mapper.tsdf.mesh import Mesh
+
+    check_size(path)
+    trimesh = import_trimesh()
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        found = scene.to_mesh() if scene.geometry else trimesh.Trimesh()
+    except MemoryError:
+        raise
+    except Exception as error:  # those of many decoders
+        raise FileFormatError(f'{path}: no {path.suffix[1:]} file: {error}') from error
+    if not len(found.faces):
+        raise FileFormatError(f'{path}: no triangles')
+    if path.suffix in GLTF:
+        found.apply_transform(Y_UP.T)
+    return Mesh(
+        vertices=np.asarray(found.vertices, np.float64),
+        triangles=np.asarray(found.faces, np.int32),
+        colors=vertex_colors(found.visual),
+    )
+
+
+def check_size(path: Path) -> None:
+    """Raise FileFormatError if a file is not a regular one, or too large for the memory."""
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            Budget(path, size, FileFormatError).take(COPIES * size, 'its triangles')
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+
+
+def vertex_colors(visual: Any) -> Any:
+    """Return the colours of vertices, (V, 3) uint8, textures included; (0, 3) without."""
+    if visual.kind == 'texture':
+        visual = visual.to_color()
+    if visual.kind is None:
+        return np.empty((0, 3), np.uint8)
+    return np.asarray(visual.vertex_colors[:, :3], np.uint8)
+
+
+def write_scene(path: Path, scene: Any) -> None:
+    """
+    Write a scene of trimesh in the format of the file's ending, whole or not at all.
+
+    Raises
+    ------
+    FileFormatError
+        If the scene is empty, or the file cannot be written.
+
+    """
+    if not scene.geometry:
+        raise FileFormatError(f'{path}: nothing to write')
+    content = scene.export(file_type=path.suffix[1:])
+    with replace_file(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def import_trimesh() -> Any:
+    """Return the module trimesh, or raise DependencyError with the command to install it."""
+    try:
+        import trimesh
+        import trimesh.path
+    except ImportError as error:
+        raise DependencyError(
+            f'trimesh cannot be loaded ({error}). It reads and writes OBJ, STL and glTF; install '
+            "it with `pip install 'surfel_mapper[meshes]'` or `pip install trimesh`"
+        ) from error
+    return trimesh
