@@ -12,8 +12,6 @@ mapped, with nothing coming in. Rows ``transport`` are a subscriber of rclpy tha
 clouds, in place of the node, with ordinary priority. The rows of the node by defaults depend on
 whether Linux permits it real-time priority (docs/node.md); without: ``setpriv
 --bounding-set=-sys_nice -- python -m test.bench --only live`` as root.
-
-Only the rows of the node at 20 Hz grow with ``--scans``; live_long.py has the long ones alone.
 """
 
 from __future__ import annotations
