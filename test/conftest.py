@@ -82,14 +82,12 @@ WAITING = ('test/ros/', 'test/cluster/', 'test/viz/test_view_browser', 'test/viz
 """Tests of processes, which wait for each other half of their time."""
 
 LONGEST = (
-    'test/fuzz/test_failures.py',
     'test/fuzz/test_fuzz.py',
     'test/docs/test_tutorials.py',
     'test/cli/test_replay_registration.py',
     'test/examples/test_examples.py',
-    'test/bench/test_drives.py',
 )
-"""Files of few tests with 7 to 15 s of processor time each; the first forks, best while small."""
+"""Files of few tests with 7 to 15 s of processor time each."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -17,7 +17,7 @@ from surfel_mapper.bags import bag_file, chunked, decoders, mcap
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.bags.runs import CHECK_EVERY
 from surfel_mapper.errors import BagError
-from test.fuzz.structures import packed_as, record, text
+from test.bags.records import packed_as, record, text
 
 HEAD = b'\x89MCAP0\r\n' + record(1, text(b'ros2') + text(b''))
 SCHEMA = record(3, struct.pack('<H', 1) + text(b'a/msg/A') + text(b'ros2msg') + text(b''))

@@ -15,6 +15,7 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.files import ply
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from test import extras
 from test.models.scenes import room, sheet, VIEW
 
 FILES = ('models.json', 'models.obj', 'models.png')
@@ -36,10 +37,10 @@ def test_a_cloud_becomes_models_and_a_picture(tmp_path, capsys):
     assert all((tmp_path / 'out' / name).stat().st_size > 0 for name in FILES)
     assert main(['extract', *arguments, '--formats', 'json']) == 0
     assert 'planes' in capsys.readouterr().out
-    pytest.importorskip('ezdxf', reason='ezdxf is not installed (extra formats)')
+    extras.load('ezdxf')
     assert main(['extract', *arguments, '--formats', 'dxf']) == 0
     assert (tmp_path / 'out' / 'models.dxf').stat().st_size > 0
-    pytest.importorskip('OCP', reason='cadquery-ocp is not installed (extra step)')
+    extras.load('OCP')
     assert main(['extract', *arguments, '--formats', 'step']) == 0
     assert (tmp_path / 'out' / 'models.step').stat().st_size > 0
 
@@ -57,7 +58,7 @@ def test_a_map_becomes_models_of_its_surfels(tmp_path, capsys):
     offsets = sorted(abs(plane['offset_m']) for plane in planes)
     assert offsets == pytest.approx([0.31, 0.91], abs=0.01)
 
-    pytest.importorskip('pyarrow')
+    extras.load('pyarrow')
     tiled, again = str(tmp_path / 'tiled'), tmp_path / 'again'
     assert main(['merge', str(tmp_path / 'map.npz'), '--output', tiled]) == 0
     assert main(['extract', tiled, '--output', str(again)]) == 0

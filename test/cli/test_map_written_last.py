@@ -17,9 +17,10 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.offline.outputs import ScanTrajectory, write_maps
 from surfel_mapper.pipeline.saved_state import load_mapper
 from surfel_mapper.viz.contents import contents
+from test import extras
 from test.pipeline.made_scans import insert, mapper_with, scan_at
 
-pytest.importorskip('pyarrow', reason='tiles need pyarrow (extra formats)')
+extras.load('pyarrow')
 
 LENGTHS_M = {'tiles': 4.0, 'map.npz': 6.0, 'map.parquet': 8.0}
 """Length of the floor in the map of each form."""

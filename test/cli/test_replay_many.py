@@ -14,6 +14,7 @@ from surfel_mapper.cluster.shards import map_shard
 from surfel_mapper.files.parquet import read_map
 from surfel_mapper.files.parquet_tiles import dataset_digest
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from test import extras
 from test.bags.recorded import cut
 from test.cli.small_disk import run_on_small_disk
 from test.cluster.bags import written
@@ -104,7 +105,7 @@ def test_ctrl_c_before_the_first_shard_is_done_leaves_the_earlier_map(
 
 
 def test_workers_make_the_map_of_one_process(bags, alone, tmp_path, capsys, caplog):
-    pytest.importorskip('distributed', reason='dask is not installed (extra cluster)')
+    extras.load('distributed')
     arguments = ['replay', bags[0], '--workers', '2', '--output', str(tmp_path), '--json']
     assert main([*arguments, *TF]) == 0
 
@@ -206,7 +207,7 @@ def test_an_invalid_number_of_workers_is_refused(bags, number):
 
 
 def test_a_scheduler_that_does_not_answer_is_refused(bags, tmp_path, capsys, monkeypatch):
-    pytest.importorskip('distributed', reason='dask is not installed (extra cluster)')
+    extras.load('distributed')
     from surfel_mapper.cluster import executors
 
     monkeypatch.setattr(executors, 'CONNECT_S', 1)

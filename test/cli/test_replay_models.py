@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.cli.main import main
+from test import extras
 from test.bags.recorded import drive, HEIGHT_M, MOUNT_M, write_rosbag2
 from test.viz.test_report import Parsed
 
@@ -26,9 +27,9 @@ def bag(tmp_path_factory):
 @pytest.fixture(scope='module')
 def output(bag, tmp_path_factory):
     """Return the output directory of a replay with models."""
-    pytest.importorskip('ezdxf', reason='ezdxf is not installed (extra formats)')
-    pytest.importorskip('pyarrow', reason='pyarrow is not installed (extra formats)')
-    pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
+    extras.load('ezdxf')
+    extras.load('pyarrow')
+    extras.load('rerun')
     output = tmp_path_factory.mktemp('out') / 'map'
     output.parent.joinpath('a.yaml').write_text('layers: {models: {enabled: true}}\n')
     config = ['--config', str(output.with_name('a.yaml')), '--rrd', str(output.with_name('a.rrd'))]

@@ -14,6 +14,7 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.files.parquet_tiles import split_map
 from surfel_mapper.messages.compressed_image import unpacked
 from surfel_mapper.messages.pointcloud2 import parse_cloud
+from test import extras
 from test.fuzz import corpus
 from test.offline import dataset_folders
 
@@ -51,7 +52,7 @@ def refusal(capsys, verb, *arguments):
 @pytest.mark.parametrize('name', INPUTS)
 def test_the_verb_ends_with_the_message(tmp_path, monkeypatch, capsys, name):
     if name.endswith('.parquet'):
-        pytest.importorskip('pyarrow')
+        extras.load('pyarrow')
     if name.endswith('.laz'):
         pytest.importorskip('laspy')
     make, verb = INPUTS[name]
@@ -76,7 +77,7 @@ def test_a_data_set_ends_with_the_message(tmp_path, wrong, capsys):
 
 
 def test_a_tile_is_not_taken_for_damaged(tmp_path, wrong):
-    pytest.importorskip('pyarrow')
+    extras.load('pyarrow')
     (tmp_path / 'a.parquet').write_bytes(corpus.parquet()[0])
     with pytest.raises(ConfigError, match='4G'):
         next(split_map(tmp_path / 'a.parquet'))

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 import json
 from pathlib import Path
 import re
@@ -23,6 +22,7 @@ from surfel_mapper.geometry import inverse, rotation_angle
 from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import as_text
 from surfel_mapper.simulation import Drive, Lidar, Simulation, World
+from test import extras
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 
@@ -121,7 +121,7 @@ def test_recordings_are_registered_without_loops_if_asked(placed, tmp_path):
             assert ('loops' in summary) == has_loops
 
 
-@pytest.mark.skipif(find_spec('kiss_matcher') is None, reason='kiss-matcher is not installed')
+@extras.needs('kiss_matcher')
 def test_a_recording_that_begins_with_another_heading_is_placed(tmp_path, world):
     recorded(tmp_path / 'a', world, 0)
     true = recorded(tmp_path / 'b', world, 4, heading=-1.0)

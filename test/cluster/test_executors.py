@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Workers that come, go and die change nothing in the map; real Dask clusters of this machine."""
 
-from importlib.util import find_spec
 from multiprocessing import forkserver
 import os
 from pathlib import Path
@@ -20,11 +19,10 @@ from surfel_mapper.cluster import executors
 from surfel_mapper.cluster.executors import open_executor, SerialExecutor
 from surfel_mapper.cluster.map_reduce import map_bags
 from surfel_mapper.errors import ClusterError
+from test import extras
 from test.cluster.bags import in_one_go, shards_of, written
 
-pytestmark = pytest.mark.skipif(
-    find_spec('distributed') is None, reason='dask is not installed (extra cluster)'
-)
+pytestmark = extras.needs('distributed')
 
 
 def squared(number):

@@ -27,7 +27,10 @@ from surfel_mapper.cluster.shards import (
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError, FileFormatError, MapError
 from surfel_mapper.files.parquet_tiles import dataset_digest
+from test import extras
 from test.cluster.bags import BAGS, counted, in_one_go, RECORDED_S, shards_of, written
+
+pytestmark = extras.needs('pyarrow')
 
 
 @pytest.mark.parametrize('name', BAGS)

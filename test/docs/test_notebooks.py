@@ -4,16 +4,10 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
-import pytest
-
+from test import extras
 from test.docs.notebooks import executed, pages, python_steps, TUTORIALS, written
 
-pytestmark = pytest.mark.skipif(
-    not all(map(find_spec, ('nbformat', 'nbclient', 'ipykernel'))),
-    reason='nbformat, nbclient or ipykernel is not installed (extra notebooks)',
-)
+pytestmark = extras.needs('nbformat', 'nbclient', 'ipykernel')
 
 
 def test_a_cell_ends_where_the_page_shows_an_output():

@@ -23,6 +23,7 @@ import pytest
 
 from surfel_mapper import SurfelMap
 from surfel_mapper.cli.main import main
+from test import extras
 
 ROOT = Path(__file__).parents[2]
 TUTORIALS = ROOT / 'docs' / 'tutorials'
@@ -108,7 +109,7 @@ def stripped(printed):
 @pytest.mark.parametrize('name', pages('console'))
 def test_every_command_of_a_tutorial_prints_what_is_shown(name, shell):
     if name == 'many_bags.md':
-        pytest.importorskip('distributed', reason='Dask is not installed (extra cluster)')
+        extras.load('distributed')
     for block in blocks(name, 'console'):
         for command, shown in steps(block):
             printed = shell(command)

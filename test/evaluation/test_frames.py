@@ -19,6 +19,7 @@ from surfel_mapper.evaluation.map_files import Discs
 from surfel_mapper.evaluation.truth import WorldTruth
 from surfel_mapper.geometry import compose, inverse, pose_matrix, rotation_angle, se3_exp
 from surfel_mapper.simulation import World
+from test import extras
 
 WIDTH_M = 0.5
 
@@ -66,7 +67,7 @@ def test_a_small_motion_is_found_from_the_frames_as_they_are(normals):
     assert found.share == 1.0
 
 
-@pytest.mark.skipif(not frames.has_kiss_matcher(), reason='kiss-matcher is not installed')
+@extras.needs('kiss_matcher')
 def test_any_motion_is_found_by_features():
     truth, motion = faces(), pose_matrix([40.0, -25.0, 3.0], se3_turn(2.5))
     found = find_motion(moved_discs(truth, inverse(motion)), CloudTruth(truth), {}, WIDTH_M)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import ast
 import contextlib
-from importlib.util import find_spec
 import json
 import os
 from pathlib import Path
@@ -30,6 +29,7 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.files.ply import read_points
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from test import extras
 from test.ros.domain import domain_of_our_own
 
 ROOT = Path(__file__).parents[2]
@@ -193,16 +193,16 @@ def test_differences_between_two_maps_are_counted_and_written(tmp_path, run):
 
 
 def test_a_dask_run_comes_to_the_digest_of_a_single_process(street, tmp_path):
-    pytest.importorskip('distributed', reason='Dask is not installed (extra cluster)')
+    extras.load('distributed')
     arguments = ['--output', 'city', '--workers', 2, '--shard', 1]
     printed = run_process('dask_run.py', street / 'bag', *arguments, folder=tmp_path)
     assert printed.startswith('2 shards')
     assert f'digest {digest_of(street / "mapped")}' in printed
 
 
+@extras.needs('playwright')
 @pytest.mark.skipif(
-    not (find_spec('playwright') and any(map(shutil.which, ('chromium', 'google-chrome')))),
-    reason='needs Chromium and playwright',
+    not any(map(shutil.which, ('chromium', 'google-chrome'))), reason='needs Chromium'
 )
 def test_the_picture_of_a_street_has_road_and_walls_in_colours_of_their_own(tmp_path, run):
     text = run('street_picture.py', 'street.png', '2', folder=tmp_path)

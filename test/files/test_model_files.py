@@ -23,6 +23,7 @@ from surfel_mapper.files.model_files import (
 from surfel_mapper.models import fit
 from surfel_mapper.models.outlines import areas
 from surfel_mapper.models.shapes import shape_of
+from test import extras
 from test.models.scenes import A, room, VIEW
 
 
@@ -46,7 +47,7 @@ def test_json_holds_planes_surfaces_and_gaussians(model, tmp_path):
 
 
 def test_parquet_has_a_row_for_every_primitive(model, tmp_path):
-    parquet = pytest.importorskip('pyarrow.parquet')
+    parquet = extras.load('pyarrow.parquet')
     write_parquet(tmp_path / 'models.parquet', model)
     table = parquet.read_table(tmp_path / 'models.parquet').to_pydict()
     kinds = ['plane'] * len(model.planes) + ['surface'] * len(model.surfaces)
@@ -72,7 +73,7 @@ def test_obj_has_an_object_for_every_patch_and_faces_within_its_vertices(model, 
 
 
 def test_ids_and_versions_of_live_models_are_kept(model, tmp_path):
-    parquet = pytest.importorskip('pyarrow.parquet')
+    parquet = extras.load('pyarrow.parquet')
     live = replace(
         model,
         planes=[replace(plane, id=plane.id + 1000) for plane in model.planes],
@@ -104,7 +105,7 @@ def test_a_missing_directory_is_refused(model, tmp_path):
 
 @pytest.fixture(scope='module')
 def ezdxf():
-    return pytest.importorskip('ezdxf', reason='ezdxf is not installed (extra formats)')
+    return extras.load('ezdxf')
 
 
 @pytest.fixture(scope='module')

@@ -12,9 +12,10 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.model_step import parts, signed_area, write_step
 from surfel_mapper.models import fit, Surface
 from surfel_mapper.models.outlines import local_outline
+from test import extras
 from test.models.scenes import A, room, VIEW
 
-OCP = pytest.importorskip('OCP', reason='cadquery-ocp is not installed (extra step)')
+OCP = extras.load('OCP')
 
 SHIFT = np.array([30.0, -20.0, 5.0])
 

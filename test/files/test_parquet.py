@@ -13,9 +13,10 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import parquet
 from surfel_mapper.files.parquet import METADATA, read_map, write_map
 from surfel_mapper.files.parquet_tiles import write_tile
+from test import extras
 
-pa = pytest.importorskip('pyarrow')
-pq = pytest.importorskip('pyarrow.parquet')
+pa = extras.load('pyarrow')
+pq = extras.load('pyarrow.parquet')
 
 
 def some_map(columns=(), voxel_size_m=0.5):

@@ -27,6 +27,9 @@ from surfel_mapper.files.parquet_tiles import (
 )
 from surfel_mapper.mapping.moments import pack_keys, ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from test import extras
+
+pytestmark = extras.needs('pyarrow')
 
 
 def scattered(num=4000, seed=1, voxel_size_m=0.5, columns=()):

@@ -248,13 +248,6 @@ def las() -> list[bytes]:
     return found
 
 
-def tile() -> list[bytes]:
-    """Return a tile of a map."""
-    from surfel_mapper.files.parquet_tiles import write_tile
-
-    return [written(lambda path: write_tile(path, small_map()[0]), 'a.parquet')]
-
-
 def shown() -> list[bytes]:
     """Return triangles as OBJ, STL and glTF, after a byte for the kind."""
     obj = b'v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1 3//1\n'

@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 import tempfile
 import time
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -22,13 +21,11 @@ from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.parquet import read_map
 from surfel_mapper.files.scan_files import read_scan
-from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.files.tsdf_state import load_tsdf
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.chain import example as example_scan
 from test.fuzz.memory import reset_peak, resident
-from test.fuzz.source import Source
 
 MOST_MESSAGES = 5000
 """Number of messages read of a bag."""
@@ -143,61 +140,6 @@ def state_bytes(data: bytes) -> None:
     refused(read_state, 'input.npz', data)
 
 
-def state_content(data: bytes) -> None:
-    """Read a state with the right hash but impossible content."""
-    source = Source(data)
-    base = Path(folder().name, 'base.npz')
-    kind = source.pick(('map', 'tsdf'))
-    base.write_bytes(bases()[kind])
-    arrays, attributes = load_state(base)
-    for _ in range(1 + source.below(3)):
-        if source.chance(2):
-            attributes[source.pick(sorted(attributes))] = source.pick(
-                (None, -1, 0, 10**6, 2**70, 1e308, 'x', [], {}, ['rgb'], [[1]], True, 0.2)
-            )
-        else:
-            name = source.pick(sorted(arrays))
-            arrays[name] = changed(source, arrays[name])
-        if source.chance(8):
-            del attributes[source.pick(sorted(attributes))]
-        if source.chance(8):
-            del arrays[source.pick(sorted(arrays))]
-    path = Path(folder().name, 'content.npz')
-    try:
-        save_state(path, arrays, attributes)
-    except (ValueError, TypeError):
-        return
-    read_state(path)
-
-
-def changed(source: Source, array: np.ndarray) -> np.ndarray:
-    """Return an array with another type, shape or content."""
-    array = array.copy()
-    kind = source.below(6)
-    if kind == 0:
-        return array.astype(source.pick(('i1', 'u8', 'f8', '?', 'c16', 'S3', 'U2', '<i4')))
-    if kind == 1:
-        return array.reshape(source.pick(((-1,), (1, -1), (-1, 1))))
-    if kind == 2:
-        return array.reshape(-1)[0] if array.size else array[:0]
-    if kind == 3:
-        return array[: source.below(len(array) + 1)]
-    flat = array.reshape(-1)
-    if len(flat):
-        value = source.real() if array.dtype.kind == 'f' else source.number()
-        with np.errstate(over='ignore'):
-            flat[source.below(len(flat))] = np.array([value]).astype(array.dtype, copy=False)[0]
-    return array
-
-
-@cache
-def bases() -> dict[str, bytes]:
-    """Return a small saved map and a small saved TSDF."""
-    from test.fuzz import corpus
-
-    return {'map': corpus.state_bytes()[0], 'tsdf': corpus.tsdf()}
-
-
 def trajectory(data: bytes) -> None:
     """Read poses in every format."""
     for format_ in (None, 'tum', 'kitti', 'csv'):
@@ -245,15 +187,3 @@ def map_url(data: bytes) -> None:
     except ConfigError:
         return
     assert found.resolve().is_relative_to(directory.resolve()), found
-
-
-def map_name(data: bytes) -> None:
-    """Take a text as a name to save under: it is a plain name, or refused."""
-    text = data.decode(errors='replace')
-    source = SimpleNamespace(name=text)
-    with contextlib.suppress(ConfigError):
-        from surfel_mapper.config import OutputConfig
-
-        found = OutputConfig(map_name=source.name).map_name
-        assert Path('/a', f'{found}.ply').parent == Path('/a'), found
-        assert '\0' not in found

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from test.fuzz import corpus, files, messages, point_files, structures
+from test.fuzz import corpus, files, messages, point_files
 
 
 class Harness(NamedTuple):
@@ -16,7 +16,7 @@ class Harness(NamedTuple):
     one_input: Callable[[bytes], None]
     corpus: Callable[[], list[bytes]]
     number: int
-    """Mutations in the tests: about half a second of each; ``make fuzz`` searches on."""
+    """Mutations in the tests: about half a second of each harness."""
 
 
 HARNESSES = {
@@ -35,29 +35,12 @@ HARNESSES = {
     'raw': Harness(files.points_raw, corpus.points_raw, 500),
     'parquet': Harness(files.parquet, corpus.parquet, 40),
     'state_bytes': Harness(files.state_bytes, corpus.state_bytes, 75),
-    'state_content': Harness(files.state_content, corpus.noise, 40),
     'trajectory': Harness(files.trajectory, corpus.trajectory, 200),
     'kitti_times': Harness(files.kitti_times, corpus.kitti_times, 200),
     'settings': Harness(files.settings, corpus.settings, 150),
     'chain': Harness(files.chain, corpus.chain, 150),
-    'mcap_structure': Harness(structures.mcap, corpus.noise, 30),
-    'ros1_structure': Harness(structures.ros1, corpus.noise, 50),
-    'sqlite_structure': Harness(structures.sqlite, corpus.noise, 50),
-    'png_structure': Harness(structures.png, corpus.noise, 50),
-    'yaml_structure': Harness(structures.yaml, corpus.noise, 12),
-    'npz_structure': Harness(structures.npz, corpus.noise, 100),
-    'cloud_structure': Harness(structures.cloud, corpus.noise, 100),
-    'data_set': Harness(structures.data_set, corpus.noise, 200),
-    'parquet_structure': Harness(structures.parquet, corpus.noise, 20),
     'las': Harness(point_files.las, corpus.las, 75),
-    'las_structure': Harness(point_files.las_structure, corpus.noise, 40),
-    'ply_structure': Harness(point_files.ply_structure, corpus.noise, 150),
-    'pcd_structure': Harness(point_files.pcd_structure, corpus.noise, 150),
-    'trajectory_structure': Harness(point_files.trajectory_structure, corpus.noise, 50),
-    'long_table': Harness(point_files.long_table, corpus.noise, 20),
-    'tile': Harness(point_files.tile, corpus.tile, 30),
     'shown': Harness(point_files.shown, corpus.shown, 150),
     'packets': Harness(point_files.packets, corpus.noise, 100),
     'map_url': Harness(files.map_url, corpus.map_url, 500),
-    'map_name': Harness(files.map_name, corpus.map_url, 500),
 }

@@ -61,7 +61,7 @@ def checked_cost(name: str, one_input: Callable[[bytes], None], data: bytes) -> 
 
 
 def cost(one_input: Callable[[bytes], None], data: bytes) -> Cost:
-    """Return the cost of an input; of harnesses that build files only the reads count."""
+    """Return the cost of an input; of a file only its reading counts."""
     reset_peak()
     files.READS.clear()
     before, start_s = resident('VmRSS'), time.process_time()

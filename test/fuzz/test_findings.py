@@ -54,9 +54,9 @@ from surfel_mapper.offline.datasets import content_of
 from surfel_mapper.poses import buffer as buffer_module
 from surfel_mapper.simulation.world import World
 from surfel_mapper.viz.contents import contents
+from test import extras
 from test.bags import recorded
 from test.fuzz import corpus
-from test.fuzz.findings_table import finding
 from test.fuzz.memory import reset_peak, resident
 
 LAUGHS = 'a0: &a0 [x, x]\n' + ''.join(
@@ -95,11 +95,6 @@ def test_yaml_that_expands_or_is_malformed_is_refused(tmp_path, text):
         ('map: [' + '1, ' * 300_000 + '1]', 'over 20000 nodes in line 1'),
     ],
     ids=['base 60', 'nodes'],
-)
-@finding(
-    'YAML with a number of 300,000 digits of base 60, or as many nodes',
-    before='over 5 minutes',
-    now='refused: below 1 s',
 )
 def test_yaml_that_takes_long_is_refused(tmp_path, text, problem):
     """A number of base 60 takes hours, a node of a list 10 us."""
@@ -329,9 +324,6 @@ XYZ = [Field(name, 4 * place, 7, 1) for place, name in enumerate('xyz')]
     ],
     ids=['all', 'partly', 'z'],
 )
-@finding(
-    'PointCloud2 of 3 MB with 200 overlapping fields', before='5.7 GB', now='refused: below 1 MB'
-)
 def test_fields_that_overlap_are_refused_before_memory_is_allocated(others):
     message = cloud_of([*XYZ, *others], 3000, 1012)
     _, peak = peak_of(lambda: to_scan(message))
@@ -356,11 +348,6 @@ def test_columns_that_are_not_read_are_not_copied():
         tracemalloc.stop()
 
 
-@finding(
-    '`~/load_map` of a path of 1 MB, 350,000 directories',
-    before='stopped mapping for 20 s',
-    now='refused: 4,096 characters',
-)
 def test_a_path_of_hundreds_of_thousands_of_directories_is_not_resolved(tmp_path, monkeypatch):
     pytest.importorskip('rclpy')
     from surfel_mapper.ros.map_files import is_inside, path_inside
@@ -373,7 +360,6 @@ def test_a_path_of_hundreds_of_thousands_of_directories_is_not_resolved(tmp_path
 
 
 @pytest.mark.parametrize('name', ['/dev/zero', 'pipe', 'large.yaml'])
-@finding('`filters: /dev/zero`, or a pipe', before='ended the node', now='refused: below 10 MB')
 def test_settings_are_read_from_small_regular_files_only(tmp_path, name):
     os.mkfifo(tmp_path / 'pipe')
     (tmp_path / 'large.yaml').write_bytes(b'# ' + bytes(b'x' * (1 << 20)))
@@ -478,11 +464,6 @@ def mcap_of_empty_messages(num_chunks, num_messages):
     return b'\x89MCAP0\r\n' + record(1, text(b'ros2') + text(b'')) + chunk * num_chunks
 
 
-@finding(
-    'mcap.zstd or db3.zstd of 1 MB, 116,000 frames of nothing',
-    before='1.4 s, 12 us a frame',
-    now='refused: 1,000 frames and one per 4 KiB',
-)
 def test_a_packed_file_of_empty_frames_is_refused(tmp_path, monkeypatch):
     zstd = import_zstd()
     path, made = tmp_path / 'a.zstd', []
@@ -501,7 +482,7 @@ def test_a_packed_file_of_empty_frames_is_refused(tmp_path, monkeypatch):
 
 def test_a_tile_that_does_not_state_its_voxels_is_refused(tmp_path):
     """Statistics without a least value, as damage leaves them, were a TypeError."""
-    parquet = pytest.importorskip('pyarrow.parquet')
+    parquet = extras.load('pyarrow.parquet')
     from surfel_mapper.files.parquet_tiles import dataset_digest, write_tile
 
     surfel_map = SurfelMap(0.5)
@@ -514,7 +495,6 @@ def test_a_tile_that_does_not_state_its_voxels_is_refused(tmp_path):
         dataset_digest(tmp_path)
 
 
-@finding('LAZ of version 0.4, 766 bytes', before='1.7 GB', now='refused: below 10 MB')
 def test_las_of_another_version_is_refused(tmp_path):
     """Laspy takes the count of version 1.4 by the second number, and sizes of layers are read."""
     laspy = pytest.importorskip('laspy')
@@ -532,11 +512,6 @@ def test_las_of_another_version_is_refused(tmp_path):
     assert peak < 10_000_000
 
 
-@finding(
-    'mcap of 46 kB, 8 chunks of 60 MB of empty messages, no index',
-    before='3.5 GB, 128 s',
-    now='refused: below 300 MB, 5 s',
-)
 def test_chunks_of_empty_messages_are_refused_before_the_index_fills_memory(tmp_path):
     path = tmp_path / 'a.mcap'
     path.write_bytes(mcap_of_empty_messages(8, 1_900_000))
@@ -615,11 +590,6 @@ def test_more_messages_than_a_file_has_room_for_are_refused(tmp_path):
     assert seconds < 3.0  # .2 s
 
 
-@finding(
-    'mcap with an index, 4 such chunks that overlap in time',
-    before='not tried',
-    now='refused: below 200 MB, 10 s',
-)
 def test_overlapping_chunks_of_an_indexed_mcap_are_not_held_at_once(tmp_path):
     """Rosbags unpacks all chunks of a span into lists of objects: 500 MB for each of these."""
     path = tmp_path / 'a.mcap'
@@ -700,11 +670,6 @@ def test_the_same_chunk_many_times_in_the_index_of_ros1_is_read_once(tmp_path):
     ],
     ids=['view', 'other view', 'computed', 'trigger'],
 )
-@finding(
-    'sqlite3 whose table of messages is a view without end, or computed',
-    before='not tried',
-    now='refused: below 20 MB, 1 s',
-)
 def test_a_database_that_computes_its_rows_is_refused(tmp_path, statements, problem):
     path = tmp_path / 'a.db3'
     path.write_bytes(corpus.sqlite()[0])
@@ -772,11 +737,6 @@ def test_a_small_database_is_read_in_order_of_time(small_database):
     ('name', 'problem'),
     [('messages', 'more messages than a file of'), ('by_time', 'reading took over 0.5 s')],
 )
-@finding(
-    'sqlite3 of 40 kB whose pages lead to each other, 50^8 rows',
-    before='not tried',
-    now='refused: below 20 MB, 3 s',
-)
 def test_a_database_of_rows_without_end_is_refused(small_database, monkeypatch, name, problem):
     """Rosbags counts 50^8 rows."""
     monkeypatch.setattr(budget, 'FLOOR_S', 0.5)
@@ -824,7 +784,7 @@ def test_large_chunks_are_unpacked_one_at_a_time(tmp_path, monkeypatch):
 
 @pytest.fixture
 def parquet_map(tmp_path):
-    pytest.importorskip('pyarrow')
+    extras.load('pyarrow')
     from surfel_mapper.files.parquet import write_map
 
     path = tmp_path / 'a.parquet'
@@ -856,7 +816,6 @@ def test_columns_of_a_wrong_type_are_refused_before_they_are_read(parquet_map, k
         read_map(parquet_map)
 
 
-@finding('Parquet of 3,000,000 equal rows', before='all rows unpacked', now='refused: below 64 MB')
 def test_rows_that_repeat_are_refused_before_they_are_read(parquet_map):
     from surfel_mapper.files.parquet import read_map
 
@@ -908,11 +867,6 @@ def png(width, height, mode='L'):
     return SimpleNamespace(header=None, format='mono8; png compressed', data=file.getvalue())
 
 
-@finding(
-    'PNG of 35 kB, 6000 x 6000 pixels, with or without calibration',
-    before='36 million pixels unpacked',
-    now='refused: below 10 MB',
-)
 def test_images_are_refused_by_the_size_in_their_header():
     large = png(6000, 6000)
     assert len(large.data) < 100_000
@@ -924,11 +878,6 @@ def test_images_are_refused_by_the_size_in_their_header():
     assert peak < 10_000_000
 
 
-@finding(
-    'PNG of 1 bit a pixel, of a palette or with alpha, 3000 x 3000 pixels, 44 kB',
-    before='99 to 126 MB',
-    now='refused: below 10 MB',
-)
 @pytest.mark.parametrize('mode', ['1', 'P', 'LA', 'RGBA', 'RGB'])
 def test_images_that_are_converted_are_charged_for_it(mode):
     large, small = png(3000, 3000, mode), png(1500, 1500, mode)
@@ -1068,11 +1017,6 @@ def test_counts_in_the_header_of_las_are_compared_with_the_file(
         (lambda c, start, table, record: c.__delitem__(slice(start + 60, None)), 'chunks'),
     ],
     ids=['chunks', 'place', 'items', 'layer', 'count', 'cut'],
-)
-@finding(
-    'LAZ of 643 bytes with 2^32 - 1 chunks, or chunks of one point',
-    before='ended the process; 4.3 GB',
-    now='refused',
 )
 def test_sizes_in_laz_are_compared_with_the_file(tmp_path, change, problem):
     """Its decoder ended the process if it could not get the memory for the chunks stated."""

@@ -3,7 +3,7 @@
 """
 The corpus of every harness and seeded mutations of it: our errors only, and bounded memory.
 
-The same inputs in every run, about 10,000; ``make fuzz`` searches on.
+The same inputs in every run, about 10,000.
 """
 
 from __future__ import annotations
@@ -13,19 +13,16 @@ import logging
 import numpy as np
 import pytest
 
+from test import extras
 from test.fuzz.harnesses import HARNESSES
 from test.fuzz.mutations import mutations
 from test.fuzz.oracle import checked_cost, Cost
 
 NEEDED = {
     'parquet': 'pyarrow',
-    'parquet_structure': 'pyarrow',
     'pcd': 'lzf',
     'mcap': 'mcap',
     'las': 'laspy',
-    'las_structure': 'laspy',
-    'pcd_structure': 'lzf',
-    'tile': 'pyarrow',
     'packets': 'ouster.sdk',
     'map_url': 'rclpy',
 }
@@ -41,7 +38,7 @@ def quiet():
 
 def harness(name):
     if name in NEEDED:
-        pytest.importorskip(NEEDED[name], reason=f'{NEEDED[name]} is not installed')
+        extras.load(NEEDED[name])
     return HARNESSES[name]
 
 

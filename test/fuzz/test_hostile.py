@@ -52,9 +52,10 @@ from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns, parse_
 from surfel_mapper.messages.poses import raw_poses
 from surfel_mapper.offline.datasets import nuscenes
 from surfel_mapper.simulation.world import World
+from test import extras
 from test.bags.recorded import drive, ROS1, write_ros1
+from test.bags.records import record, text
 from test.fuzz import corpus
-from test.fuzz.structures import record, text
 
 TIMEOUT_S = 120
 
@@ -424,7 +425,7 @@ def test_two_members_of_one_name_are_refused(saved):
 
 
 def test_columns_that_no_map_has_are_refused(tmp_path):
-    parquet = pytest.importorskip('pyarrow.parquet')
+    parquet = extras.load('pyarrow.parquet')
     from surfel_mapper.files.parquet import read_map, read_moments
 
     path = tmp_path / 'map.parquet'

@@ -21,6 +21,7 @@ from surfel_mapper.errors import SurfelMapperError
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.parquet import read_map
+from test import extras
 from test.fuzz import corpus
 
 NUM_CHANGES = 120
@@ -68,7 +69,7 @@ EXACT = {
 def test_a_change_in_a_file_with_checksums_is_harmless_or_told(tmp_path, caplog, name):
     make, read = EXACT[name]
     if 'parquet' in name:
-        pytest.importorskip('pyarrow')
+        extras.load('pyarrow')
     content, path = make(), tmp_path / name
     path.write_bytes(content)
     expected = read(path)

@@ -17,6 +17,7 @@ from surfel_mapper.pipeline.checkpoints import checkpoint_paths, Checkpoints, du
 from surfel_mapper.pipeline.regions import Box
 from surfel_mapper.pipeline.saved_state import load_mapper, save_mapper
 from surfel_mapper.ros.map_files import load_map, save_map
+from test import extras
 from test.layers.test_distance_field import insert, LIDAR, mapper_with
 
 
@@ -59,7 +60,7 @@ def test_a_map_without_a_field_leaves_an_empty_one(tmp_path):
 
 
 def test_the_field_of_an_earlier_run_is_not_loaded_with_newer_tiles(tmp_path):
-    pytest.importorskip('pyarrow', reason='tiles need pyarrow (extra formats)')
+    extras.load('pyarrow')
     mapper, later = mapper_with(), mapper_with()
     insert(mapper, 1)
     save_mapper(tmp_path / 'map.npz', mapper)

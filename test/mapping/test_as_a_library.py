@@ -28,6 +28,7 @@ from surfel_mapper import (
 )
 from surfel_mapper.errors import ConfigError, DependencyError, FileFormatError, MapError
 from surfel_mapper.pipeline import Mapper as PipelineMapper
+from test import extras
 
 ORIGIN = [1.0, 1.0, 3.0]
 
@@ -48,7 +49,7 @@ def surfel_map():
 @pytest.mark.parametrize('name', ['map.npz', 'map.parquet'])
 def test_maps_are_saved_and_loaded_exactly(surfel_map, tmp_path, name):
     if name.endswith('parquet'):
-        pytest.importorskip('pyarrow')
+        extras.load('pyarrow')
     assert surfel_map.save(str(tmp_path / name)) == surfel_map.digest()
     assert SurfelMap.load(str(tmp_path / name)) == surfel_map
     if name == 'map.npz':
@@ -135,7 +136,7 @@ def test_tables_have_every_column(surfel_map):
 
 
 def test_pandas_has_the_same_columns(surfel_map):
-    pytest.importorskip('pandas')
+    extras.load('pandas')
     surfels = surfel_map.surfels()
     frame = surfels.to_pandas()
     assert tuple(frame.columns) == surfels.to_numpy().dtype.names

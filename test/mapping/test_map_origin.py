@@ -11,6 +11,7 @@ from surfel_mapper import SurfelMap
 from surfel_mapper.errors import MapError, MapLimitError
 from surfel_mapper.files import parquet, pcd, ply
 from surfel_mapper.files.map_state import load_map, save_map
+from test import extras
 
 UTM = np.array([400_000.0, 5_400_000.0, 250.0])
 
@@ -95,7 +96,7 @@ def test_state_and_parquet_keep_the_origin(tmp_path):
     surfel_map = map_at(UTM)
     save_map(tmp_path / 'map.npz', surfel_map)
     assert load_map(tmp_path / 'map.npz')[0] == surfel_map
-    pytest.importorskip('pyarrow')
+    extras.load('pyarrow')
     parquet.write_map(tmp_path / 'map.parquet', surfel_map)
     assert parquet.read_map(tmp_path / 'map.parquet') == surfel_map
     from pyarrow.parquet import read_table

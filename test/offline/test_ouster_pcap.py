@@ -17,6 +17,7 @@ from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.request import Request
+from test import extras
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 
@@ -59,8 +60,8 @@ def points_of(number, info):
 
 @pytest.fixture(scope='module')
 def capture(tmp_path_factory):
-    core = pytest.importorskip('ouster.sdk.core', reason='ouster-sdk is not installed')
-    pcap = pytest.importorskip('ouster.sdk.pcap')
+    core = extras.load('ouster.sdk.core')
+    pcap = extras.load('ouster.sdk.pcap')
     info = core.SensorInfo.from_default(core.LidarMode('512x10'))
     info.format.udp_profile_lidar = core.UDPProfileLidar.RNG19_RFL8_SIG16_NIR16
     info.config.udp_port_lidar, info.config.udp_port_imu = 7502, 7503

@@ -26,6 +26,7 @@ from surfel_mapper.offline.replay import ReplayOptions, started_mapper
 from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import as_text
 from surfel_mapper.viz import viewer
+from test import extras
 from test.bags.recorded import drive, NUM_SCANS, START_NS, write_rosbag2
 
 pytestmark = pytest.mark.usefixtures('undrawn')
@@ -128,7 +129,7 @@ def test_files_that_cannot_be_written_are_refused_before_the_first_scan(
     bag, tmp_path, option, place
 ):
     if option == 'rrd':
-        pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
+        extras.load('rerun')
     (tmp_path / 'file').touch()
     with pytest.raises(FileFormatError, match='cannot be written'):
         replay(
@@ -152,7 +153,7 @@ def test_formats_without_their_package_are_refused_before_the_first_scan(
 
 
 def test_a_viewer_that_closes_does_not_end_the_replay(bag, tmp_path, monkeypatch, caplog):
-    pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
+    extras.load('rerun')
     calls = []
 
     def add(self, update):
@@ -208,7 +209,7 @@ def test_the_map_is_written_before_a_picture_that_fails(bag, tmp_path, monkeypat
 
 
 def test_the_default_output_can_be_read_back(bag, tmp_path, capsys, caplog):
-    pytest.importorskip('pyarrow', reason='merging needs pyarrow (extra formats)')
+    extras.load('pyarrow')
     out, half = tmp_path / 'out', tmp_path / 'half'
     digest = replay(bag, output=out).summary['digest']
     replay(Request(path=bag, start_s=0.25), output=half)

@@ -26,6 +26,7 @@ from surfel_mapper.ros import node_view
 from surfel_mapper.viz.discs import DrawnDiscs
 from surfel_mapper.viz.scene import Scene
 from surfel_mapper.viz.server import free_port, LIVE
+from test import extras
 from test.ros.driving import arguments, drive, mapped, send
 from test.ros.live import cloud, LATCHED, NODE, room, START_NS, TIMEOUT_S
 
@@ -34,7 +35,7 @@ NUM_SCANS = 6
 
 @pytest.fixture(autouse=True)
 def _rerun():
-    pytest.importorskip('rerun.chunk', reason='rerun with a reader of its files')
+    extras.load('rerun.chunk')
 
 
 def in_order(places):

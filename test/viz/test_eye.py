@@ -19,6 +19,7 @@ from surfel_mapper.viz.eye import followed, target
 from surfel_mapper.viz.scene import Scene
 from surfel_mapper.viz.server import free_port, rerun_program
 from surfel_mapper.viz.show import show_contents, Shown
+from test import extras
 from test.viz.test_show import ground_map
 
 WAIT_S = 60.0
@@ -26,7 +27,7 @@ WAIT_S = 60.0
 
 @pytest.fixture(autouse=True, scope='module')
 def needs_a_viewer_that_tells_its_eye():
-    experimental = pytest.importorskip('rerun.experimental', reason='rerun is not installed')
+    experimental = extras.load('rerun.experimental')
     if not hasattr(getattr(experimental, 'ViewerClient', None), 'get_blueprint'):
         pytest.skip('this rerun cannot say where its eye is')
 

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 import io
 import os
 import re
@@ -15,6 +14,7 @@ import numpy as np
 from PIL import Image
 import pytest
 
+from test import extras
 from test.viz.test_mesh import sphere
 from test.viz.test_report import plane, report
 
@@ -25,9 +25,7 @@ pytestmark = [
     pytest.mark.skipif(
         BROWSER is None, reason=f'no browser on the PATH: none of {", ".join(NAMES)}'
     ),
-    pytest.mark.skipif(
-        find_spec('playwright') is None, reason='playwright is not installed (extra test)'
-    ),
+    extras.needs('playwright'),
 ]
 
 SOFTWARE_GL = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader')

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 import re
 
 import numpy as np
@@ -23,10 +22,11 @@ from surfel_mapper.viz.detail import LEVELS
 from surfel_mapper.viz.discs import CORNERS
 from surfel_mapper.viz.scene import Scene
 from surfel_mapper.viz.show import show_contents
+from test import extras
 from test.bags.recorded import drive, write_rosbag2
 from test.viz.test_mesh import sphere
 
-pytestmark = pytest.mark.skipif(find_spec('pyarrow') is None, reason='pyarrow is not installed')
+pytestmark = extras.needs('pyarrow')
 
 UTM = np.array([400_384.0, 5_400_576.0, 256.0])
 
@@ -35,7 +35,7 @@ START_NS = 1_700_000_000_000_000_000
 
 @pytest.fixture(autouse=True)
 def _rerun():
-    pytest.importorskip('rerun.chunk', reason='rerun with a reader of its files')
+    extras.load('rerun.chunk')
 
 
 def ground(number=20_000, seed=0):

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 import io
 import os
 from pathlib import Path
@@ -17,16 +16,14 @@ import numpy as np
 from PIL import Image
 import pytest
 
+from test import extras
 from test.viz.test_report_browser import BROWSER, browser, picture_until, WAIT_S
 from test.viz.test_show import ground_map
 from test.viz.test_viewer import addresses
 
 pytestmark = [
     pytest.mark.skipif(BROWSER is None, reason='no browser on the PATH'),
-    pytest.mark.skipif(
-        not all(map(find_spec, ('playwright', 'rerun'))),
-        reason='playwright or rerun is not installed',
-    ),
+    extras.needs('playwright', 'rerun'),
 ]
 
 __all__ = ['browser']  # a fixture

@@ -22,12 +22,11 @@ from surfel_mapper.scan import Scan
 from surfel_mapper.viz import scene
 from surfel_mapper.viz.server import LIVE, started_server
 from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
+from test import extras
 from test.bags.recorded import drive, write_rosbag2
 from test.layers.test_distance_field import insert, mapper_with
 
-pytestmark = pytest.mark.skipif(
-    find_spec('rerun') is None, reason='rerun is not installed (extra viewer)'
-)
+pytestmark = extras.needs('rerun')
 
 PROGRAM = find_spec('rerun') and Path(find_spec('rerun_cli').origin).with_name('rerun')
 """The program itself: `python -m rerun` takes .6 s to start it."""

@@ -1,40 +1,29 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The writers of files, which fail or are killed at one of their steps.
-
-``python -m test.fuzz.writers FOLDER STRIDE`` has every writer killed at its steps, in a process
-that holds little beside them: to fork one takes 20 ms of processor time, and 80 to 400 ms in a
-process that has collected all tests.
-"""
+"""A save that fails at any of its steps leaves the old file or the new one."""
 
 from __future__ import annotations
 
 import errno
-from importlib.util import find_spec
 import os
-from pathlib import Path
-import signal
-import sys
 
 import numpy as np
 import pytest
 
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import atomic, pcd, ply
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.simulation.world import World
-
-MOST_KILLS = 20
-"""Steps of a writer at which it is killed unless each is tried."""
+from test import extras
 
 
 class Steps:
     """Counts the steps of writing a file, and fails at one of them."""
 
-    def __init__(self, monkeypatch, fail_at=None, kill=False):
+    def __init__(self, monkeypatch, fail_at=None):
         self.done = 0
-        self._fail_at, self._kill = fail_at, kill
+        self._fail_at = fail_at
         self._open, self._fsync, self._replace = open, os.fsync, os.replace
         monkeypatch.setattr(atomic, 'open', self.open, raising=False)
         monkeypatch.setattr(atomic.os, 'fsync', self.wrapped(os.fsync))
@@ -43,8 +32,6 @@ class Steps:
     def step(self):
         self.done += 1
         if self.done - 1 == self._fail_at:
-            if self._kill:
-                os.kill(os.getpid(), signal.SIGKILL)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def wrapped(self, function):
@@ -84,19 +71,14 @@ class StepFile:
         return getattr(self._file, name)
 
 
-def map_of(seed, columns=(), threads=1):
-    surfel_map = SurfelMap(0.5, columns=columns, threads=threads)
-    points = np.random.default_rng(seed).uniform(-2.0, 2.0, (50, 3))
-    surfel_map.add(points, columns=made_columns(points))
+def map_of(seed):
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add(np.random.default_rng(seed).uniform(-2.0, 2.0, (50, 3)))
     return surfel_map
 
 
-def made_columns(points):
-    """Return intensity and colours of points, all different from 0."""
-    return {'intensity': 1.0 + np.arange(len(points)), 'rgb': np.full((len(points), 3), 7)}
-
-
 def write_parquet(path, surfel_map):
+    extras.load('pyarrow')
     from surfel_mapper.files.parquet import write_map
 
     write_map(path, surfel_map)
@@ -150,33 +132,17 @@ class Written:
         return [file for file in self.path.parent.iterdir() if file != self.path]
 
 
-def is_killed(write, number):
-    """Write in a process that is killed at a step; return whether it came to that."""
-    child = os.fork()
-    if not child:
-        Steps(pytest.MonkeyPatch(), number, kill=True)
-        try:
-            write()
-        finally:
-            os._exit(0)
-    return os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
-
-
-def main(folder, stride):
-    """Kill each writer at steps a stride apart, 0 for MOST_KILLS of them, and check its file."""
-    for name in WRITERS:
-        if name == 'parquet' and find_spec('pyarrow') is None:
-            continue
-        path = Path(folder, name, 'a')
-        path.parent.mkdir()
-        file = Written(name, path)
-        numbers = range(0, file.num_steps, int(stride) or -(-file.num_steps // MOST_KILLS))
-        for number in numbers:
-            file.check(is_killed(file.write_new, number), number)
-            for left in file.left():
-                left.unlink()
-        print(name, len(numbers))
-
-
-if __name__ == '__main__':
-    main(*sys.argv[1:])
+@pytest.mark.parametrize('name', WRITERS)
+def test_a_save_that_fails_at_any_step_leaves_the_old_file_or_the_new(tmp_path, name):
+    file = Written(name, tmp_path / 'a')
+    assert file.num_steps >= 5
+    for number in range(file.num_steps):
+        failed = False
+        with pytest.MonkeyPatch.context() as patch:
+            Steps(patch, number)
+            try:
+                file.write_new()
+            except FileFormatError:
+                failed = True
+        file.check(failed, number)
+        assert not file.left(), (name, number)
