@@ -103,26 +103,32 @@ RUNNER = [
     'hypothesis>=6.98',  # random sequences of adds and removes
 ]
 
+# What `make test` needs. Tests of the extras below are skipped without them.
 TEST = [
     *RUNNER,
+    *LAS,
+    *LOOPS,
+    *GLTF,
+    'python-neo-lzf>=0.3',  # scans in compressed PCD files
+    'pytest-xdist>=3.7',  # several processes: those of ROS wait, those of the others calculate
+    'plyfile>=1.0.1',  # an independent reader of what we write
+    'pypcd4>=1.1',  # likewise
+    'mcap>=1.1',  # an independent writer of what we read
+]
+
+# The tests of packages that take 1.2 GB more: `make test-extras`.
+TEST_EXTRAS = [
+    *TEST,
     *FORMATS,
     *CLUSTER,
-    *LAS,
-    *STEP,
-    *LOOPS,
     *ALIGN,
     *VIEWER,
-    *GLTF,
     *NOTEBOOKS,
     # an independent reader of trajectories, and judge of their errors; GPL-3, so it is used by the
     # tests alone, and nothing that is installed with the package imports it
     'evo>=1.28',
     'playwright>=1.40',  # opens report.html in a browser, which it does not bring
-    'pytest-xdist>=3.7',  # two processes: those of ROS wait, those of the others calculate
-    'plyfile>=1.0.1',  # an independent reader of what we write
-    'pypcd4>=1.1',  # likewise
     'pandas>=2.0',  # Surfels.to_pandas
-    'mcap>=1.1',  # an independent writer of what we read
 ]
 
 # Pinned, so that every machine reaches the same verdict; `make lint` keeps them in an environment
@@ -132,12 +138,6 @@ LINT = [
     'ruff==0.17.6',  # style and format; its rules are in .ruff.toml
     'mypy==2.4.1',  # types; configured in setup.cfg
     'numpy==2.2.6',  # the newest for all of Python 3.10 to 3.13
-]
-
-FUZZ = [
-    # searches for inputs that break readers, led by the branches they take; has wheels for some
-    # Pythons only, which is why the tests do without it
-    'atheris>=2.3',
 ]
 
 DOCS = [
@@ -195,9 +195,9 @@ setup(
         'notebooks': NOTEBOOKS,
         'ros': ROS,
         'test': TEST,
+        'test_extras': TEST_EXTRAS,
         'lint': LINT,
         'docs': DOCS,
-        'fuzz': FUZZ,
     },
     entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.main:main']},
     data_files=[
