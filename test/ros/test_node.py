@@ -123,6 +123,8 @@ def test_bad_clouds_are_counted_and_valid_ones_mapped(start, peer):
         stamp_ns = START_NS + number * PERIOD_NS + PERIOD_NS // 2
         _, bad = bad_clouds(stamp_ns)[number]
         send(peer, [pair, (bad, odometry(stamp_ns, (0.2 * number, 0.0, 0.0)))])
+        if number % 5 == 4:  # a subscription keeps 20 clouds
+            peer.diagnosis({'scans.received': 2 * number + 2})
 
     _, values = peer.diagnosis({'scans.received': 2 * len(causes)})
 
