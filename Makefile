@@ -50,7 +50,7 @@ demo: $(or $(wildcard $(STAMP)),$(DEMO_STAMP))  ## simulate a street, map it liv
 TESTS = OPENBLAS_NUM_THREADS=1 PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
 	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
-test: $(STAMP)  ## all tests but those of optional packages that take 1.2 GB
+test: $(STAMP)  ## all tests but those of optional packages that take 1.1 GB
 	$(TESTS) --durations=5 $(PYTEST_ARGS)
 
 test-extras: $(EXTRAS_STAMP)  ## the files of tests that `make test` skips or runs in part
@@ -126,14 +126,14 @@ clean:  ## remove the environment and everything built
 $(STAMP): setup.py pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 	{ echo 'Python 3.10 or newer is needed: make PYTHON=python3.12 ...' >&2; exit 1; }
-	@echo 'Once: packages from PyPI into $(VENV)/, about TODO MB to download, TODO GB on the disk'
+	@echo 'Once: packages from PyPI into $(VENV)/, about 250 MB to download, 1.0 GB on the disk'
 	$(PYTHON) -m venv $(VENV_FLAGS) $(if $(wildcard $(VENV)/.ready-$(OTHER)),--clear) $(VENV)
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS)]'
 	touch $@
 
 $(EXTRAS_STAMP): $(STAMP)
-	@echo 'Once: optional packages from PyPI into $(VENV)/, about TODO MB to download, TODO GB on the disk'
-	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS),test_extras]'
+	@echo 'Once: optional packages from PyPI into $(VENV)/, about 320 MB to download, 1.1 GB on the disk'
+	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS),full]'
 	$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --upgrade \
 		--target $(OUSTER) 'ouster-sdk>=1,<2' more-itertools
 	touch $@

@@ -116,8 +116,8 @@ TEST = [
     'mcap>=1.1',  # an independent writer of what we read
 ]
 
-# The tests of packages that take 1.2 GB more: `make test-extras`.
-TEST_EXTRAS = [
+# All that the tests need, with optional packages that take 1.1 GB more: `make test-extras`.
+FULL = [
     *TEST,
     *FORMATS,
     *CLUSTER,
@@ -195,7 +195,7 @@ setup(
         'notebooks': NOTEBOOKS,
         'ros': ROS,
         'test': TEST,
-        'test_extras': TEST_EXTRAS,
+        'full': FULL,
         'lint': LINT,
         'docs': DOCS,
     },

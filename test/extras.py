@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Packages of the extra ``test_extras``, which take 1.2 GB: `make test` does without them.
+Packages of the extra ``full``, which take 1.1 GB: `make test` does without them.
 
 `make test-extras` installs them and runs the test files that import this module, so every test
 that they skip elsewhere runs there.

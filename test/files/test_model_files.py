@@ -149,5 +149,6 @@ def test_empty_models_give_an_empty_drawing(ezdxf, tmp_path):
 
 
 def test_dxf_in_a_missing_directory_is_refused(tmp_path):
+    extras.load('ezdxf')
     with pytest.raises(FileFormatError, match='none'):
         write_dxf(tmp_path / 'none' / 'a.dxf', fit(np.empty((0, 3))))
