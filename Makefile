@@ -56,7 +56,7 @@ test: $(STAMP)  ## all tests but those of optional packages that take 1.1 GB
 test-extras: $(EXTRAS_STAMP)  ## the files of tests that `make test` skips or runs in part
 	$(TESTS) -rs $$(grep -rlE --include='test_*.py' 'import (.*, )?extras' test) $(PYTEST_ARGS)
 
-ouster: $(STAMP) $(OUSTER_ENV)/.ready  ## read the packets of an Ouster lidar with the extra `ouster` alone
+ouster: $(EXTRAS_STAMP) $(OUSTER_ENV)/.ready  ## read the packets of an Ouster lidar with the extra `ouster` alone
 	PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
 	SURFEL_MAPPER_OUSTER_PYTHON=$(OUSTER_ENV)/bin/python \
 	$(BIN)/python -m pytest -q test/offline/test_ouster_pcap.py
