@@ -270,11 +270,6 @@ class Node:
                 raise RuntimeError(f'the node did not say {text!r}: {output}')
             time.sleep(0.02)
 
-    def keep_to_one_core(self) -> None:
-        """Run all threads of the node on one core."""
-        for thread in Path(f'/proc/{self._process.pid}/task').iterdir():
-            os.sched_setaffinity(int(thread.name), {0})
-
     def cpu_s(self) -> float:
         """Return the processor time of the node so far."""
         fields = Path(f'/proc/{self._process.pid}/stat').read_text().rpartition(')')[2].split()
