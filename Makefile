@@ -11,7 +11,6 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTHON ?= python3
 PYTEST_ARGS ?=
 TEST_PROCESSES ?= 4
-FUZZ_SECONDS ?= 600
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
 VENV := .venv
@@ -28,6 +27,7 @@ EXTRAS := test
 VENV_FLAGS := --system-site-packages
 endif
 STAMP := $(VENV)/.ready-$(KIND)
+EXTRAS_STAMP := $(VENV)/.extras-$(KIND)
 DEMO_STAMP := $(VENV)/.demo-$(KIND)
 DOCS_STAMP := $(VENV)/.docs-$(KIND)
 LINT := $(VENV)-lint
@@ -37,7 +37,7 @@ LINT_STAMP := $(LINT)/.ready
 OUSTER := $(CURDIR)/$(VENV)/ouster
 OUSTER_ENV := $(CURDIR)/$(VENV)-ouster
 
-.PHONY: demo test ouster boundscheck versions bench ratios soak fuzz lint format docs dist notebooks settings clean
+.PHONY: demo test test-extras ouster boundscheck versions bench soak lint format docs dist notebooks settings clean
 
 # The environment of the tests does too, and the one of the demo becomes it later.
 demo: $(or $(wildcard $(STAMP)),$(DEMO_STAMP))  ## simulate a street, map it live over DDS and from the bag, compare
@@ -47,12 +47,16 @@ demo: $(or $(wildcard $(STAMP)),$(DEMO_STAMP))  ## simulate a street, map it liv
 # one, and has a ROS domain of its own. Four keep two cores busy, as tests of nodes wait for each
 # other. TEST_PROCESSES=0 runs all in this process. A thread of BLAS that waits for work computes:
 # with one in each process the models need a tenth less.
-test: $(STAMP)  ## all tests
-	OPENBLAS_NUM_THREADS=1 PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
-	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder \
-		--durations=5 $(PYTEST_ARGS)
+TESTS = OPENBLAS_NUM_THREADS=1 PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
+	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
-ouster: $(STAMP) $(OUSTER_ENV)/.ready  ## read the packets of an Ouster lidar with the extra `ouster` alone
+test: $(STAMP)  ## all tests but those of optional packages that take 1.1 GB
+	$(TESTS) --durations=5 $(PYTEST_ARGS)
+
+test-extras: $(EXTRAS_STAMP)  ## the files of tests that `make test` skips or runs in part
+	$(TESTS) -rs $$(grep -rlE --include='test_*.py' 'import (.*, )?extras' test) $(PYTEST_ARGS)
+
+ouster: $(EXTRAS_STAMP) $(OUSTER_ENV)/.ready  ## read the packets of an Ouster lidar with the extra `ouster` alone
 	PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
 	SURFEL_MAPPER_OUSTER_PYTHON=$(OUSTER_ENV)/bin/python \
 	$(BIN)/python -m pytest -q test/offline/test_ouster_pcap.py
@@ -79,16 +83,8 @@ versions:  ## one bag, one digest, on every Python of PYTHONS that is there
 bench: $(STAMP)  ## milliseconds a scan
 	$(BIN)/python -m test.bench
 
-ratios: $(STAMP)  ## ratios to plain numpy that fell by more than 15 % since the last release
-	$(BIN)/python -m test.bench --quick --only real --since test/bench/release.txt
-
 soak: $(STAMP)  ## a million scans: does memory grow, do times, does the map drift?
 	$(BIN)/python -m test.soak
-
-fuzz: $(STAMP)  ## ten minutes: let writes and allocations fail, and search for inputs that break readers
-	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[fuzz]'
-	PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
-	$(BIN)/python -m test.fuzz --seconds $(FUZZ_SECONDS)
 
 lint: $(LINT_STAMP)  ## style, format, types, layers, language; needs no ROS
 	$(LINT)/bin/ruff check
@@ -117,7 +113,7 @@ dist: $(DOCS_STAMP)  ## build wheel and sdist into dist/; run tests of the sdist
 	cd "$$check" && venv/bin/surfel-mapper simulate street --output street --scans 3 --columns 256 && \
 	venv/bin/surfel-mapper replay street --output mapped
 
-notebooks: $(STAMP)  ## write the notebooks of the tutorials from their pages, and run them
+notebooks: $(EXTRAS_STAMP)  ## write the notebooks of the tutorials from their pages, and run them
 	$(BIN)/python -m test.docs.notebooks
 
 settings: $(STAMP)  ## write default.yaml and the table of docs/settings.md from config/
@@ -130,8 +126,14 @@ clean:  ## remove the environment and everything built
 $(STAMP): setup.py pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 	{ echo 'Python 3.10 or newer is needed: make PYTHON=python3.12 ...' >&2; exit 1; }
+	@echo 'Once: packages from PyPI into $(VENV)/, about 250 MB to download, 1.0 GB on the disk'
 	$(PYTHON) -m venv $(VENV_FLAGS) $(if $(wildcard $(VENV)/.ready-$(OTHER)),--clear) $(VENV)
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS)]'
+	touch $@
+
+$(EXTRAS_STAMP): $(STAMP)
+	@echo 'Once: optional packages from PyPI into $(VENV)/, about 320 MB to download, 1.1 GB on the disk'
+	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS),full]'
 	$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --upgrade \
 		--target $(OUSTER) 'ouster-sdk>=1,<2' more-itertools
 	touch $@

@@ -98,23 +98,31 @@ RUNNER = [
     'hypothesis>=6.98',  # random sequences of adds and removes
 ]
 
+# What `make test` needs. Tests of the extras below are skipped without them.
 TEST = [
     *RUNNER,
-    *FORMATS,
-    *CLUSTER,
     *LAS,
     *LOOPS,
+    *MESHES,
+    'python-neo-lzf>=0.3',  # scans in compressed PCD files
+    'pytest-xdist>=3.7',  # several processes: those of ROS wait, those of the others calculate
+    'plyfile>=1.0.1',  # an independent reader of what we write
+    'pypcd4>=1.1',  # likewise
+    'mcap>=1.1',  # an independent writer of what we read
+]
+
+# All that the tests need, with optional packages that take 1.1 GB more: `make test-extras`.
+FULL = [
+    *TEST,
+    *FORMATS,
+    *CLUSTER,
     *ALIGN,
     *VIEWER,
-    *MESHES,
     *NOTEBOOKS,
     # an independent reader of trajectories, and judge of their errors; GPL-3, so it is used by the
     # tests alone, and nothing that is installed with the package imports it
     'evo>=1.28',
     'playwright>=1.40',  # opens report.html in a browser, which it does not bring
-    'pytest-xdist>=3.7',  # two processes: those of ROS wait, those of the others calculate
-    'plyfile>=1.0.1',  # an independent reader of what we write
-    'pypcd4>=1.1',  # likewise
     'pandas>=2.0',  # Surfels.to_pandas
 ]
 
@@ -125,12 +133,6 @@ LINT = [
     'ruff==0.17.6',  # style and format; its rules are in .ruff.toml
     'mypy==2.4.1',  # types; configured in setup.cfg
     'numpy==2.2.6',  # the newest for all of Python 3.10 to 3.13
-]
-
-FUZZ = [
-    # searches for inputs that break readers, led by the branches they take; has wheels for some
-    # Pythons only, which is why the tests do without it
-    'atheris>=2.3',
 ]
 
 DOCS = [
@@ -187,9 +189,9 @@ setup(
         'notebooks': NOTEBOOKS,
         'ros': ROS,
         'test': TEST,
+        'full': FULL,
         'lint': LINT,
         'docs': DOCS,
-        'fuzz': FUZZ,
     },
     entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.main:main']},
     data_files=[

@@ -5,8 +5,8 @@ Surroundings that seem to move along with the sensor, as trucks on all sides do.
 
 They fit the map well, at a pose that hardly moves, while the world between them streams past: scan
 after scan has voxels that the map does not know, more than the motion explains. Boxed in by nine
-trucks (test/bench/scenarios.py) 8 % of the voxels of a scan are new, at 0.1 m a scan; in the same
-street 0.1 % are new at rest, 2 % at rest with three trucks that pass, 9 % at 0.9 m a scan.
+trucks (test/pipeline/scenarios.py) 8 % of the voxels of a scan are new, at 0.1 m a scan; in the
+same street 0.1 % are new at rest, 2 % at rest with three trucks that pass, 9 % at 0.9 m a scan.
 
 It stands alone because it judges the result of tracking and has no part in it.
 """

@@ -6,7 +6,7 @@ Benchmarks: milliseconds a scan, beside other packages.
     make bench                                      all, with the environment of the project
     python -m test.bench --help                     list them
     python -m test.bench --quick                    smaller runs, for use while working
-    python -m test.bench --only compare --peers     other packages too, from PyPI
+    python -m test.bench --only filters --peers     other packages too, from PyPI
 
 How to read it: every row is the median, the 99th percentile and the slowest of the scans of one
 run, on one core of a machine that may be shared; compare rows of one run only, and check the

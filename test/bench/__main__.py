@@ -18,33 +18,8 @@ from surfel_mapper.memory import keep_freed_memory
 from test.bench.machine import facts, load
 from test.bench.options import cache_directory, Options
 from test.bench.report import Row, table
-from test.bench.since import earlier_ratios, fallen, ratios
 
-BENCHES = (
-    'mapping',
-    'real',
-    'decode',
-    'threads',
-    'scaling',
-    'start',
-    'view',
-    'live',
-    'live_long',
-    'offline',
-    'compare',
-    'filters',
-    'lum',
-    'align',
-    'accuracy',
-    'registration',
-    'tracking',
-    'loops',
-    'long_drive',
-    'outputs',
-    'tsdf',
-    'models',
-    'workers',
-)
+BENCHES = ('real', 'start', 'live', 'filters', 'lum', 'registration', 'tsdf', 'models')
 """Modules of this folder that have run(options) -> list of rows, in the order to run them."""
 
 
@@ -64,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
         'The street is simulated once, 1.6 MB a scan, and kept in --cache. Peers come from PyPI\n'
         'at the first call with --peers, into environments of their own in --cache (1.2 GB), and\n'
         'take about ten minutes. Both may be deleted at any time. Then all benches\n'
-        'with --peers take about two hours; each prints its seconds.',
+        'with --peers take about an hour; each prints its seconds.',
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument(
@@ -77,12 +52,6 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument(
         '--cache', type=Path, default=cache_directory(), metavar='DIR', help='default: %(default)s'
-    )
-    result.add_argument(
-        '--since',
-        type=Path,
-        metavar='FILE',
-        help='output of an earlier run: print the ratios that fell by more than 15 %% since',
     )
     return result
 
@@ -125,10 +94,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.scans is not None and args.scans < 1:
         parser().error(f'--scans: {args.scans}, expected one or more')
     names = args.only or BENCHES
-    try:
-        before = earlier_ratios(args.since, names) if args.since else {}
-    except (OSError, ValueError) as error:
-        parser().error(f'--since: {error}')
     keep_freed_memory()  # as node and replay do
     machine, chosen = facts(), options(args)
     print(', '.join(f'{name} {value}' for name, value in machine.items()))
@@ -137,9 +102,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = [{**settings, **row, **machine} for row in run(names, chosen)]
     for row in rows:
         print(json.dumps(row))
-    if args.since:
-        lines = list(fallen(ratios(rows), before)) or ['none']
-        print(f'\nratios that fell by more than 15 % since {args.since}:', *lines, sep='\n')
     return 0
 
 

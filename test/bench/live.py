@@ -12,8 +12,6 @@ mapped, with nothing coming in. Rows ``transport`` are a subscriber of rclpy tha
 clouds, in place of the node, with ordinary priority. The rows of the node by defaults depend on
 whether Linux permits it real-time priority (docs/node.md); without: ``setpriv
 --bounding-set=-sys_nice -- python -m test.bench --only live`` as root.
-
-Only the rows of the node at 20 Hz grow with ``--scans``; live_long.py has the long ones alone.
 """
 
 from __future__ import annotations
@@ -271,11 +269,6 @@ class Node:
             if self._process.poll() is not None or time.monotonic() > end_s:
                 raise RuntimeError(f'the node did not say {text!r}: {output}')
             time.sleep(0.02)
-
-    def keep_to_one_core(self) -> None:
-        """Run all threads of the node on one core."""
-        for thread in Path(f'/proc/{self._process.pid}/task').iterdir():
-            os.sched_setaffinity(int(thread.name), {0})
 
     def cpu_s(self) -> float:
         """Return the processor time of the node so far."""

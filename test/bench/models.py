@@ -8,8 +8,6 @@ the organised points to the models, thinning included. Precision and completenes
 points themselves, also of Gaussians alone (gmm_). Frames per second follow from the least
 processor time (cpu_ms), as the machine may be shared. Open3D gets normals and finds planes only,
 from the cloud thinned to 1 cm and from the whole cloud.
-
-Height fields of B-splines are fitted to a sample in each cell, or in those of a street across it.
 """
 
 from __future__ import annotations
@@ -27,8 +25,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import evaluate, fit, MultiModel
-from surfel_mapper.models.bspline import fit_pspline, initial_field
-from test.bench import live_models, scan_planes, tabletop
+from test.bench import scan_planes, tabletop
 from test.bench.machine import one_core
 from test.bench.options import Options
 from test.bench.peers import OPEN3D, PeerSpec
@@ -51,44 +48,16 @@ WARM = 2
 MOST_RUNS = 15
 PEER_RUNS = 3
 
-FIELD_CELLS = (50, 450)
-FIELD_PITCH_M, FIELD_SMOOTHING, FIELD_RUNS = 0.2, 1e-2, 3
 
 PEER_SIZES_M = (0.01, 0.0)
 """Thinning of the cloud for Open3D; 0: none."""
 
 
 def run(options: Options) -> Iterator[Row]:
-    """Yield rows of labelled frames of a table, scans of lidars, live models, and rooms."""
+    """Yield rows of labelled frames of a table, scans of lidars, and rooms."""
     yield from tabletop.run(options)
     yield from scan_planes.run(options)
-    yield from live_models.run()
     yield from rooms(options)
-    yield from height_fields()
-
-
-def height_fields() -> Iterator[Row]:
-    """Yield rows of square height fields, all filled, and with a street of filled cells."""
-    rng = np.random.default_rng(1)
-    for cells in FIELD_CELLS:
-        index = np.stack(np.meshgrid(*2 * [np.arange(cells)], indexing='ij'), axis=-1)
-        xy = FIELD_PITCH_M * (index + rng.uniform(0.1, 0.9, index.shape))
-        z = np.sin(0.5 * xy[..., 0]) + 0.02 * rng.standard_normal((cells, cells))
-        street = np.abs(index[..., 0] - index[..., 1]) < 0.4 * cells
-        for name, filled in (('filled', np.ones_like(street)), ('street', street)):
-            start = initial_field(FIELD_PITCH_M, np.zeros(2), z, filled, 3)
-            samples = xy[filled], z[filled], np.ones(filled.sum())
-            with one_core():
-                times = []
-                for _ in range(FIELD_RUNS):
-                    begin = perf_counter()
-                    fit_pspline(start, *samples, FIELD_SMOOTHING)
-                    times.append((perf_counter() - begin) * 1e3)
-            yield {
-                'cloud': f'height field of {cells} x {cells} cells, {name}',
-                'who': 'surfel_mapper',
-                'least_ms': min(times),
-            }
 
 
 def rooms(options: Options) -> Iterator[Row]:

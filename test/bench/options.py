@@ -29,12 +29,6 @@ class Options:
         Scans timed, after the window is full.
     window : int
         Scans in the window.
-    windows : tuple of int
-        Compared lengths of the window; times are divided by that of the first.
-    map_voxels : tuple of int
-        Compared sizes of the map; times are divided by that of the first.
-    real_windows, real_map_voxels : tuple of int
-        The same for a real scan.
     voxel_sizes_m : tuple of float
         Edges of voxels.
     beams, columns : int
@@ -48,10 +42,6 @@ class Options:
 
     scans: int = 100
     window: int = 100
-    windows: tuple[int, ...] = (25, 400)
-    map_voxels: tuple[int, ...] = (100_000, 5_000_000)
-    real_windows: tuple[int, ...] = (25, 1000)
-    real_map_voxels: tuple[int, ...] = (100_000, 20_000_000)
     voxel_sizes_m: tuple[float, ...] = (0.5, 0.2)
     beams: int = 64
     columns: int = 2048
@@ -70,12 +60,4 @@ class Options:
 
     def quick(self) -> Options:
         """Return options for runs of some seconds, for use while working."""
-        return replace(
-            self,
-            scans=25,
-            window=25,
-            windows=(10, 50),
-            map_voxels=(100_000, 1_000_000),
-            real_windows=(10, 50),
-            real_map_voxels=(100_000, 1_000_000),
-        )
+        return replace(self, scans=25, window=25)

@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The mapping of a scan by direct calls, each stage timed, without Mapper.
-
-Decode a PointCloud2, reduce it to moments, insert them, evict the oldest scan, derive the normals
-of all voxels that changed.
-"""
+"""A map and its window by direct calls, each stage timed, without Mapper."""
 
 from __future__ import annotations
 
@@ -14,14 +9,10 @@ from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
-import numpy.typing as npt
 
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.messages.pointcloud2 import RawCloud, to_scan
 from test.bench.numpy_map import COUNT, NumpyMap, PRODUCT, SUM, VIEW
-
-STAGES = ('decode', 'reduce', 'insert', 'evict', 'normals')
 
 
 class Ours:
@@ -42,19 +33,6 @@ class Ours:
         self.scans: deque[ScanMoments] = deque()
         self.num_changed = 0
         self._window = window
-
-    def step(self, message: RawCloud, pose: npt.NDArray[np.float64]) -> dict[str, float]:
-        """Map a scan; return the milliseconds of every stage."""
-        times = [perf_counter()]
-        points = to_scan(message).points  # decoded when it is read
-        times.append(perf_counter())
-        moments = self.map.reduce(points, pose, origin=pose[:3, 3])
-        times.append(perf_counter())
-        times += self.put(moments)
-        return {
-            stage: (end - start) * 1e3
-            for stage, start, end in zip(STAGES, times[:-1], times[1:], strict=True)
-        }
 
     def put(self, moments: ScanMoments, clock: Callable[[], float] = perf_counter) -> list[float]:
         """Insert a reduced scan; return the times at the end of insert, evict and derive, s."""

@@ -40,7 +40,7 @@ from test.bench.numpy_map import NumpyMap
 from test.bench.options import Options
 from test.bench.ours import Ours
 from test.bench.report import Row
-from test.bench.street import MovedScan, Street
+from test.bench.street import Street
 
 WINDOW = 20
 
@@ -65,8 +65,6 @@ SCANS = {
 }
 """Names of rows and files of scans."""
 
-DRIVEN = ('VLS-128 street', '64 beams street', 'OS2-128')
-"""Scans that other benches take beside the simulated street, by their names."""
 
 STAGES = ('reduce', 'insert', 'evict', 'normals')
 
@@ -104,15 +102,6 @@ def real_scans() -> Iterator[tuple[str, npt.NDArray[np.float32]]]:
             points = np.asarray(read_scan(path)[0], np.float32)
             valid = np.isfinite(points).all(axis=1) & points.any(axis=1)
             yield name, np.asfortranarray(points[valid])
-
-
-def drives(options: Options) -> Iterator[tuple[str, Street, Options]]:
-    """Yield name, scans and size of the simulated street and of the driven real scans."""
-    yield 'simulated street', Street(options), options
-    for name, points in real_scans():
-        if name in DRIVEN:
-            moved = MovedScan(options, points)
-            yield name, moved, moved.options
 
 
 def step_row(name: str, points: npt.NDArray[np.float32], size_m: float, options: Options) -> Row:

@@ -27,11 +27,6 @@ def spread(milliseconds: Sequence[float]) -> dict[str, float]:
     }
 
 
-def rates(median_ms: float, num_points: int) -> dict[str, float]:
-    """Return scans and millions of points a second."""
-    return {'scans_s': 1e3 / median_ms, 'Mpt_s': num_points / median_ms * 1e-3}
-
-
 def table(rows: Sequence[Row]) -> str:
     """Return rows as text: columns in order of first appearance, numbers to the right."""
     names = list(dict.fromkeys(name for row in rows for name in row))

@@ -3,16 +3,13 @@
 """
 The scans of all benchmarks: a lidar of 131,072 points driving through the simulated street.
 
-Or one scan of a real lidar at every pose of that drive. Scans are simulated once
-and kept as .npy, a file a scan, in a directory named by a hash of the parameters.
-Messages have the layout of drivers, 32 bytes a point, 4 MiB each; in a list of them none is still
-in a cache when it is used.
+Scans are simulated once and kept as .npy, a file a scan, in a directory named by a hash of the
+parameters. Messages have the layout of drivers, 32 bytes a point, 4 MiB each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 import hashlib
 import json
 from pathlib import Path
@@ -107,19 +104,6 @@ class Street:
             is_dense=cloud.is_dense,
         )
 
-    def drive(self, untimed: int, timed: int) -> Iterator[tuple[int, RawCloud, bool]]:
-        """
-        Yield number, message and whether it counts, of each run of scans.
-
-        All counted ones are in memory before the first is yielded, and so are not in a cache when
-        used.
-        """
-        for number in range(untimed):
-            yield number, self.message(number), False
-        messages = [self.message(untimed + later) for later in range(timed)]
-        for later, message in enumerate(messages):
-            yield untimed + later, message, True
-
     def _made(self, number: int) -> npt.NDArray[np.float32]:
         """Return the points of a scan that is not kept yet."""
         points: npt.NDArray[np.float32] = self.simulation.scan(number).points
@@ -130,40 +114,3 @@ class Street:
         world = self.simulation.world.to_mapping()
         state = [world, asdict(self.simulation.lidar), asdict(self.simulation.drive)]
         return hashlib.sha256(json.dumps(state).encode()).hexdigest()[:12]
-
-
-class MovedScan(Street):
-    """
-    One scan at the poses of the drive, in place of simulated ones.
-
-    Parameters
-    ----------
-    options : Options
-        The cache.
-    points : (N, 3) float32, m
-        The scan, in recorded order.
-
-    Attributes
-    ----------
-    options : Options
-        The same for N points.
-
-    """
-
-    def __init__(self, options: Options, points: npt.NDArray[np.float32]) -> None:
-        super().__init__(options)
-        self.options = replace(options, beams=1, columns=len(points))
-        self._scan, self._rows = points, 1
-        content = hashlib.sha256(points.tobytes()).hexdigest()[:12]
-        self._file = options.cache / f'scan-{content}.npy'
-
-    def path(self, number: int) -> Path:
-        """Return the file of the scan."""
-        return self._file
-
-    def prepare(self, num_scans: int) -> None:
-        """Write the file of the scan."""
-        self.points(0)
-
-    def _made(self, number: int) -> npt.NDArray[np.float32]:
-        return self._scan

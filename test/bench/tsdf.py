@@ -10,9 +10,6 @@ input is points or depths in the frame of the sensor; VDBFusion gets points in t
 Errors of meshes are distances from the equations of street and room; a mesh that is empty or less
 than half complete fails. ``mesh_ms`` is the processor time of the whole mesh, made anew, the
 least of three.
-
-Rows ``layer`` are the time of a scan in the layer of a mapper, its check of the sensor included.
-Then follow clouds of other kinds, see any_cloud.py, and the node with the field, live_tsdf.py.
 """
 
 from __future__ import annotations
@@ -27,18 +24,12 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.pipeline import Mapper
-from surfel_mapper.scan import Scan
-from surfel_mapper.sensors.depth import depth_points, PinholeCamera
 from surfel_mapper.tsdf.blocks import BlockMap
-from surfel_mapper.tsdf.euclidean import EuclideanField
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.mesh import Mesher
 from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
 from surfel_mapper.tsdf.sensors import LidarModel
 from test.bench import room
-from test.bench.any_cloud import cloud_rows
-from test.bench.live_tsdf import live_rows
 from test.bench.machine import one_core
 from test.bench.mesh_error import mesh_error
 from test.bench.options import Options
@@ -54,7 +45,6 @@ from test.bench.peers.tsdf import (
 )
 from test.bench.report import Row, spread
 from test.bench.street import Street
-from test.fields import config_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -119,92 +109,6 @@ def run(options: Options) -> Iterator[Row]:
         with one_core():
             rows = case_rows(case, options)
         yield from rows
-    with one_core():
-        rows = [*image_rows(rooms[0]), *esdf_rows(street[1]), *layer_rows(street[1])]
-    yield from rows
-    yield from cloud_rows(options)
-    yield from live_rows(options)
-
-
-def layer_rows(case: Case) -> list[Row]:
-    """Return rows of the whole layer, with its defaults and as in the preset of a lidar."""
-    rows: list[Row] = []
-    outdoors = {'voxel_size_m': 0.2, 'truncation_m': 0.6, 'min_range_m': 1.5, 'max_range_m': 60.0}
-    settings = {'defaults': {}, 'preset': {**case.ours, **outdoors, 'max_radius_m': 80.0}}
-    for name, ours in settings.items():
-        mapping = {f'layers.tsdf.{key}': value for key, value in ours.items()}
-        mapping |= {'layers.tsdf.enabled': True, 'layers.tsdf.threads': 1}
-        layer, found = Mapper(config_of(mapping)).tsdf, []
-        for number, (path, pose) in enumerate(zip(case.files, case.poses, strict=True)):
-            scan = Scan(points=np.load(path), stamp_ns=number * 10**8, frame_id='lidar')
-            busy = process_time()
-            layer.insert(scan, pose)
-            found.append((process_time() - busy) * 1e3)
-        late = found[len(found) // 3 :]
-        figures = {'cpu_ms': float(np.median(late)), 'least_ms': min(late), 'scans': len(late)}
-        rows.append({'case': f'layer, {name}', 'who': 'surfel_mapper', **figures})
-    return rows
-
-
-def image_rows(case: Case) -> list[Row]:
-    """Return rows of range images of 640 x 480, from the depth image and from its points."""
-    camera, found = room.CAMERA, []
-    pinhole = PinholeCamera(
-        camera.columns, camera.rows, camera.fx, camera.fy, camera.cx, camera.cy
-    )
-    for path in case.files:
-        depth = np.load(path).astype(np.float32)
-        begin = process_time()
-        from_depth(camera, depth)
-        middle = process_time()
-        from_points(camera, depth_points(depth, pinhole))
-        found.append(((middle - begin) * 1e3, (process_time() - middle) * 1e3))
-    late = np.array(found)[WARM:]
-    return [
-        {'case': f'range image, {what}', 'who': 'surfel_mapper', 'cpu_ms': float(np.median(times))}
-        for what, times in zip(('from depth', 'from points'), late.T, strict=True)
-    ]
-
-
-def esdf_rows(case: Case) -> list[Row]:
-    """Return rows of updates of Euclidean distances: the lidar drives, or stands and flickers."""
-    rows: list[Row] = []
-    for stands in (False, True):
-        config = TsdfConfig(
-            voxel_size_m=case.voxel_size_m,
-            truncation_m=case.truncation_m,
-            threads=1,
-            min_range_m=1.5,
-            max_range_m=60.0,
-            **case.ours,
-        )
-        one = Integrator(BlockMap(config))
-        esdf = EuclideanField(one.blocks, max_m=2.0, radius_m=20.0)
-        found = []
-        for number, path in enumerate(case.files):
-            data, pose = (
-                np.load(case.files[0] if stands else path),
-                case.poses[0 if stands else number],
-            )
-            if stands:  # another noise of the same range
-                noise = np.random.default_rng(number).normal(0.0, 0.02, (len(data), 1))
-                length = np.linalg.norm(data, axis=1, keepdims=True)
-                data = (data * (1.0 + noise / np.maximum(length, 1.0))).astype(np.float32)
-            one.integrate(case.image(data), pose, number * 10**8)
-            busy = process_time()
-            changed = esdf.update(pose[:3, 3])
-            found.append((changed, (process_time() - busy) * 1e3))
-        late = np.array(found)[len(found) // 2 :]
-        rows.append(
-            {
-                'case': 'esdf 20 m, standing' if stands else 'esdf 20 m, driving',
-                'who': 'surfel_mapper',
-                'cpu_ms': float(np.median(late[:, 1])),
-                'voxels_changed': float(np.median(late[:, 0])),
-                'scans': len(late),
-            }
-        )
-    return rows
 
 
 def case_rows(case: Case, options: Options) -> list[Row]:

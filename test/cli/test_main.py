@@ -174,8 +174,15 @@ def test_a_closed_pipe_is_no_error(tmp_path):
     assert (done.returncode, done.stderr) == (0, '')
 
 
-@pytest.mark.parametrize('closed', ['>&-', '2>&-', '>&- 2>&-', '<&- >&- 2>&-'])
-@pytest.mark.parametrize('verb', ['replay', 'simulate'])
+@pytest.mark.parametrize(
+    ('verb', 'closed'),
+    [
+        ('replay', '>&-'),
+        ('replay', '<&- >&- 2>&-'),
+        ('simulate', '2>&-'),
+        ('simulate', '>&- 2>&-'),
+    ],
+)
 def test_closed_streams_change_no_result(tmp_path, verb, closed):
     code = 'import sys; from surfel_mapper.cli.main import main; sys.exit(main())'
     output = tmp_path / 'out'

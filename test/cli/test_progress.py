@@ -21,7 +21,7 @@ import pytest
 from surfel_mapper.cli import _progress as progress_module
 from surfel_mapper.cli._progress import interrupted_by_sigterm, progress, stopped_by_interrupt
 from surfel_mapper.cli.main import main
-from surfel_mapper.files.parquet import read_map
+from surfel_mapper.files.map_state import load_map
 from surfel_mapper.viz import picture
 from test.bags.recorded import drive, Entries, PERIOD_NS, START_NS, write_rosbag2
 
@@ -188,7 +188,7 @@ def long_bag(tmp_path_factory):
 def command(long_bag, tmp_path):
     settings = tmp_path / 'settings.yaml'
     settings.write_text('pose: {source: identity}\n')
-    options = ['--config', str(settings), '--formats', 'parquet,bag', '--json']
+    options = ['--config', str(settings), '--formats', 'npz,bag', '--json']
     program = [sys.executable, '-c', WITH_MANY_LINES, 'replay', str(long_bag)]
     return [*program, *options, '--output', str(tmp_path / 'out')]
 
@@ -204,7 +204,7 @@ def test_sigterm_ends_a_replay_early_and_the_map_is_written(command, tmp_path):
     summary = json.loads(printed)
     assert summary['interrupted']
     assert 0 < summary['scans']['mapped'] < MANY
-    assert read_map(tmp_path / 'out' / 'map.parquet').digest() == summary['digest']
+    assert load_map(tmp_path / 'out')[0].digest() == summary['digest']
 
 
 def interrupted_simulation(program, output):
@@ -277,9 +277,9 @@ def test_ctrl_c_ends_the_bar_of_a_terminal_and_the_map_is_written(command, tmp_p
     summary = json.loads(printed)
     assert summary['interrupted']
     assert 0 < summary['scans']['mapped'] < MANY
-    assert read_map(output / 'map.parquet').digest() == summary['digest']
+    assert load_map(output)[0].digest() == summary['digest']
     assert {path.name for path in output.iterdir()} == {
-        'map.parquet',
+        'map.npz',
         'normals',
         'map.png',
         'report.html',

@@ -19,7 +19,7 @@ from test.bags.recorded import cut
 from test.cli.small_disk import run_on_small_disk
 from test.cluster.bags import written
 
-pytestmark = pytest.mark.usefixtures('undrawn')
+pytestmark = [pytest.mark.usefixtures('undrawn'), extras.needs('pyarrow', 'distributed')]
 
 FILES = {'trajectory.tum', 'map.ply', 'map.npz', 'map.png', 'report.html', 'summary.json'}
 TF = ['--pose-topic', '/tf']
@@ -106,7 +106,6 @@ def test_ctrl_c_before_the_first_shard_is_done_leaves_the_earlier_map(
 
 
 def test_workers_make_the_map_of_one_process(bags, alone, tmp_path, capsys, caplog):
-    extras.load('distributed')
     arguments = ['replay', bags[0], '--workers', '2', '--output', str(tmp_path), '--json']
     assert main([*arguments, *TF]) == 0
 
@@ -221,7 +220,6 @@ def test_an_invalid_number_of_workers_is_refused(bags, number):
 
 
 def test_a_scheduler_that_does_not_answer_is_refused(bags, tmp_path, capsys, monkeypatch):
-    extras.load('distributed')
     from surfel_mapper.cluster import workers
 
     monkeypatch.setattr(workers, 'CONNECT_S', 1)

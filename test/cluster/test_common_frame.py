@@ -24,7 +24,7 @@ from surfel_mapper.offline.summary import as_text
 from surfel_mapper.simulation import Drive, Lidar, Simulation, World
 from test import extras
 
-pytestmark = pytest.mark.usefixtures('undrawn')
+pytestmark = [pytest.mark.usefixtures('undrawn'), extras.needs('pyarrow', 'distributed')]
 
 LIDAR = Lidar(beams=32, columns=256, range_noise_m=0.01)
 NUM_SCANS = 12

@@ -3,6 +3,5 @@
 """
 Any input gives a result or an error of this package, in bounded memory and time.
 
-Each harness is a function of bytes. The tests feed it its corpus and some seeded mutations of
-that; ``make fuzz`` lets atheris search, led by the branches that the bytes make the code take.
+Each harness is a function of bytes. The tests feed it its corpus and seeded mutations of it.
 """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Mutations of bytes, the same for the same seed: for runs without atheris."""
+"""Mutations of bytes, the same for the same seed."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ EDGES = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000,
 MAX_BYTES = 1 << 16
 """Size limit of mutated inputs, bytes."""
 
-LARGE = (1 << 20, 1 << 22)
-"""Sizes of enlarged inputs, bytes."""
-
 
 def mutations(corpus: Sequence[bytes], number: int, seed: int = 1) -> Iterator[bytes]:
     """Yield the corpus and then ``number`` mutations of it."""
@@ -25,18 +22,6 @@ def mutations(corpus: Sequence[bytes], number: int, seed: int = 1) -> Iterator[b
         for _ in range(rng.choice((1, 1, 2, 4, 8))):
             rng.choice(WAYS)(rng, data, corpus)
         yield bytes(data[:MAX_BYTES])
-
-
-def enlarged(data: bytes, seed: int) -> bytes:
-    """Return an input with a slice repeated up to some megabytes: a line, if it has lines."""
-    rng = random.Random(seed)
-    begin = rng.randrange(len(data) + 1)
-    end = rng.randrange(begin, len(data) + 1)
-    if b'\n' in data:
-        begin = data.rfind(b'\n', 0, begin) + 1
-        end = data.find(b'\n', begin) + 1 or len(data)
-    piece = data[begin:end] or b'\n'
-    return data[:begin] + piece * (rng.choice(LARGE) // len(piece)) + data[end:]
 
 
 def flip(rng, data, corpus):

@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Harnesses of files of points and poses: LAS, PLY, PCD, TUM, tiles, captures of packets.
-
-Those that build a file from choices remember what is in it: unless they changed the file, the
-reader has to return that. A file whose header was changed is refused, or read within the limits.
-"""
+"""Harnesses of LAS files, of files that ``view`` shows, and of captures of packets."""
 
 from __future__ import annotations
 

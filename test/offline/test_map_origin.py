@@ -22,6 +22,7 @@ from surfel_mapper.files.trajectory import read_trajectory, write_tum
 from surfel_mapper.offline.replay import ReplayOptions
 from surfel_mapper.offline.request import Request
 from surfel_mapper.viz import picture
+from test import extras
 from test.bags.recorded import drive, HEIGHT_M, NUM_SCANS, PERIOD_NS, START_NS, write_rosbag2
 
 UTM = np.array([400_000.0, 5_400_000.0, 250.0])
@@ -31,6 +32,9 @@ SETTINGS = {
     'layers.tsdf.enabled': True,
     'layers.models.enabled': True,
 }
+
+
+FORMATS = ('ply', 'pcd', 'npz', *(['parquet'] if extras.has('pyarrow') else []))
 
 
 @pytest.fixture(scope='module')
@@ -49,9 +53,7 @@ def replayed(bag, directory, origin, shift):
         Request(path=bag, topics=('/points',), poses=directory / 'poses.tum'),
         output=directory / 'out',
         config=Config.from_mapping({**SETTINGS, 'map.origin': origin}),
-        options=ReplayOptions(
-            formats=('ply', 'pcd', 'npz', 'parquet'), truth=directory / 'poses.tum'
-        ),
+        options=ReplayOptions(formats=FORMATS, truth=directory / 'poses.tum'),
     )
 
 
@@ -126,6 +128,8 @@ def test_map_png_has_the_coordinates_of_the_fixed_frame(bag, far, monkeypatch, t
 
 @pytest.mark.parametrize('name', ['map.npz', 'map.parquet', 'map.ply', '.'])
 def test_maps_are_compared_in_outer_coordinates(near, far, name):
+    if name.endswith('parquet'):
+        extras.load('pyarrow')
     expected, found = (load_discs(out_of(run) / name, 5) for run in (near, far))
 
     def order(places):
@@ -137,6 +141,7 @@ def test_maps_are_compared_in_outer_coordinates(near, far, name):
 
 
 def test_maps_of_two_origins_are_merged(bag, far, tmp_path):
+    extras.load('pyarrow')
     other = replayed(bag, tmp_path / 'other', '400512 5399488 250', UTM)
     command = ['merge', str(out_of(far)), str(out_of(other)), '--output', str(tmp_path / 'both')]
 

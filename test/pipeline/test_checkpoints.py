@@ -14,6 +14,7 @@ from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.parquet_tiles import write_tiles
 from surfel_mapper.pipeline import checkpoints, saved_state
 from surfel_mapper.pipeline.checkpoints import checkpoint_paths, Checkpoints, load_start
+from test import extras
 from test.pipeline.made_scans import add_pose, insert, mapper_with, scan_at
 
 
@@ -173,7 +174,7 @@ def test_a_checkpoint_for_which_there_is_no_memory_is_passed_over(tmp_path, cloc
 
 
 def test_a_map_in_tiles_is_a_start_too(tmp_path):
-    pytest.importorskip('pyarrow')
+    extras.load('pyarrow')
     mapper = mapper_in(tmp_path)
     drive(mapper, 1.0, 2.0)
     write_tiles(tmp_path / 'tiled' / 'map', mapper.map)

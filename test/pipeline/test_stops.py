@@ -17,7 +17,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.geometry import inverse
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.simulation import World
-from test.bench.scenarios import LIDAR, Scenario, street_course
+from test.pipeline.scenarios import LIDAR, Scenario, street_course
 
 SPEED_M_S = 8.0
 

@@ -17,7 +17,7 @@ from surfel_mapper.geometry import inverse
 from surfel_mapper.offline.summary import MOST_SURROUNDED, uncertain_text
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.simulation import World
-from test.bench.scenarios import LIDAR, scenarios
+from test.pipeline.scenarios import LIDAR, scenarios
 
 
 @cache

@@ -125,11 +125,14 @@ class Peer:
             finally:
                 self._context.shutdown()
 
+    def spin_once(self):
+        self._executor.spin_once(0.05)
+
     def spin_until(self, condition, timeout_s=TIMEOUT_S, what=lambda: 'timed out'):
         end = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < end, what()
-            self._executor.spin_once(0.05)
+            self.spin_once()
 
     def spin_for(self, seconds):
         end = time.monotonic() + seconds

@@ -45,7 +45,8 @@ class Stream:
 
     def begin(self):
         """Count from the present values on."""
-        self.peer.spin_for(0.3)
+        num_reports = len(self._reports) + 2  # the second has counts from now on
+        self.peer.spin_until(lambda: len(self._reports) >= num_reports)
         self._before = self.values()
 
     def step(self, period_ns=PERIOD_NS):

@@ -285,17 +285,28 @@ def test_lost_large_clouds_are_reported_with_a_remedy(start, peer):
     publisher = peer.node.create_publisher(PointCloud2, '/points', BEST_EFFORT)
     peer.spin_until(publisher.get_subscription_count)
     reports = peer.collect(DiagnosticArray, '/diagnostics')
-    points = np.zeros((350_000, 3), np.float32)  # 4 MiB, of which shared memory holds an eighth
-    clouds = (cloud(START_NS + index * PERIOD_NS, points) for index in count())
+    # of 4 MiB shared memory holds an eighth, of 0.5 MB all: such a cloud arrives, also under load
+    large, small = np.zeros((350_000, 3), np.float32), np.zeros((42_000, 3), np.float32)
+    stamps = count(START_NS, PERIOD_NS)
+
+    def publish_until(is_reported):
+        """Publish a small cloud after each report."""
+        end, num_reports = time.monotonic() + TIMEOUT_S, 0
+        while not is_reported():
+            assert time.monotonic() < end, node.output
+            if len(reports) > num_reports:
+                publisher.publish(cloud(next(stamps), small))
+                num_reports = len(reports)
+            peer.spin_once()
+
+    publish_until(lambda: 'too_near' in node.output)  # losses count from the first that arrives
     with node.paused():  # a reader that takes nothing loses what shared memory cannot hold
         for _ in range(10):
-            publisher.publish(next(clouds))
-    end = time.monotonic() + TIMEOUT_S
-    while not any('clouds lost on the way' in report.status[0].message for report in reports):
-        assert time.monotonic() < end, node.output
-        publisher.publish(next(clouds))
-        peer.spin_for(0.05)
-    assert 'fastdds_shm.xml' in node.output
+            publisher.publish(cloud(next(stamps), large))
+    publish_until(
+        lambda: any('clouds lost on the way' in report.status[0].message for report in reports)
+    )
+    node.wait_for_output('fastdds_shm.xml')
 
 
 class Interrupted(BaseNode):

@@ -174,6 +174,8 @@ def test_a_reliability_set_by_the_user_stays(domain, chosen):
     try:
         bench.subscribe()
         publisher = bench.advertise(BEST_EFFORT if chosen == 'reliable' else RELIABLE)
+        if chosen == 'best_effort':
+            peer.spin_until(publisher.get_subscription_count)
         peer.spin_for(1.0)
         assert bench.executor.reliabilities() == {'/chosen': chosen.replace('_', ' ')}
         assert publisher.get_subscription_count() == (chosen == 'best_effort')
@@ -206,8 +208,8 @@ def test_publishers_of_another_type_do_not_decide_the_reliability(bench, other_p
     assert publishers(node, '/followed') == (0, '')
     bench.check_connected(bench.advertise(RELIABLE), 'reliable beside another type')
     other_peer.node.destroy_publisher(other)
-    bench.peer.spin_for(0.5)
-    assert publishers(node, '/followed') == (1, '')
+    bench.peer.spin_until(lambda: node.count_publishers('/followed') == 1)
+    bench.peer.spin_until(lambda: publishers(node, '/followed') == (1, ''))
     assert bench.executor.reliabilities() == {'/followed': 'reliable'}
 
 

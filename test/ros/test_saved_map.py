@@ -14,6 +14,7 @@ from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.checkpoints import load_start
 from surfel_mapper.scan import Scan
+from test import extras
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
@@ -21,6 +22,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 @pytest.fixture(scope='module')
 def saved(tmp_path_factory):
     """Return the output directory of ~/save_map and the mapper that wrote it."""
+    extras.load('pyarrow')  # to merge it
     from surfel_mapper.ros.map_files import save_map
 
     directory = tmp_path_factory.mktemp('maps')

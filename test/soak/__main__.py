@@ -15,7 +15,6 @@ from test.bench.machine import facts
 from test.bench.options import Options
 from test.bench.report import Row, table
 from test.soak import core
-from test.soak.long_run import row_of
 
 BLOCKS = 20
 NODE_BLOCK = 5000
@@ -53,8 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps(row), flush=True)
     print(table(rows))
     print(verdict(rows))
-    command = ' '.join(['-m test.soak', *(sys.argv[1:] if arguments is None else arguments)])
-    print(row_of(command, rows, 'the map equals a new one'))
     return 0
 
 

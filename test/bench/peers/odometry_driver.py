@@ -4,9 +4,8 @@
 Feed scans to the odometry of one peer and time it; runs in the environment of the peer.
 
 The job is JSON on stdin: the module, voxel_size_m, the files of the scans, and the file for the
-poses, (S, 4, 4), corrected at the end if the peer closes loops. JSON on stdout has clock time,
-processor time, which depends little on other load, and the memory. Peers print progress on stdout,
-which goes to stderr here.
+poses, (S, 4, 4). JSON on stdout has clock time, processor time, which depends little on other
+load, and the memory. Peers print progress on stdout, which goes to stderr here.
 """
 
 from __future__ import annotations
@@ -36,15 +35,8 @@ def main() -> None:
         milliseconds.append((perf_counter() - start) * 1e3)
         cpu_ms.append((process_time() - cpu_start) * 1e3)
         poses.append(np.array(pose))
-    end = process_time()
-    corrected = odometry.finish() if hasattr(odometry, 'finish') else poses
-    np.save(job['poses'], np.array(corrected))
-    result = {
-        'milliseconds': milliseconds,
-        'cpu_ms': cpu_ms,
-        'finish_s': process_time() - end,
-        'peak_mb': peak_mb(),
-    }
+    np.save(job['poses'], np.array(poses))
+    result = {'milliseconds': milliseconds, 'cpu_ms': cpu_ms, 'peak_mb': peak_mb()}
     json.dump(result, stdout)
     stdout.close()
 

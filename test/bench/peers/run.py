@@ -19,9 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from test.bench.options import Options
 from test.bench.peers import PeerSpec
-from test.bench.street import Street
 
 ROOT = Path(__file__).parents[3]
 
@@ -35,61 +33,11 @@ class PeerError(RuntimeError):
     """A peer cannot be installed or run."""
 
 
-def run_peer(
-    python: str | Path, peer: PeerSpec, options: Options, street: Street, size_m: float
-) -> tuple[list[float], int]:
-    """
-    Return milliseconds of every timed scan, and voxels at the end.
-
-    Raises
-    ------
-    PeerError
-        With the last line that the peer said.
-
-    """
-    numbers = range(options.untimed + options.scans)
-    with tempfile.TemporaryDirectory() as scratch:
-        poses = Path(scratch) / 'poses.npy'
-        np.save(poses, np.array([street.pose(number) for number in numbers]))
-        job = {
-            'module': peer.module,
-            'scans': [str(street.path(number)) for number in numbers],
-            'poses': str(poses),
-            'voxel_size_m': size_m,
-            'window': options.window,
-            'untimed': options.untimed,
-        }
-        command = [str(python), '-m', 'test.bench.peers.driver']
-        result = json.loads(output(command, input=json.dumps(job), cwd=ROOT))
-    return result['milliseconds'], result['num_voxels']
-
-
-def run_normals(
-    python: str | Path, peer: PeerSpec, points: npt.NDArray[np.float64], support: int
-) -> npt.NDArray[np.float64]:
-    """
-    Return the normals of points, (N, 3), from ``support`` nearest neighbours.
-
-    Raises
-    ------
-    PeerError
-        With the last line that the peer said.
-
-    """
-    with tempfile.TemporaryDirectory() as scratch:
-        files = [str(Path(scratch) / name) for name in ('points.npy', 'normals.npy')]
-        np.save(files[0], points)
-        command = [str(python), '-m', 'test.bench.peers.normals_driver', peer.module, *files]
-        output([*command, str(support)], cwd=ROOT)
-        normals: npt.NDArray[np.float64] = np.load(files[1])
-    return normals
-
-
 def run_odometry(
     python: str | Path, peer: PeerSpec, scans: Sequence[Path], size_m: float
 ) -> tuple[dict[str, Any], npt.NDArray[np.float64]]:
     """
-    Return times (milliseconds, cpu_ms, finish_s), peak_mb, and pose of every scan, (S, 4, 4).
+    Return times (milliseconds, cpu_ms), peak_mb, and pose of every scan, (S, 4, 4).
 
     Raises
     ------
