@@ -37,9 +37,7 @@ from surfel_mapper.models.kernels.growth import (
 )
 from surfel_mapper.models.kernels.joining import plane_frames, rename_owners, sort_owners
 from surfel_mapper.models.kernels.voxel_points import (
-    block_noise,
     find_core,
-    LEAST_COSINE,
     merge_owners,
     neighbour_table,
     owner_means,
@@ -61,18 +59,6 @@ CORE_SHARE, CORE_POINTS = 0.12, 8
 
 MOST_SPARSE = 0.3
 """If more voxels are sparse, they are outliers; planes alone clip fewer to sparse ones."""
-
-BLOCKS, BLOCK_POINTS = 120, 100
-"""Blocks for the estimate of the noise, up to twice as many, and most points used in each."""
-
-NOISE_BINS, NOISE_QUANTILE = 4, 0.3
-"""Bins of range; the quantile is below the median, as edges add to the noise of a block."""
-
-LEAST_ALONE, CLIPPED_VOXELS = 0.25, 0.1
-"""Share of the voxels with enough points for an estimate of their own, and the most they tell."""
-
-CLIPPING = 2.0
-"""Correction of sigma by this times its square in voxels, for 5 to 15 mm at 3 cm within 10 %."""
 
 TOLERANCE_SIGMAS, TOLERANCE_VOXELS, MOST_TOLERANCE_VOXELS = 3.0, 0.03, 0.5
 """Tolerance of a patch: sigmas of its points and a share of a voxel, up to half a voxel."""
@@ -144,55 +130,6 @@ class VoxelPoints:
         if len(core):
             find_core(self.starts, self.adjacent, CORE_SHARE, CORE_POINTS, core)
         return core if 1.0 - core.mean() > MOST_SPARSE else np.ones_like(core)
-
-
-def estimate_noise(
-    voxels: VoxelPoints, means: Array, core: npt.NDArray[np.bool_], size_m: float, view: Array
-) -> tuple[float, float]:
-    """
-    Return the noise of the points as n0, m, and n2, 1/m: sigma is n0 + n2 range^2.
-
-    Single voxels clip noise of more than a tenth of a voxel, blocks of three that of more than a
-    third (see CLIPPING), but these contain edges and corners, which are no noise.
-    """
-    rows = np.flatnonzero(core)
-    seeds = rows[:: max(len(rows) // BLOCKS, 1)]
-    range_sq = ((means[seeds] - view) ** 2).sum(axis=1)
-    state = voxels.points, voxels.starts, voxels.adjacent
-    sigma: Array = np.empty(len(seeds))
-    for alone in (True, False):
-        block_noise(*state, seeds, alone, BLOCK_POINTS, view, sigma)
-        known = sigma >= 0.0
-        enough = known.sum() >= max(LEAST_ALONE * len(seeds), 1.0)
-        if alone and enough and np.median(sigma[known]) < CLIPPED_VOXELS * size_m:
-            break
-    range_sq, sigma = range_sq[known], sigma[known]
-    if not len(sigma):
-        return 0.0, 0.0
-    bins = NOISE_BINS if len(sigma) >= 10 * NOISE_BINS else 1
-    parts = np.array_split(np.argsort(range_sq, kind='stable'), bins)
-    x = np.array([np.median(range_sq[part]) for part in parts])
-    y = np.array([np.quantile(sigma[part], NOISE_QUANTILE) for part in parts])
-    y *= 1.0 + CLIPPING * (y / size_m) ** 2
-    return line_above_zero(x, y)
-
-
-def line_above_zero(x: Array, y: Array) -> tuple[float, float]:
-    """
-    Return a and b of a + b x, neither negative, nearest to y relative to y.
-
-    If x does not determine b, b is 0: noise at one range says nothing of other ranges.
-    """
-    weight = 1.0 / np.maximum(y, 1e-9)
-    design = np.stack([np.ones_like(x), x], axis=1) * weight[:, None]
-    best, least = (0.0, 0.0), math.inf
-    for used in ([0], [0, 1], [1]):
-        part = np.zeros(2)
-        part[used] = np.linalg.lstsq(design[:, used], y * weight, rcond=None)[0]
-        error = float(((design @ part - y * weight) ** 2).sum())
-        if (part >= 0.0).all() and error < least - 1e-12:
-            best, least = (float(part[0]), float(part[1])), error
-    return best
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,7 +27,6 @@ from surfel_mapper.models.kernels.region_joining import (
     join_smooth,
     Regions,
 )
-from surfel_mapper.models.kernels.voxel_points import LEAST_COSINE
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -37,6 +36,9 @@ LEAST_TOUCH = 2
 
 LAYER_SHARE = 0.6
 """Least share of the voxels of a layer that touch the larger patch."""
+
+LEAST_COSINE = 0.5
+"""Noise is along the ray; at grazing incidence other errors dominate."""
 
 FLOOR_VOXELS = 0.02
 """Residuals are not resolved below this, in voxels: exact surfaces would otherwise never join."""

@@ -9,7 +9,12 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.models.growth import estimate_noise, line_above_zero
+from surfel_mapper.models.cloud_noise import (
+    block_noise,
+    estimate_noise,
+    line_above_zero,
+    neighbourhoods,
+)
 from surfel_mapper.models.kernels import growth
 from surfel_mapper.models.kernels.growth import (
     assign_points,
@@ -20,7 +25,6 @@ from surfel_mapper.models.kernels.growth import (
     SLOTS,
 )
 from surfel_mapper.models.kernels.voxel_points import (
-    block_noise,
     find_core,
     merge_owners,
     owner_means,
@@ -129,9 +133,8 @@ def test_sparse_voxels_are_no_core(call):
     assert core.tolist() == [True, False, False, False, True, True]
 
 
-@both
 @pytest.mark.parametrize(('radius', 'outliers'), [(0.6, 0), (1e3, 0), (1e3, 900)])
-def test_noise_of_blocks_is_that_of_the_points_without_outliers(call, radius, outliers):
+def test_noise_of_blocks_is_that_of_the_points_without_outliers(radius, outliers):
     rng = np.random.default_rng(6)
     xy = rng.uniform(-0.2, 0.2, (9000, 2))
     z = np.sqrt(radius**2 - (xy**2).sum(axis=1)) - radius
@@ -139,13 +142,11 @@ def test_noise_of_blocks_is_that_of_the_points_without_outliers(call, radius, ou
     points[:outliers, 2] = rng.uniform(-0.1, 0.1, outliers)
     _, voxels = by_voxel(points, 0.05)
     full = np.flatnonzero(np.diff(voxels.starts) > 30)[:40]
-    sigma = np.empty(len(full))
-    state, above = (voxels.points, voxels.starts, voxels.adjacent), np.array([0.0, 0.0, 9.0])
-    call(block_noise, *state, full, False, 120, above, sigma)
+    blocks, above = neighbourhoods(voxels, full), np.array([0.0, 0.0, 9.0])
+    sigma = block_noise(voxels, blocks, above, 120)
     assert np.median(sigma) == pytest.approx(0.004, rel=0.15)
     aside = np.array([9.0, 0.0, 9.0 * math.sqrt(1.0 / 3.0)])  # 60 degrees from the normal
-    across = sigma.copy()
-    call(block_noise, *state, full, False, 120, aside, sigma)
+    across, sigma = sigma, block_noise(voxels, blocks, aside, 120)
     if radius > 1.0:  # noise is along the ray
         assert np.median(sigma) == pytest.approx(2.0 * np.median(across), rel=0.02)
 
