@@ -4,8 +4,8 @@
 Eigenvalues and eigenvectors of symmetric 3 by 3 matrices, of many at once or of one.
 
 ``decompose`` finds the eigenvalues and the eigenvector of the smallest one, ``eigenvectors`` the
-other two eigenvectors. No trigonometry, no iteration and no branches, so that the compiler
-vectorises the loops. ``eigen_frame`` finds all of a single matrix by Jacobi rotations.
+other two eigenvectors. No trigonometry, no iteration of unknown length and no branches, so that
+the compiler vectorises the loops.
 
 The deviator scaled to B (trace 0, |B|^2 = 6) has eigenvalues t with t^3 - 3 t = det B. The one
 farthest from the other two is a well-conditioned root, at least 3^(1/2) away from both; its
@@ -33,9 +33,6 @@ NOISE = 1e-15
 """Eigenvalues below this share of the trace are rounding errors, and become 0."""
 
 SIXTH = 1.0 / 6.0
-
-MOST_SWEEPS = 8
-"""Jacobi rotations of each pair of axes; the error is squared with each, so five suffice."""
 
 CHUNK = 128
 """Matrices decomposed together: their intermediate results stay in the first-level cache."""
@@ -300,72 +297,3 @@ def store(vectors, i, k, x, y, z):
         leading = z
     side = -1.0 if leading < 0.0 else 1.0
     vectors[i, k, 0], vectors[i, k, 1], vectors[i, k, 2] = side * x, side * y, side * z
-
-
-@part(error_model='numpy')
-def rotate_axes(matrix, vectors, p, q):
-    """Turn two axes so that element p, q of a matrix becomes 0; vectors are turned alike."""
-    theta = 0.5 * (matrix[q, q] - matrix[p, p]) / matrix[p, q]
-    tangent = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
-    tangent = -tangent if theta < 0.0 else tangent
-    cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
-    sine = tangent * cosine
-    matrix[p, p] -= tangent * matrix[p, q]
-    matrix[q, q] += tangent * matrix[p, q]
-    r = 3 - p - q
-    a, b = matrix[r, p], matrix[r, q]
-    matrix[p, q] = matrix[q, p] = 0.0
-    matrix[r, p] = matrix[p, r] = cosine * a - sine * b
-    matrix[r, q] = matrix[q, r] = sine * a + cosine * b
-    for j in range(3):
-        a, b = vectors[p, j], vectors[q, j]
-        vectors[p, j], vectors[q, j] = cosine * a - sine * b, sine * a + cosine * b
-
-
-@kernel(error_model='numpy')
-def eigen_frame(matrix, values, vectors):
-    """
-    Decompose one matrix by Jacobi rotations.
-
-    matrix   (3, 3) float64, symmetric, positive semidefinite; is overwritten
-    values   (3,) float64, out: ascending, none negative
-    vectors  (3, 3) float64, out: row k is the unit eigenvector of values[k], its component of
-             largest magnitude positive; the identity if all values are 0
-
-    A fifth of the code of ``decompose`` and ``eigenvectors``, which vectorise over many matrices:
-    each kernel that calls this compiles it.
-    """
-    for i in range(3):
-        for j in range(3):
-            vectors[i, j] = 1.0 if i == j else 0.0
-    noise = NOISE * (matrix[0, 0] + matrix[1, 1] + matrix[2, 2])
-    zeros = 0
-    for turn in range(3 * MOST_SWEEPS):
-        p, q = turn % 3, (turn + 1) % 3
-        if abs(matrix[p, q]) > 1e-3 * noise:
-            rotate_axes(matrix, vectors, p, q)
-            zeros = 0
-        zeros += 1
-        if zeros == 3:
-            break
-    for i in range(3):
-        values[i] = matrix[i, i] if matrix[i, i] >= noise else 0.0
-    for turn in range(3):
-        i = turn % 2
-        if values[i] > values[i + 1]:
-            values[i], values[i + 1] = values[i + 1], values[i]
-            for j in range(3):
-                vectors[i, j], vectors[i + 1, j] = vectors[i + 1, j], vectors[i, j]
-    for i in range(3):
-        leading = 0.0
-        for j in range(3):
-            leading = vectors[i, j] if abs(vectors[i, j]) > abs(leading) else leading
-        for j in range(3):
-            vectors[i, j] = -vectors[i, j] if leading < 0.0 else vectors[i, j]
-
-
-@kernel(error_model='numpy')
-def eigen_frames(matrices, values, vectors):
-    """Decompose matrices (K, 3, 3) into values (K, 3) and vectors (K, 3, 3) by eigen_frame."""
-    for k in range(len(matrices)):
-        eigen_frame(matrices[k], values[k], vectors[k])

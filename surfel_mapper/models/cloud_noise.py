@@ -131,7 +131,7 @@ def block_noise(
 
 
 def sampled(voxels: VoxelPoints, blocks: Indices, most: int) -> tuple[Array, Array]:
-    """Return evenly chosen points (B, most, 3) of the voxels of each block, and weights, 1 or 0."""
+    """Return evenly chosen points (B, most, 3) of each block, and their weights, 1 or 0."""
     is_voxel, starts = blocks >= 0, voxels.starts
     counts = np.where(is_voxel, starts[blocks + 1] - starts[blocks], 0)
     ends = counts.cumsum(axis=1)

@@ -26,19 +26,19 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.models.joining import join_patches, Pieces
+from surfel_mapper.models.frames import eigen, means_and_scatters, plane_frames
+from surfel_mapper.models.joining import join_patches, LEAST_COSINE, Pieces
+from surfel_mapper.models.kernels.frames import LEAST_WIDTH
 from surfel_mapper.models.kernels.growth import (
     assign_points,
-    classify_free,
     find_facets,
+    FREE,
     grow_patches,
-    sample_distances,
     SLOTS,
 )
-from surfel_mapper.models.kernels.joining import plane_frames, rename_owners, sort_owners
+from surfel_mapper.models.kernels.joining import sort_owners
 from surfel_mapper.models.kernels.voxel_points import (
     find_core,
-    merge_owners,
     neighbour_table,
     owner_means,
 )
@@ -75,6 +75,9 @@ SAMPLES = 20_000
 RESOLVED_VOXELS = 0.2
 """Tolerance of facets in voxels of the cloud, or sigmas: in clutter patches are thicker."""
 
+LEAST_POINTS = 6
+"""Points that determine the plane of a voxel, at least."""
+
 FLAT_VOXELS = 0.6
 """Thickness of a flat voxel, 6 sigma, at most."""
 
@@ -94,7 +97,7 @@ class VoxelPoints:
 
     Attributes
     ----------
-    points : (P, 3) float32 or float64, m
+    points : (P, 3) float64, m
     rows : (P,) int32
         Row of each in the cloud.
     starts : (V + 1,) int64
@@ -104,7 +107,7 @@ class VoxelPoints:
 
     """
 
-    points: npt.NDArray[np.floating]
+    points: Array
     rows: npt.NDArray[np.int32]
     starts: Indices
     adjacent: tuple[Indices, npt.NDArray[np.int32]]
@@ -112,7 +115,7 @@ class VoxelPoints:
     @classmethod
     def of(
         cls,
-        points: npt.NDArray[np.floating],
+        points: Array,
         rows: npt.NDArray[np.int32],
         starts: Indices,
         keys: Indices,
@@ -209,9 +212,19 @@ def grow(
     num = len(patches) + len(add_facets(voxels, owner, len(patches), (size_m, facet_m), config))
     table = owner_table(voxels, owner)
     index, normals, curved = join_patches(pieces_of(voxels, table, num), view, noise, size_m)
-    rename_owners(voxels.starts, group, index, owner)
-    rename_owners(table[3], group, index, table[0])
-    return grown(owner, table, normals, curved, median_m)
+    owner = renamed(voxels.starts, group, index, owner)
+    return grown(owner, owner_table(voxels, owner), normals, curved, median_m)
+
+
+def renamed(starts: Indices, group: Owners, index: Owners, owner: Owners) -> Owners:
+    """
+    Return owners (P,), where patch k is index[k] and a free one -1 less the group of its voxel.
+
+    starts: first owner of each voxel, (V + 1,)
+    """
+    free = -1 - np.repeat(group, np.diff(starts))
+    found: Owners = np.where(owner >= 0, np.append(index, 0)[owner], free).astype(np.int32)
+    return found
 
 
 def grown(
@@ -221,11 +234,9 @@ def grown(
     curved: npt.NDArray[np.bool_],
     tolerance_m: float,
 ) -> Grown:
-    """Return the points by patch; the table is consumed."""
-    held = merge_owners(*table)
-    owners, first = table[0][:held], table[3]
-    low = min(int(owners.min(initial=0)), 0)
-    starts, _, points, _ = sorted_table((owners, *table[1:3], first), low, len(normals) - low)
+    """Return the points by patch."""
+    low = min(int(table[0].min(initial=0)), 0)
+    starts, _, points, _ = sorted_table(table, low, len(normals) - low)
     names = np.repeat(np.arange(low, len(normals), dtype=np.int32), np.diff(starts))
     return Grown(owner, points, names, normals, curved, tolerance_m)
 
@@ -298,8 +309,7 @@ def extend_planes(
         return
     table = owner_table(voxels, owner)
     starts, voxel, points, weights = sorted_table(table, 0, number)
-    means, normals, values = np.empty((3, number, 3))
-    plane_frames(points, weights, starts, means, normals, values)
+    means, normals, values = plane_frames(points, weights, starts)
     planes = np.column_stack([normals, -np.einsum('ij,ij->i', normals, means)])
     sigma = np.sqrt(np.maximum(values[:, 0], 0.0))
     tolerance = np.minimum(TOLERANCE_SIGMAS * sigma, FAR_SIGMAS * sigma + sizes[1])
@@ -343,7 +353,9 @@ def add_facets(
     )
     planes = np.empty((number + MOST_FACETS, 4))
     state = voxels.points, voxels.starts, voxels.adjacent
-    num = find_facets(*state, free, rules, owner, planes, number)
+    seeds = np.flatnonzero(free[1])
+    seeds = seeds[np.argsort(-free[0][seeds], kind='stable')]
+    num = find_facets(*state, free, seeds, rules, owner, planes, number)
     return planes[number:num, :3]
 
 
@@ -378,11 +390,13 @@ def tolerances(
 ) -> Array:
     """Return the distance (K,) up to which a point lies on each patch, m; noise (K,) across it."""
     number = len(noise)
-    held = int(np.diff(voxels.starts)[label >= 0].sum())
-    who, distance = np.empty(held, np.int32), np.empty(held)
-    stride = 1 + held // SAMPLES
-    num = sample_distances(voxels.points, voxels.starts, label, tangent, stride, who, distance)
-    order = np.argsort(who[:num], kind='stable')
+    voxel = np.repeat(np.arange(len(label)), np.diff(voxels.starts))
+    rows = np.flatnonzero(label[voxel] >= 0)
+    rows = rows[:: 1 + len(rows) // SAMPLES]
+    voxel = voxel[rows]
+    who, plane = label[voxel], tangent[voxel]
+    distance = np.abs(np.einsum('ij,ij->i', voxels.points[rows], plane[:, :3]) + plane[:, 3])
+    order = np.argsort(who, kind='stable')
     ends = np.searchsorted(who[order], np.arange(1, number))
     sigma = [
         1.4826 * float(np.median(part)) if len(part) else 0.0
@@ -398,9 +412,13 @@ def free_surfels(
     voxels: VoxelPoints, owner: Owners, size_m: float, tolerance_m: float
 ) -> FreeSurfels:
     """Return number, flatness, mean and normal of the free points of every voxel."""
-    number = len(voxels.starts) - 1
-    count, flat = np.empty(number, np.int64), np.empty(number, np.bool_)
-    mean, normal = np.zeros((number, 3)), np.zeros((number, 3))
     thickness = min(FLAT_VOXELS * size_m, 8.0 / TOLERANCE_SIGMAS * tolerance_m)
-    classify_free(voxels.points, voxels.starts, owner, thickness, count, flat, mean, normal)
-    return count, flat, mean, normal
+    weights = (owner == FREE).astype(np.float64)
+    total, mean, scatters = means_and_scatters(voxels.points, weights, voxels.starts)
+    flat, normal = np.zeros(len(total), np.bool_), np.zeros_like(mean)
+    enough = np.flatnonzero(total >= LEAST_POINTS)
+    values, axes = eigen(scatters[enough] / total[enough, None, None])
+    is_flat = 36.0 * values[:, 0] < thickness**2
+    is_flat &= values[:, 1] > LEAST_WIDTH * values[:, 2]
+    flat[enough], normal[enough] = is_flat, axes[:, 0]
+    return total.astype(np.int64), flat, mean, normal

@@ -22,11 +22,10 @@ from surfel_mapper.models.bspline import fit_grids, HeightField, is_small
 from surfel_mapper.models.bspline_incremental import DEGREE, fit_field, FittedField, SMOOTHING
 from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.kernels.bspline import rms_off_field
-from surfel_mapper.models.kernels.patches import describe_patches
 from surfel_mapper.models.kernels.surfel_classes import FLAT
 from surfel_mapper.models.kernels.surfel_groups import mean_normals, merge_voxels, sample_voxels
 from surfel_mapper.models.multi_model import Plane, Surface
-from surfel_mapper.models.patches import cells_of, PatchPoints, rms_across
+from surfel_mapper.models.patches import cells_of, described, PatchPoints, rms_across
 from surfel_mapper.models.surfel_graph import SurfelGraph
 
 Array = npt.NDArray[np.float64]
@@ -176,8 +175,8 @@ class PatchFitter:
         samples, frames, curved, means = groups.samples, groups.frames, groups.curved, groups.means
         origins, stays = self._steadied(before, groups)
         pitches = np.where(curved, self._surface_pitch_m, PLANE_PITCH_VOXELS * self._size_m)
-        placed = origins, frames, pitches, np.empty_like(samples.points)
-        cells = cells_of(samples, placed, 0.5 * self._size_m, snapped=True)
+        placed = origins, frames, pitches
+        cells, _ = cells_of(samples, placed, 0.5 * self._size_m, snapped=True)
         known = [t.fitted if t and stay else None for t, stay in zip(before, stays, strict=True)]
         ends = np.array([len(part) for part in beyond])
         fields = self._fields(cells, np.flatnonzero(curved & (ends == 0)), known)
@@ -221,8 +220,7 @@ class PatchFitter:
         starts = np.concatenate([[0], ends])
         groups = PatchPoints(points, starts, samples.normals[chosen], samples.thickness[chosen])
         origins, axes, pitches = (part[chosen] for part in frames)
-        placed = origins, axes, pitches, np.empty_like(points)
-        return cells_of(groups, placed, 0.5 * self._size_m, snapped=True)
+        return cells_of(groups, (origins, axes, pitches), 0.5 * self._size_m, snapped=True)[0]
 
     def _fields(
         self, cells: Cells, chosen: Indices, before: list[FittedField | None]
@@ -260,20 +258,8 @@ class PatchFitter:
 
     def _frames(self, groups: PatchPoints) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Return the frames (K, 3, 3) of groups as surfaces, and whether they are curved."""
-        number = len(groups.thickness)
-        means, frames = np.empty((number, 3)), np.empty((number, 3, 3))
-        covariances, curved = np.empty((number, 3, 3)), np.empty(number, np.bool_)
-        describe_patches(
-            groups.points,
-            groups.starts,
-            groups.normals,
-            np.zeros(3),
-            (groups.thickness, self._surface_pitch_m, True, True),
-            means,
-            covariances,
-            frames,
-            curved,
-        )
+        rules = groups.thickness, self._surface_pitch_m, True, True
+        _, _, frames, curved = described(groups, np.zeros(3), rules)
         return frames, curved
 
     def _steadied(

@@ -83,8 +83,8 @@ def with_smooth_seams(
     means = np.array([surfaces[number].mean for number in chosen])
     frames = np.array([surfaces[number].R_patch_map for number in chosen])
     pitches = np.full(len(chosen), PITCH_VOXELS * config.voxel_size_m)
-    placed = means, frames, pitches, np.empty_like(groups.points)
-    cells = cells_of(groups, placed, config.voxel_size_m, snapped=True)
+    placed = means, frames, pitches
+    cells, _ = cells_of(groups, placed, config.voxel_size_m, snapped=True)
     splines = splines_of(cells, np.arange(len(chosen)), config)
     found = list(surfaces)
     for k, number in enumerate(chosen):

@@ -11,7 +11,7 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.symmetric3 import eigen_frame
+from surfel_mapper.models.kernels.frames import eigen_frame
 
 MEANS_ITERATIONS = 20
 """Most iterations of 2-means on normals."""

@@ -8,46 +8,15 @@ neighbours of a voxel are in nine rows along x. One pass with a place in the sor
 row finds all without a hash table, in 8 ns a voxel and row.
 """
 
-from numba import njit
 import numpy as np
 
-from surfel_mapper.models.kernels.voxel_means import CHUNK, LENGTH_BITS
+from surfel_mapper.kernels.compiling import kernel
 
 WIDER_ROUNDS = 2
 """Outliers without points around them are compared with voxels one farther away in each round."""
 
 
-@njit(cache=True, nogil=True)
-def gather_voxels(points, runs, to_key, gathered, rows, starts, keys):
-    """
-    Copy points voxel by voxel; return how many points there are.
-
-    points    (N, 3) float32 or float64, m
-    runs      (R,) int64, sorted; to_key: bits of row and length, see voxel_means.py
-    gathered  (N, 3), dtype of points, out
-    rows      (N,) int32, out: row of each in points
-    starts    (V + 1,) int64, out: first point of each voxel
-    keys      (V,) int64, out
-    """
-    row_mask = (np.int64(1) << to_key) - 1
-    previous, voxel, place = np.int64(-1), -1, 0
-    for run in runs:
-        key = run >> to_key
-        if key != previous:
-            voxel += 1
-            starts[voxel], keys[voxel] = place, key
-            previous = key
-        first = (run & row_mask) >> LENGTH_BITS
-        for i in range(first, first + (run & (CHUNK - 1)) + 1):
-            for j in range(3):
-                gathered[place, j] = points[i, j]
-            rows[place] = i
-            place += 1
-    starts[voxel + 1] = place
-    return place
-
-
-@njit(cache=True, nogil=True)
+@kernel(error_model='numpy')
 def neighbour_table(keys, to_y, to_z, starts, rows):
     """
     List the occupied ones of the 26 neighbours of every voxel.
@@ -79,7 +48,7 @@ def neighbour_table(keys, to_y, to_z, starts, rows):
     starts[len(keys)] = num
 
 
-@njit(cache=True, nogil=True)
+@kernel(error_model='numpy')
 def find_core(starts, adjacent, share, least, core):
     """
     Find voxels that are not sparse compared with the densest voxel near them.
@@ -107,7 +76,7 @@ def find_core(starts, adjacent, share, least, core):
         core[v] = most[v] < least or starts[v + 1] - starts[v] >= share * most[v]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def owner_means(points, starts, owner, owners, means, counts, first):
     """
     Average the points of each voxel that have the same owner; return how many means there are.
@@ -137,33 +106,4 @@ def owner_means(points, starts, owner, owners, means, counts, first):
             for j in range(3):
                 means[k, j] /= counts[k]
     first[len(starts) - 1] = num
-    return num
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def merge_owners(owners, means, counts, first):
-    """
-    Merge the means of a voxel that have the same owner, in place; return how many are left.
-
-    owners, means, counts, first  of owner_means, with new owners
-    """
-    num = 0
-    for v in range(len(first) - 1):
-        low, high, begin = first[v], first[v + 1], num
-        first[v] = begin
-        for i in range(low, high):
-            k = begin
-            while k < num and owners[k] != owners[i]:
-                k += 1
-            if k == num:
-                owners[k], counts[k] = owners[i], counts[i]
-                for j in range(3):
-                    means[k, j] = means[i, j]
-                num += 1
-                continue
-            share = counts[i] / (counts[i] + counts[k])
-            for j in range(3):
-                means[k, j] += share * (means[i, j] - means[k, j])
-            counts[k] += counts[i]
-    first[len(first) - 1] = num
     return num
