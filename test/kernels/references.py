@@ -53,7 +53,6 @@ REFERENCES = {
     'models/kernels/outlines.py': 'models/test_outlines.py',
     'models/kernels/region_merging.py': 'models/kernels/test_patches.py',
     'models/kernels/region_joining.py': 'models/kernels/test_region_joining.py',
-    'models/kernels/seams.py': 'models/test_seams.py',
     'models/kernels/surfel_classes.py': 'models/kernels/test_surfels.py',
     'models/kernels/surfel_groups.py': 'models/kernels/test_surfels.py',
     'models/kernels/surfel_links.py': 'models/kernels/test_surfels.py',

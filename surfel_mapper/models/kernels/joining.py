@@ -91,7 +91,7 @@ def touching_patches(starts, voxel, adjacent, first, owners, pairs):
     return num
 
 
-@kernel(error_model='numpy')
+@part(error_model='numpy')
 def gather(rows, number, stride, points, weights, found, low):
     """
     Copy every stride-th of the first ``number`` rows as height_errors takes them; return the end.
@@ -109,7 +109,7 @@ def gather(rows, number, stride, points, weights, found, low):
     return low
 
 
-@kernel(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
+@part(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
 def height_errors(points, low, high, normal, errors):
     """
     Fit height fields of degree 1, 2 and 4 over a plane; return by how much the quadric turns, rad.

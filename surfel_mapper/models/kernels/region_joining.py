@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import kernel, part, stay_apart
 from surfel_mapper.models.kernels.joining import gather, height_errors, TERMS
 
 JOIN_COSINE = math.cos(math.radians(50.0))
@@ -164,20 +164,25 @@ def join_smooth(edges, adjacent, points, weights, starts, boxes, floor, regions)
     scratch = np.empty((2, len(points)), np.int64), np.empty((4, 2 * len(points)))
     root, patches = regions.root, regions.patches
     heap = [(math.inf, np.int64(-1), np.int64(-1), np.int64(0), np.int64(0))]  # the last
-    marked = np.empty(len(root), np.int64)
+    marked, joined = np.empty(len(root), np.int64), 0
+    pairs, num = np.empty((len(edges) + len(root) + 1, 2), np.int64), len(edges)
     for k in range(len(root)):
         marked[k] = -1
     for i in range(len(edges)):
-        push(heap, edges[i, 0], edges[i, 1], state, scratch, regions)
-    joined = 0
-    while heap[0][0] < 0.0:
+        pairs[i, 0], pairs[i, 1] = edges[i, 0], edges[i, 1]
+    while True:
+        for i in range(num):
+            push(heap, pairs[i, 0], pairs[i, 1], state, scratch, regions)
+        num = 0
+        if not heap[0][0] < 0.0:
+            break
         _, a, b, size_a, size_b = heappop(heap)
         if root[a] != a or root[b] != b:
             continue
         if patches[a] != size_a or patches[b] != size_b:
             known_a = patches[a] == size_a or size_a > LARGE_REGION
             if known_a and (patches[b] == size_b or size_b > LARGE_REGION):
-                push(heap, a, b, state, scratch, regions)
+                pairs[0, 0], pairs[0, 1], num = a, b, 1
             continue
         small, large = (a, b) if regions.rows[a] < regions.rows[b] else (b, a)
         patch = large if patches[large] <= LARGE_REGION else small  # a chain ends with the latest
@@ -187,12 +192,13 @@ def join_smooth(edges, adjacent, points, weights, starts, boxes, floor, regions)
                 other = root[others[n]]
                 if other != large and marked[other] != joined:
                     marked[other] = joined
-                    push(heap, large, other, state, scratch, regions)
+                    pairs[num, 0], pairs[num, 1] = large, other
+                    num += 1
             patch = regions.after[patch]
         joined += 1
 
 
-@kernel(error_model='numpy')
+@part(error_model='numpy')
 def push(heap, a, b, state, scratch, regions):
     """Queue a pair that gains by being joined."""
     gain = gain_of(a, b, state, scratch, regions)
@@ -228,22 +234,28 @@ def gain_of(a, b, state, scratch, regions):
     num_a = rows_near(a, small, state, regions, rows[0])
     num_b = rows_near(b, small, state, regions, rows[1])
     stride = 1 + (num_a + num_b) // MOST_ROWS
-    middle = gather(rows[0], num_a, stride, state[0], state[1], points, 0)
-    end = gather(rows[1], num_b, stride, state[0], state[1], points, middle)
+    middle = end = 0
+    for side in range(2):
+        middle = end
+        number = num_b if side else num_a
+        end = gather(rows[side], number, stride, state[0], state[1], points, middle)
     least = min(middle, end - middle)
     if least < 3:
         return 0.0
-    floor, gain = state[4], 0.0
-    both = heights(points, 0, end, normals[2], True, floor)
     rms_m = max(regions.patch_sigma[a], regions.patch_sigma[b])
-    for quartic in range(2):
-        heights_a = heights(points, 0, middle, normals[0], quartic > 0, floor)
-        heights_b = heights(points, middle, end, normals[1], quartic > 0, floor)
-        rms_m = max(rms_m, heights_a[2], heights_b[2])
-        gain = heights_a[0] + heights_b[0] - both[0]
-        if not gain > 0.0:  # quartics only lower it
+    both_m = gain = cost = 0.0
+    for turn in range(5):  # both, then each, then each with quartics, which only lower the gain
+        if turn == 3 and not gain > 0.0:
             break
-    if cosine > COPLANAR_COSINE and both[2] < COPLANAR_GROWTH * rms_m:
+        low, high = middle if turn % 2 == 0 and turn else 0, middle if turn % 2 else end
+        normal = normals[2] if turn == 0 else normals[(turn - 1) % 2]
+        fit = heights(points, low, high, normal, turn == 0 or turn > 2, state[4])
+        if turn == 0:
+            cost, both_m = fit[0], fit[2]
+        else:
+            gain = (gain if turn % 2 == 0 else -cost) + fit[0]
+            rms_m = max(rms_m, fit[2])
+    if cosine > COPLANAR_COSINE and both_m < COPLANAR_GROWTH * rms_m:
         gain = max(gain, float(least))
     return gain
 
@@ -279,7 +291,7 @@ def rows_near(region, small, state, regions, rows):
     return num
 
 
-@kernel(error_model='numpy')
+@kernel(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
 def heights(points, low, high, normal, quartic, floor):
     """
     Fit height fields to columns low to high - 1 of points (4, n) over a plane.
@@ -288,6 +300,7 @@ def heights(points, low, high, normal, quartic, floor):
 
     Returns cost, cost of a plane, rms from a plane m, turn rad, and bend m of the quadric.
     """
+    stay_apart()
     number = high - low
     tries = 3 if quartic and number > POINTS_PER_TERM * TERMS[2] else 2
     errors = np.empty(tries)
