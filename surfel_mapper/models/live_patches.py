@@ -18,10 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.mapping.moments import unpack_keys
-from surfel_mapper.models.bspline import fit_grids, HeightField, is_small
-from surfel_mapper.models.bspline_incremental import DEGREE, fit_field, FittedField, SMOOTHING
+from surfel_mapper.models.bspline import fit_cells, HeightField
+from surfel_mapper.models.bspline_incremental import (
+    DEGREE,
+    fit_field,
+    FittedField,
+    is_large,
+    SMOOTHING,
+)
 from surfel_mapper.models.grid import Cells
-from surfel_mapper.models.kernels.bspline import rms_off_field
 from surfel_mapper.models.kernels.surfel_classes import FLAT
 from surfel_mapper.models.kernels.surfel_groups import mean_normals, merge_voxels, sample_voxels
 from surfel_mapper.models.multi_model import Plane, Surface
@@ -226,16 +231,14 @@ class PatchFitter:
         self, cells: Cells, chosen: Indices, before: list[FittedField | None]
     ) -> dict[int, FittedField]:
         """Return the fields of chosen patches: small ones anew, large ones near changes."""
-        small = is_small(cells.sizes[chosen], DEGREE)
-        fitted, heights = fit_grids(cells, chosen[small], DEGREE, SMOOTHING)
-        found = {
-            k: FittedField(field, heights[cells.of(k)].reshape(cells.sizes[k]).copy())
-            for k, field in zip(chosen[small].tolist(), fitted, strict=True)
-        }
-        for k in chosen[~small].tolist():
-            sums = cells.sums[cells.of(k)].reshape(*cells.sizes[k], 4)
-            pitch_m, origin = float(cells.pitches[k]), cells.origins[k].copy()
-            found[k] = fit_field(pitch_m, origin, sums, before[k], self._still_m)
+        found = {}
+        for k in chosen.tolist():
+            if is_large(cells.sizes[k]):
+                sums = cells.sums[cells.of(k)].reshape(*cells.sizes[k], 4)
+                pitch_m, origin = float(cells.pitches[k]), cells.origins[k].copy()
+                found[k] = fit_field(pitch_m, origin, sums, before[k], self._still_m)
+            else:
+                found[k] = FittedField(*fit_cells(cells, k, DEGREE, SMOOTHING))
         return found
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
@@ -294,9 +297,11 @@ class PatchFitter:
 
     def _rms_m(self, field: HeightField, frame: Array, origin: Array, rows: Rows) -> float:
         """Return the root mean square distance of the points of voxels from a field, m."""
-        held = self._graph.count, self._graph.position, self._graph.eigenvalues
-        found: float = rms_off_field(rows, held, frame, origin, field.parts())
-        return found
+        graph = self._graph
+        local = (graph.position[rows] - origin) @ frame.T
+        away = local[:, 2] - field.heights(local[:, :2])
+        squares = away**2 + graph.eigenvalues[rows, 0]
+        return float(np.sqrt(np.average(squares, weights=graph.count[rows])))
 
 
 def turned(x: Array, normals: Array) -> Array:

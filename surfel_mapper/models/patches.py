@@ -15,14 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.models.bspline import (
-    fit_grids,
-    fit_lsqr,
-    fit_pspline,
-    HeightField,
-    initial_field,
-    is_small,
-)
+from surfel_mapper.models.bspline import fit_cells, HeightField
 from surfel_mapper.models.frames import eigen, means_and_scatters
 from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.multi_model import Plane, Surface
@@ -223,25 +216,8 @@ def cells_of(
 def splines_of(cells: Cells, curved: Indices, config: ModelsConfig) -> dict[int, HeightField]:
     """Return the splines of the curved patches."""
     by_lsqr = is_paper(config) or config.solver == 'lsqr'
-    together = is_small(cells.sizes[curved], config.degree) & (not by_lsqr)
-    chosen = curved[together]
-    fields, _ = fit_grids(cells, chosen, config.degree, config.smoothing)
-    found = dict(zip(chosen.tolist(), fields, strict=True))
-    for k in curved[~together].tolist():
-        sums, shape = cells.sums[cells.of(k)], cells.sizes[k]
-        used = sums[:, 3] > 0.0
-        means = np.zeros((len(sums), 3))
-        means[used] = sums[used, :3] / sums[used, 3:]
-        heights, filled = means[:, 2].reshape(shape), used.reshape(shape)
-        pitch_m = float(cells.pitches[k])
-        start = initial_field(pitch_m, cells.origins[k], heights, filled, config.degree)
-        xy, z = means[used, :2], means[used, 2]
-        found[k] = (
-            fit_lsqr(start, xy, z)
-            if by_lsqr
-            else fit_pspline(start, xy, z, sums[used, 3], config.smoothing)
-        )
-    return found
+    smoothing = None if by_lsqr else config.smoothing
+    return {k: fit_cells(cells, k, config.degree, smoothing)[0] for k in curved.tolist()}
 
 
 def surface_of(plane: Plane, spline: HeightField, points: Array, far_m: float) -> Surface | None:

@@ -43,8 +43,6 @@ REFERENCES = {
     'messages/kernels/discs.py': 'messages/test_surfel_markers.py',
     'messages/kernels/triangles.py': 'messages/test_surfel_markers.py',
     'models/kernels/bisection.py': 'models/kernels/test_bisection.py',
-    'models/kernels/bspline.py': 'models/test_bspline.py',
-    'models/kernels/bspline_incremental.py': 'models/kernels/test_bspline_incremental.py',
     'models/kernels/charts.py': 'models/kernels/test_charts.py',
     'models/kernels/frames.py': 'models/kernels/test_frames.py',
     'models/kernels/gaussian_mixture.py': 'models/kernels/test_bisection.py',
