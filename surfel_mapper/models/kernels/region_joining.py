@@ -234,7 +234,8 @@ def gain_of(a, b, state, scratch, regions):
     num_a = rows_near(a, small, state, regions, rows[0])
     num_b = rows_near(b, small, state, regions, rows[1])
     stride = 1 + (num_a + num_b) // MOST_ROWS
-    middle = end = 0
+    zero = np.int64(0)  # a literal would be compiled for on its own
+    middle = end = zero
     for side in range(2):
         middle = end
         number = num_b if side else num_a
@@ -247,7 +248,7 @@ def gain_of(a, b, state, scratch, regions):
     for turn in range(5):  # both, then each, then each with quartics, which only lower the gain
         if turn == 3 and not gain > 0.0:
             break
-        low, high = middle if turn % 2 == 0 and turn else 0, middle if turn % 2 else end
+        low, high = middle if turn % 2 == 0 and turn else zero, middle if turn % 2 else end
         normal = normals[2] if turn == 0 else normals[(turn - 1) % 2]
         fit = heights(points, low, high, normal, turn == 0 or turn > 2, state[4])
         if turn == 0:
@@ -329,14 +330,15 @@ def describe_regions(names, state, regions, limits, normals, found):
     """
     points, weights, _, _, floor = state
     rows, own = np.empty(len(points), np.int64), np.empty((4, len(points)))
+    zero = np.int64(0)
     for k in range(len(names)):
         for j in range(3):
             normals[k, j] = regions.normal[names[k], j]
         normalise(normals[k])
         number = rows_near(names[k], names[k], state, regions, rows)
-        end = gather(rows, number, 1 + number // MOST_ROWS, points, weights, own, 0)
+        end = gather(rows, number, 1 + number // MOST_ROWS, points, weights, own, zero)
         for quartic in range(2):
-            best, plane, sigma, turn, bend = heights(own, 0, end, normals[k], quartic > 0, floor)
+            best, plane, sigma, turn, bend = heights(own, zero, end, normals[k], quartic > 0, floor)
             found[k, 0], found[k, 1], found[k, 2], found[k, 3] = plane - best, turn, bend, sigma
             if not (turn > limits[1] and bend > limits[2] and plane - best <= limits[0]):
                 break
