@@ -176,16 +176,16 @@ def relaxed(
 
 def influential(filled: Mask, field: HeightField) -> Mask:
     """Return the control points (Nx + 2, Ny + 2) on which heights in cells (Nx, Ny) depend."""
-    sides = []
+    found = filled
     for axis, number in enumerate(filled.shape):
         degree, knot = field.degrees[axis], knots(number, field.degrees[axis])
         ends = (np.arange(number + 1) + 0.5) / (number + 1)  # of the cells, as parameters
         spans = np.clip(np.searchsorted(knot, ends, side='right') - 1, degree, number + 1)
-        first, last = spans[:-1] - degree, spans[1:]
-        point = np.arange(number + 2)
-        sides.append((first[:, None] <= point) & (point <= last[:, None]))
-    x, y = (side.astype(np.float64) for side in sides)
-    return np.asarray(x.T @ filled @ y > 0.0, np.bool_)
+        points = np.zeros((number + 2, found.shape[1]), np.bool_)
+        for cell, (low, high) in enumerate(zip(spans[:-1] - degree, spans[1:] + 1, strict=True)):
+            points[low:high] |= found[cell]
+        found = points.T
+    return found
 
 
 def near_cells(touched: Mask) -> Mask:

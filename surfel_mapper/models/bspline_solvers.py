@@ -149,32 +149,63 @@ def relax(
     parts = [sparse(rows, values, control.size)]
     parts += differences(places, active, free, np.sqrt(smoothing))
     x = control.ravel().copy()
-    residual = ridge * -x
+    place = np.flatnonzero(free)
+    residual = -ridge * x[place]
+    diagonal, pairs = np.full(len(place), ridge), []
     for number, matrix in enumerate(parts):
         missing = -(matrix @ x)
         missing += samples.z[used] * weight if number == 0 else 0.0
-        residual += matrix.T @ missing
-    diagonal = ridge + sum(matrix.multiply(matrix).sum(axis=0) for matrix in parts)
-    inverse = np.where(free, 1.0 / np.asarray(diagonal).ravel(), 0.0)
-    parts = [(matrix, matrix.T.tocsr()) for matrix in parts]
-    residual *= free
+        matrix = matrix[:, place]
+        pairs.append((matrix, matrix.T.tocsr()))
+        residual += pairs[-1][1] @ missing
+        diagonal += np.asarray(matrix.multiply(matrix).sum(axis=0)).ravel()
+    x[place] += conjugate_gradients(pairs, residual, diagonal, ridge, last_m)
+    return x.reshape(control.shape).copy()
+
+
+def conjugate_gradients(
+    pairs: list[tuple[Any, Any]], residual: Array, diagonal: Array, ridge: float, last_m: float
+) -> Array:
+    """
+    Return the solution (n,) for a right side (n,), which is overwritten.
+
+    Parameters
+    ----------
+    pairs : list of (sparse matrix, sparse matrix)
+        Matrices (M, n), and their transposes: the system is the sum of the squares and the ridge.
+    residual, diagonal : (n,) float64
+        Right side, and diagonal of the system.
+    ridge : float
+        Added to the diagonal.
+    last_m : float
+        Length of the last step.
+
+    """
+    x, inverse = np.zeros(len(residual)), 1.0 / diagonal
     direction = residual * inverse
-    energy = float(residual @ direction)
+    energy = dot(residual, direction)
     for _ in range(MOST_STEPS):
         product = ridge * direction
-        for matrix, transposed in parts:
+        for matrix, transposed in pairs:
             product += transposed @ (matrix @ direction)
-        along = float(direction @ product)
+        along = dot(direction, product)
         if not along > 0.0:
             break
         length = energy / along
         x += length * direction
-        residual -= length * product * free
-        before, energy = energy, float(residual @ (residual * inverse))
+        residual -= length * product
+        scaled = residual * inverse
+        before, energy = energy, dot(residual, scaled)
         if length * float(np.abs(direction).max()) < last_m:
             break
-        direction = residual * inverse + energy / before * direction
-    return x.reshape(control.shape).copy()
+        direction *= energy / before
+        direction += scaled
+    return x
+
+
+def dot(a: Array, b: Array) -> float:
+    """Return the scalar product of vectors; threads of BLAS wait longer than it takes."""
+    return float(np.einsum('i,i->', a, b))
 
 
 def sparse(rows: Indices, values: Array, number: int) -> Any:

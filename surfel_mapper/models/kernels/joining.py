@@ -15,6 +15,9 @@ from surfel_mapper.kernels.compiling import kernel, part
 TERMS = np.array([3, 6, 15])
 """Coefficients of a plane, a quadric and a quartic height field."""
 
+POWERS = np.array([(a, d - a) for d in range(5) for a in range(d, -1, -1)])
+"""Powers of x and y in the terms of height fields, by degree."""
+
 RIDGE = 1e-10
 """Added to the normal equations of coordinates in [-1, 1], for points in one line."""
 
@@ -106,7 +109,7 @@ def gather(rows, number, stride, points, weights, found, low):
     return low
 
 
-@part(error_model='numpy')
+@part(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
 def height_errors(points, low, high, normal, errors):
     """
     Fit height fields of degree 1, 2 and 4 over a plane; return by how much the quadric turns, rad.
@@ -124,20 +127,23 @@ def height_errors(points, low, high, normal, errors):
     of the quadric, so that heights weigh as much as distances from the surface.
     """
     most = TERMS[len(errors) - 1]
-    local, basis = np.empty((4, high - low)), np.empty((most + 1, high - low))
-    matrix = np.empty((most + 1, most + 1))
+    local, powers = np.empty((4, high - low)), np.empty((9, high - low))
+    sums, right = np.empty((9, 9)), np.empty((5, 5))
+    terms, matrix = np.empty(most), np.empty((most, most))
     scale = local_points(points, low, normal, local)
-    size, turn = TERMS[1], 0.0
+    left = turn = 0.0
     for again in range(2):
         size = most if again else TERMS[1]
-        fill_basis(local, size, basis)
-        factorise(basis, size, matrix)
+        degree = 4 if size > TERMS[1] else 2
+        left = height_sums(local, degree, powers, sums, right)
+        solve_heights(size, sums, right, terms, matrix)
         if not again:
-            turn = turn_of(local, size, matrix)
-    left, done = matrix[size, size], 0
+            solve_transposed(size, matrix, terms)
+            turn = turn_of(local, terms)
+    done = 0
     for d in range(len(errors)):
         for p in range(done, TERMS[d]):
-            left -= matrix[size, p] * matrix[size, p]
+            left -= terms[p] * terms[p]
         done = TERMS[d]
         errors[d] = max(left, 0.0) * scale * scale
     return turn
@@ -155,19 +161,22 @@ def local_points(points, low, normal, local):
     for j in range(1, 3):
         if abs(normal[j]) < abs(normal[least]):
             least = j
-    za, zb, zc = normal[0], normal[1], normal[2]
     length = math.sqrt(1.0 - normal[least] ** 2)
+    za, zb, zc = normal[0], normal[1], normal[2]
     xa = ((1.0 if least == 0 else 0.0) - normal[least] * za) / length
     xb = ((1.0 if least == 1 else 0.0) - normal[least] * zb) / length
     xc = ((1.0 if least == 2 else 0.0) - normal[least] * zc) / length
     ya, yb, yc = zb * xc - zc * xb, zc * xa - za * xc, za * xb - zb * xa
     total = a = b = c = 0.0
     for n in range(local.shape[1]):
-        weight = points[3, low + n]
+        x, y, z, weight = (
+            points[0, low + n],
+            points[1, low + n],
+            points[2, low + n],
+            points[3, low + n],
+        )
         total += weight
-        a += weight * points[0, low + n]
-        b += weight * points[1, low + n]
-        c += weight * points[2, low + n]
+        a, b, c = a + weight * x, b + weight * y, c + weight * z
     a, b, c, scale = a / total, b / total, c / total, 1e-12
     for n in range(local.shape[1]):
         dx, dy, dz = points[0, low + n] - a, points[1, low + n] - b, points[2, low + n] - c
@@ -175,72 +184,93 @@ def local_points(points, low, normal, local):
         v = dx * ya + dy * yb + dz * yc
         local[0, n], local[1, n] = u, v
         local[2, n] = dx * za + dy * zb + dz * zc
-        local[3, n] = points[3, low + n] / total
         scale = max(scale, abs(u), abs(v))
-    for j in range(3):
-        for n in range(local.shape[1]):
-            local[j, n] /= scale
+    for n in range(local.shape[1]):
+        local[0, n] /= scale
+        local[1, n] /= scale
+        local[2, n] /= scale
+        local[3, n] = points[3, low + n] / total
     return scale
 
 
 @part(error_model='numpy')
-def fill_basis(local, size, basis):
+def height_sums(local, degree, powers, sums, right):
     """
-    Compute monomials of x and y, and the height, times the roots of the shares.
+    Sum monomials of x and y, and these times the height; return the weighted mean square height.
 
-    local  of local_points
-    size   number of monomials
-    basis  (size + 1, n) float64, out: by degree x^d, x^(d - 1) y to y^d, then the height
+    The normal equations of degree d have (2 d + 1) (d + 1) different entries of their
+    ((d + 1) (d + 2) / 2)^2, and a sum over all points at a time is four times as fast.
+
+    local   of local_points
+    powers  (2 d + 1, n) float64, scratch
+    sums    (2 d + 1, 2 d + 1) float64, out: of share x^a y^b at [b, a], for a + b <= 2 d
+    right   (d + 1, d + 1) float64, out: of share z x^a y^b, for a + b <= d
     """
+    squares = 0.0
     for n in range(local.shape[1]):
-        root = math.sqrt(local[3, n])
-        basis[0, n], basis[size, n] = root, root * local[2, n]
-    k, degree = 1, 1
-    while k < size:
-        for b in range(degree + 1):
-            last = b == degree  # y^d comes from y^(d - 1), others from those with an x less
+        value = local[3, n]
+        squares += value * local[2, n] * local[2, n]
+        for a in range(2 * degree + 1):
+            powers[a, n] = value
+            value *= local[0, n]
+    for b in range(2 * degree + 1):
+        for a in range(2 * degree + 1 - b):
+            total = 0.0
             for n in range(local.shape[1]):
-                factor = local[1, n] if last else local[0, n]
-                basis[k, n] = factor * basis[k - degree - last, n]
-            k += 1
-        degree += 1
+                total += powers[a, n]
+            sums[b, a] = total
+        for a in range(degree + 1 - b):
+            total = 0.0
+            for n in range(local.shape[1]):
+                total += powers[a, n] * local[2, n]
+            right[b, a] = total
+        for a in range(2 * degree - b):
+            for n in range(local.shape[1]):
+                powers[a, n] *= local[1, n]
+    return squares
 
 
 @part(error_model='numpy')
-def factorise(basis, size, matrix):
+def solve_heights(size, sums, right, reduced, matrix):
     """
-    Compute the Cholesky factor of the normal equations of a least squares fit.
+    Solve the triangular part of a least squares fit of ``size`` terms.
 
-    basis   of fill_basis
-    matrix  (size + 1, size + 1) float64 or larger, out: the factor; in row ``size`` the right side
-            of the triangular system, of which the squares are the parts of the mean square that
-            the terms explain, one after the other, and last the mean square
+    sums, right  of height_sums
+    reduced      (size,) float64 or longer, out: right side of the triangular system; its squares
+                 are the parts of the mean square that the terms explain, one after the other
+    matrix       (size, size) float64 or larger, out: its Cholesky factor
     """
-    for p in range(size + 1):
+    for p in range(size):
+        x, y = POWERS[p, 0], POWERS[p, 1]
+        reduced[p] = right[y, x]
         for q in range(p + 1):
-            value = RIDGE if p == q and p < size else 0.0
-            for n in range(basis.shape[1]):
-                value += basis[p, n] * basis[q, n]
-            if q < size:
-                for m in range(q):
-                    value -= matrix[p, m] * matrix[q, m]
-                value = math.sqrt(max(value, RIDGE)) if p == q else value / matrix[q, q]
-            matrix[p, q] = value
+            value = sums[y + POWERS[q, 1], x + POWERS[q, 0]]
+            value += RIDGE if p == q else 0.0
+            for m in range(q):
+                value -= matrix[p, m] * matrix[q, m]
+            matrix[p, q] = math.sqrt(max(value, RIDGE)) if p == q else value / matrix[q, q]
+        for m in range(p):
+            reduced[p] -= matrix[p, m] * reduced[m]
+        reduced[p] /= matrix[p, p]
 
 
 @part(error_model='numpy')
-def turn_of(local, size, matrix):
+def solve_transposed(size, matrix, reduced):
+    """Solve for the coefficients, in place; matrix and reduced of solve_heights."""
+    for p in range(size - 1, -1, -1):
+        for m in range(p + 1, size):
+            reduced[p] -= matrix[m, p] * reduced[m]
+        reduced[p] /= matrix[p, p]
+
+
+@part(error_model='numpy')
+def turn_of(local, terms):
     """
     Return sqrt(12) times the root mean square angle of a quadric's normals to their mean.
 
-    local   of local_points; shares are multiplied by the squared cosine of the slope
-    matrix  of factorise, for a quadric; row ``size`` becomes its terms
+    local  of local_points; shares are multiplied by the squared cosine of the slope
+    terms  (6,) float64, of the quadric
     """
-    terms = matrix[size]
-    for p in range(size - 1, -1, -1):
-        for m in range(p + 1, size):
-            terms[p] -= matrix[m, p] * terms[m]
-        terms[p] /= matrix[p, p]
     a, b, c, d, e = terms[1], terms[2], terms[3], terms[4], terms[5]
     sum_x = sum_y = sum_z = 0.0
     for n in range(local.shape[1]):

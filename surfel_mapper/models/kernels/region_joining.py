@@ -338,7 +338,9 @@ def describe_regions(names, state, regions, limits, normals, found):
         number = rows_near(names[k], names[k], state, regions, rows)
         end = gather(rows, number, 1 + number // MOST_ROWS, points, weights, own, zero)
         for quartic in range(2):
-            best, plane, sigma, turn, bend = heights(own, zero, end, normals[k], quartic > 0, floor)
+            best, plane, sigma, turn, bend = heights(
+                own, zero, end, normals[k], quartic > 0, floor
+            )
             found[k, 0], found[k, 1], found[k, 2], found[k, 3] = plane - best, turn, bend, sigma
             if not (turn > limits[1] and bend > limits[2] and plane - best <= limits[0]):
                 break
