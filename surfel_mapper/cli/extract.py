@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
 def announce() -> None:
     """Say on stderr why the first fit takes long."""
     print(
-        'surfel-mapper extract: compiling kernels, about two minutes of processor time, once per '
+        'surfel-mapper extract: compiling kernels, about a minute of processor time, once per '
         'machine',
         file=sys.stderr,
         flush=True,
