@@ -28,10 +28,10 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.base import FiniteFilter, generator, parameter, select, with_points
+from surfel_mapper.filters.kernels.voxel_grid import average, group_points
 from surfel_mapper.filters.merging import MergedColumns, PointGroups
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.registry import register
-from surfel_mapper.kernels.voxel_grid import average, group_points
 from surfel_mapper.scan import Scan
 
 AXIS_BITS = 31

@@ -4,8 +4,8 @@
 Eigenvalues and eigenvectors of symmetric 3 by 3 matrices, of many at once or of one.
 
 ``decompose`` finds the eigenvalues and the eigenvector of the smallest one, ``eigenvectors`` the
-other two eigenvectors, ``eigen_frame`` all of a single matrix. No trigonometry, no iteration of
-unknown length and no branches, so that the compiler vectorises the loops.
+other two eigenvectors. No trigonometry, no iteration of unknown length and no branches, so that
+the compiler vectorises the loops.
 
 The deviator scaled to B (trace 0, |B|^2 = 6) has eigenvalues t with t^3 - 3 t = det B. The one
 farthest from the other two is a well-conditioned root, at least 3^(1/2) away from both; its
@@ -25,7 +25,6 @@ matrices) for deflation; Duff et al. 2017 for the basis across a unit vector.
 import math
 
 from numba import njit
-import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part
 
@@ -231,26 +230,3 @@ def store(vectors, i, k, x, y, z):
         leading = z
     side = -1.0 if leading < 0.0 else 1.0
     vectors[i, k, 0], vectors[i, k, 1], vectors[i, k, 2] = side * x, side * y, side * z
-
-
-@kernel(error_model='numpy')
-def eigen_frame(matrix, values, vectors):
-    """
-    Decompose one matrix.
-
-    matrix   (3, 3) float64, positive semidefinite
-    values   (3,) float64, out: ascending, none negative
-    vectors  (3, 3) float64, out: row k is the unit eigenvector of values[k], its component of
-             largest magnitude positive; the identity if all values are 0
-    """
-    upper, found = np.empty((6, 1)), np.empty((3, 1))
-    smallest, frame = np.empty((3, 1)), np.empty((1, 3, 3))
-    upper[0, 0], upper[1, 0], upper[2, 0] = matrix[0, 0], matrix[0, 1], matrix[0, 2]
-    upper[3, 0], upper[4, 0], upper[5, 0] = matrix[1, 1], matrix[1, 2], matrix[2, 2]
-    decompose(upper, 1, found, smallest)
-    eigenvectors(upper, found, smallest, frame)
-    known = found[2, 0] > 0.0
-    for i in range(3):
-        values[i] = found[i, 0]
-        for j in range(3):
-            vectors[i, j] = frame[0, i, j] if known else (1.0 if i == j else 0.0)

@@ -21,15 +21,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.bspline_multigrid import least_squares
+from surfel_mapper.models.bspline_solvers import FieldSamples, is_direct, relax, solve_band
 from surfel_mapper.models.grid import Cells
-from surfel_mapper.models.kernels.bspline import (
-    clamped_knots,
-    evaluate_basis,
-    evaluate_field,
-    fit_fields,
-    greville_places,
-)
 
 Array = npt.NDArray[np.float64]
 
@@ -39,8 +32,8 @@ RIDGE = 1e-6
 LSQR_STEPS = 2000
 """Most iterations of LSQR."""
 
-MOST_AT_ONCE = 2e6
-"""Multiplications of a banded solve, about 1 ms, above which a field is large."""
+LAST_STEP_CELLS = 1e-4
+"""Iterative fits stop when no control point moves farther, in cells."""
 
 CACHED_AXES = 4096
 """Cached axes (knots, Greville abscissae): few different sizes occur."""
@@ -59,15 +52,17 @@ def knots(num_cells: int, degree: int) -> Array:
         At most num_cells + 1.
 
     """
-    found: Array = clamped_knots(num_cells, degree)
-    return found
+    pieces = num_cells + 2 - degree
+    inner = np.arange(1, pieces) / pieces
+    return np.concatenate([np.zeros(degree + 1), inner, np.ones(degree + 1)])
 
 
 @lru_cache(CACHED_AXES)
 def greville_cells(num_cells: int, degree: int) -> Array:
     """Return the Greville abscissae along an axis, in cells; cached, read-only."""
-    found: Array = greville_places(knots(num_cells, degree), degree, 1.0)
-    return found
+    knot, number = knots(num_cells, degree), num_cells + 2
+    means = sum(knot[k : k + number] for k in range(1, degree + 1)) / degree
+    return np.asarray(means * (number - 1) - 0.5, np.float64)
 
 
 def axis_degree(num_cells: int, degree: int) -> int:
@@ -98,10 +93,27 @@ def basis(u: Array, knot: Array, degree: int) -> tuple[npt.NDArray[np.int64], Ar
         Their derivatives.
 
     """
-    first = np.empty(len(u), np.int64)
-    values, slopes = np.empty((2, len(u), degree + 1))
-    evaluate_basis(u, knot, degree, first, values, slopes)
-    return first, values, slopes
+    last = len(knot) - degree - 2
+    is_number = ~np.isnan(u)
+    span = (np.where(is_number, u, 1.0) * (last + 1 - degree)).astype(np.int64) + degree
+    span = np.minimum(span, last)
+    span -= (span > degree) & (u < knot[span])  # rounding
+    span += (span < last) & (u >= knot[span + 1])
+    values, lower = [np.where(is_number, 1.0, np.nan)], []
+    for order in range(1, degree + 1):
+        lower = values
+        values = [np.zeros(len(u)) for _ in range(order + 1)]
+        for k, value in enumerate(lower):
+            left, right = knot[span + 1 - order + k], knot[span + 1 + k]
+            share = (u - left) / (right - left) * value
+            values[k] += value - share
+            values[k + 1] = share
+    slopes = np.zeros((len(u), degree + 1))
+    for k, value in enumerate(lower):
+        slope = degree * value / (knot[span + 1 + k] - knot[span + 1 - degree + k])
+        slopes[:, k] -= slope
+        slopes[:, k + 1] += slope
+    return span - degree, np.stack(values, axis=1), slopes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,8 +141,15 @@ class HeightField:
 
     def heights(self, xy: Array) -> Array:
         """Return z at (M, 2) x and y, m; beyond the grid, that at its boundary; at nan, nan."""
-        result = np.empty(len(xy))
-        evaluate_field(np.ascontiguousarray(xy), self.parts(), result)
+        (first_x, x, _), (first_y, y, _) = (self._basis(xy, axis) for axis in range(2))
+        control, start = self.control.ravel(), first_x * self.control.shape[1] + first_y
+        result = np.zeros(len(xy))
+        for j in range(x.shape[1]):
+            along = np.zeros(len(xy))
+            for k in range(y.shape[1]):
+                along += y[:, k] * control[start + k]
+            result += x[:, j] * along
+            start += self.control.shape[1]
         return result
 
     def slopes(self, xy: Array) -> Array:
@@ -141,13 +160,15 @@ class HeightField:
             result[:, axis] = unit * np.einsum('ij,ij->i', self.control.ravel()[rows], weights)
         return result
 
-    def parts(self) -> tuple[Array, float, tuple[int, int], tuple[Array, Array], Array]:
-        """Return the arguments of the kernels: origin, pitch, degrees, knots, control points."""
-        x, y = self.degrees
-        num_x, num_y = self.control.shape
-        both = knots(num_x - 2, x), knots(num_y - 2, y)
-        control = np.ascontiguousarray(self.control)
-        return np.ascontiguousarray(self.origin), self.pitch_m, self.degrees, both, control
+    def _basis(self, xy: Array, axis: int) -> tuple[npt.NDArray[np.int64], Array, Array]:
+        """Return the basis functions along an axis at locations (M, 2); see basis."""
+        cells, degree = self.control.shape[axis] - 2, self.degrees[axis]
+        u = (xy[:, axis] - self.origin[axis] + 0.5 * self.pitch_m) / self.width_m(axis)
+        return basis(np.clip(u, 0.0, 1.0), knots(cells, degree), degree)
+
+    def width_m(self, axis: int) -> float:
+        """Return the width of the range of the parameter along an axis, m."""
+        return (self.control.shape[axis] - 1) * self.pitch_m
 
     def greville(self) -> tuple[Array, Array]:
         """Return x (Nx + 2,) and y (Ny + 2,) of the control points as a NURBS patch, m."""
@@ -186,13 +207,10 @@ def design(
     """
     firsts, parts, unit = [], [], 1.0
     for axis in range(2):
-        cells, degree = field.control.shape[axis] - 2, field.degrees[axis]
-        width_m = (cells + 1) * field.pitch_m
-        u = (xy[:, axis] - field.origin[axis] + 0.5 * field.pitch_m) / width_m
-        first, values, slopes = basis(np.clip(u, 0.0, 1.0), knots(cells, degree), degree)
-        firsts.append(first[:, None] + np.arange(degree + 1))
+        first, values, slopes = field._basis(xy, axis)
+        firsts.append(first[:, None] + np.arange(values.shape[1]))
         parts.append(slopes if axis == along else values)
-        unit = 1.0 / width_m if axis == along else unit
+        unit = 1.0 / field.width_m(axis) if axis == along else unit
     rows = firsts[0][:, :, None] * field.control.shape[1] + firsts[1][:, None, :]
     weights = parts[0][:, :, None] * parts[1][:, None, :]
     shape = len(xy), (field.degrees[0] + 1) * (field.degrees[1] + 1)
@@ -257,75 +275,69 @@ def fit_pspline(
 
     Notes
     -----
-    Up to 100 x 100 cells the equations are solved to rounding, larger ones to TOLERANCE of
-    models/bspline_multigrid.py, in time and memory in proportion to the number of cells.
+    Up to 100 x 100 cells the equations are solved to rounding. In larger fields control points on
+    which no sample depends have the height of the nearest other one, and conjugate gradients stop
+    at steps of LAST_STEP_CELLS.
 
     """
     if start.control.shape[1] > start.control.shape[0]:  # the bandwidth is the short side
         turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, smoothing)
         return transposed(turned)
-    samples, share = np.column_stack([xy, z]), weight / weight.mean()
-    rules = smoothing, RIDGE
-    control = least_squares(samples, share, start.parts(), start.greville(), rules)
+    rows, weights, _ = design(start, xy)
+    samples = FieldSamples(rows, weights, z, weight / weight.mean())
+    if is_direct(start.control.shape, max(*start.degrees, 2)):
+        control = solve_band(samples, start.greville(), (smoothing, RIDGE))
+        return HeightField(start.pitch_m, start.origin, start.degrees, control)
+    active = np.zeros(start.control.shape, np.bool_)
+    active.ravel()[rows] = True
+    rules = smoothing, RIDGE, LAST_STEP_CELLS * start.pitch_m
+    before = continued(start.control, start.control != 0.0)
+    control = relax(samples, start.greville(), (active, active), rules, before)
+    control = continued(control, active)
     return HeightField(start.pitch_m, start.origin, start.degrees, control)
 
 
-def is_small(sizes: npt.NDArray[np.int64], degree: int) -> npt.NDArray[np.bool_]:
-    """Return which grids of (K, 2) cells have fields that ``fit_grids`` fits."""
-    number = (sizes + 2).prod(axis=1)
-    found: npt.NDArray[np.bool_] = number * (degree * sizes.min(axis=1)) ** 2 <= MOST_AT_ONCE
-    return found
+def continued(control: Array, known: npt.NDArray[np.bool_]) -> Array:
+    """Return control points (Nx, Ny) where unknown ones have the height of the nearest other."""
+    from scipy.ndimage import distance_transform_edt  # seconds to import
+
+    if not known.any():
+        return control
+    x, y = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    nearest: Array = control[x, y]
+    return nearest
 
 
-def fit_grids(
-    cells: Cells, chosen: npt.NDArray[np.int64], degree: int, smoothing: float
-) -> tuple[list[HeightField], Array]:
+def fit_cells(
+    cells: Cells, patch: int, degree: int, smoothing: float | None
+) -> tuple[HeightField, Array]:
     """
-    Return small fields that ``fit_pspline`` would fit to the means of their cells.
+    Return the field that fits the mean heights of the cells of a patch, and these, (Nx, Ny) m.
 
     Parameters
     ----------
     cells : Cells
         The cells of all patches.
-    chosen : (F,) int64
-        Patches whose fields are asked for; see is_small.
+    patch : int
+        Their patch.
     degree : int
         Degree of the splines, reduced along axes with too few cells.
-    smoothing : float
-        Weight of the second differences, for a mean weight of 1.
-
-    Returns
-    -------
-    list of HeightField
-        F fields.
-    (C,) float64, m
-        Mean heights of the cells of these patches, nan for empty cells and other patches.
+    smoothing : float or None
+        Weight of the second differences, for a mean weight of 1; None for fit_lsqr.
 
     """
-    shapes = cells.sizes[chosen] + 2
-    ends = np.cumsum(shapes.prod(axis=1))
-    begin = ends - shapes.prod(axis=1)
-    control = np.empty(int(ends[-1]) if len(ends) else 0)
-    heights = np.full(len(cells.sums), np.nan)
-    numbers = cells.first, cells.sizes
-    rules = degree, smoothing, RIDGE
-    fit_fields(
-        cells.sums, numbers, chosen, cells.pitches, cells.origins, rules, begin, control, heights
-    )
-    parts = zip(
-        cells.pitches[chosen].tolist(),
-        cells.origins[chosen],
-        shapes.tolist(),
-        begin.tolist(),
-        ends.tolist(),
-        strict=True,
-    )
-    found = []
-    for pitch_m, origin, (x, y), low, high in parts:
-        degrees = axis_degree(x - 2, degree), axis_degree(y - 2, degree)
-        own = control[low:high].reshape(x, y).copy()  # a view would keep those of all fields
-        found.append(HeightField(pitch_m, origin, degrees, own))
-    return found, heights
+    sums, (num_x, num_y) = cells.sums[cells.of(patch)], cells.sizes[patch]
+    used = sums[:, 3] > 0.0
+    means = np.full((len(sums), 3), np.nan)
+    means[used] = sums[used, :3] / sums[used, 3:]
+    heights = means[:, 2].reshape(num_x, num_y).copy()
+    filled = used.reshape(num_x, num_y)
+    origin = cells.origins[patch].copy()
+    start = initial_field(float(cells.pitches[patch]), origin, heights, filled, degree)
+    xy, z = means[used, :2], means[used, 2]
+    if smoothing is None:
+        return fit_lsqr(start, xy, z), heights
+    return fit_pspline(start, xy, z, sums[used, 3], smoothing), heights
 
 
 def transposed(field: HeightField) -> HeightField:

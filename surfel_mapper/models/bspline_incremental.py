@@ -16,15 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.bspline import HeightField, initial_field, RIDGE
-from surfel_mapper.models.kernels.bspline_incremental import (
-    conjugate_gradients,
-    equations,
-    extrapolate,
-    mark_active,
-    mark_near,
-    second_differences,
+from surfel_mapper.models.bspline import (
+    continued,
+    design,
+    HeightField,
+    initial_field,
+    knots,
+    RIDGE,
 )
+from surfel_mapper.models.bspline_solvers import FieldSamples, relax
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -43,6 +43,15 @@ DEGREE = 3
 """Degree of the splines."""
 BLOCK = 16
 """Grids start and end at multiples of this number of cells."""
+
+
+MOST_AT_ONCE = 2e6
+"""Multiplications of a banded solve, about 1 ms, above which a field is large."""
+
+
+def is_large(size: npt.NDArray[np.int64]) -> bool:
+    """Return whether a grid of (2,) cells has a field that is fitted by fit_field."""
+    return float((size + 2).prod() * (DEGREE * size.min()) ** 2) > MOST_AT_ONCE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +76,7 @@ def fit_field(
     pitch_m: float, origin: Array, sums: Array, before: FittedField | None, still_m: float
 ) -> FittedField:
     """
-    Return the field that fits the mean heights of many cells; others see fit_grids.
+    Return the field that fits the mean heights of many cells; others see fit_cells.
 
     Parameters
     ----------
@@ -124,8 +133,7 @@ def taken_over(
     new, was = overlap(start.control.shape, old.control.shape, step)
     # control points away from filled cells were not fitted
     start.control[new] = np.where(known[new], start.control[new], 0.0)
-    valid = np.zeros(old.control.shape, np.bool_)
-    mark_active(~np.isnan(before.heights), old.parts(), valid)
+    valid = influential(~np.isnan(before.heights), old)
     start.control[new] = np.where(valid[was], old.control[was], start.control[new])
     known[new] |= valid[was]
     earlier = np.full(heights.shape, np.nan)
@@ -154,31 +162,35 @@ def relaxed(
     start: HeightField, means: Array, masks: tuple[Mask, Mask, Mask], still_m: float
 ) -> HeightField:
     """Return a large field, refitted near touched cells; masks: filled, touched, known points."""
-    (filled, touched, known), control = masks, start.control
-    active, free = np.zeros(control.shape, np.bool_), np.zeros(control.shape, np.bool_)
-    mark_active(filled, start.parts(), active)
-    extrapolate(control, known, active)
-    mark_near(touched, MARGIN, active, free)
+    filled, touched, known = masks
+    active = influential(filled, start)
+    control = np.where(active, continued(start.control, known), start.control)
+    free = active & near_cells(touched)
     xyz = means[filled]
-    first, values = np.empty((len(xyz), 2), np.int64), np.empty((len(xyz), 2, DEGREE + 1))
-    num = equations(xyz, start.parts(), free, first, values)
-    ats, seconds = [], []
-    for axis, places in enumerate(start.greville()):
-        at, second = np.empty((control.size, 2), np.int64), np.empty((control.size, 3))
-        bent = second_differences(places, axis, active, free, at, second)
-        ats.append(at[:bent])
-        seconds.append(second[:bent])
-    flat = control.ravel()
-    conjugate_gradients(
-        first[:num],
-        values[:num],
-        xyz[first[:num, 1], 2],
-        control.shape[1],
-        np.concatenate(ats),
-        np.concatenate(seconds),
-        (SMOOTHING, RIDGE, LAST_STEP * still_m),
-        np.flatnonzero(free),
-        flat,
-    )
-    field = flat.reshape(control.shape)
-    return HeightField(start.pitch_m, start.origin, start.degrees, field)
+    rows, weights, _ = design(start, xyz[:, :2])
+    samples = FieldSamples(rows, weights, xyz[:, 2], np.ones(len(xyz)))
+    rules = SMOOTHING, RIDGE, LAST_STEP * still_m
+    control = relax(samples, start.greville(), (active, free), rules, control)
+    return HeightField(start.pitch_m, start.origin, start.degrees, control)
+
+
+def influential(filled: Mask, field: HeightField) -> Mask:
+    """Return the control points (Nx + 2, Ny + 2) on which heights in cells (Nx, Ny) depend."""
+    found = filled
+    for axis, number in enumerate(filled.shape):
+        degree, knot = field.degrees[axis], knots(number, field.degrees[axis])
+        ends = (np.arange(number + 1) + 0.5) / (number + 1)  # of the cells, as parameters
+        spans = np.clip(np.searchsorted(knot, ends, side='right') - 1, degree, number + 1)
+        points = np.zeros((number + 2, found.shape[1]), np.bool_)
+        for cell, (low, high) in enumerate(zip(spans[:-1] - degree, spans[1:] + 1, strict=True)):
+            points[low:high] |= found[cell]
+        found = points.T
+    return found
+
+
+def near_cells(touched: Mask) -> Mask:
+    """Return the control points (Nx + 2, Ny + 2) up to MARGIN cells from touched cells."""
+    from scipy.ndimage import maximum_filter  # seconds to import
+
+    points = np.pad(touched, 1)
+    return np.asarray(maximum_filter(points, 2 * MARGIN + 1, mode='constant'), np.bool_)

@@ -14,7 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.charts import bisect_chart, find_small_curved
+from surfel_mapper.models.kernels.charts import bisect_folded, find_small_curved, is_folded
 from surfel_mapper.models.kernels.surfel_groups import (
     connected_components,
     find_doubtful,
@@ -26,6 +26,9 @@ from surfel_mapper.models.surfel_graph import SurfelGraph
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int32]
 Indices = npt.NDArray[np.int64]
+
+STACKED_SHARE = 0.05
+"""A chart overlaps itself if more than this share of its columns is too high."""
 
 STACKED_VOXELS = 4.0
 """Height of a column that overlaps itself, in voxels; a slope of 60 deg is 2.5 voxels high."""
@@ -87,14 +90,62 @@ def bisected(graph: SurfelGraph, members: Rows, limit: float, least: int) -> lis
     size_m = graph.map.voxel_size_m
 
     def side(part: Rows) -> npt.NDArray[np.bool_] | None:
-        beyond, state = np.empty(len(part), np.bool_), (graph.normal[part], graph.position[part])
-        is_cut = bisect_chart(*state, limit, STACKED_VOXELS * size_m, size_m, beyond)
-        return beyond if is_cut else None
+        return chart_side(graph.normal[part], graph.position[part], limit, size_m)
 
     def components(half: Rows) -> list[Rows]:
         return [part for part in connected_parts(graph, half) if len(part) >= least]
 
     return height_fields([members], side, components)
+
+
+def chart_side(
+    normals: Array, points: Array, limit: float, size_m: float
+) -> npt.NDArray[np.bool_] | None:
+    """
+    Return how to bisect a chart, (n,) bool, or None if it has one height over one plane.
+
+    Parameters
+    ----------
+    normals : (n, 3) float64
+        Unit normals of its voxels.
+    points : (n, 3) float64, m
+        Their surfels.
+    limit : float
+        Least cosine to the mean normal for nearly all normals.
+    size_m : float
+        Edge of the voxels, m.
+
+    """
+    total, side = normals.sum(axis=0), np.empty(len(normals), np.bool_)
+    mean = total / max(float(np.linalg.norm(total)), 1e-300)
+    if bisect_folded(normals, mean, limit, side):
+        axis = np.linalg.eigh(normals.T @ normals)[1][:, 2]
+        facing = normals * np.where(normals @ axis < 0.0, -1.0, 1.0)[:, None]
+        if is_folded(facing, axis, limit):
+            return side
+        mean = axis  # equal up to sign: the voxels have no common viewpoint
+    return stacked_side(points, mean, size_m)
+
+
+def stacked_side(points: Array, normal: Array, size_m: float) -> npt.NDArray[np.bool_] | None:
+    """Return the upper half (n,) of a surface that overlaps itself; None for others."""
+    heights, high_m = points @ normal, STACKED_VOXELS * size_m
+    low, high = heights.min(), heights.max()
+    if high - low <= high_m:
+        return None
+    least = int(np.abs(normal).argmin())
+    x = np.cross(normal, np.eye(3)[least])
+    x /= np.linalg.norm(x)
+    # voxel indices have 21 bits, so column numbers are unique
+    row, place = points @ x / size_m, points @ np.cross(normal, x) / size_m
+    column = np.floor(row) * 2.0**26 + np.floor(place)
+    order = np.argsort(column, kind='stable')
+    first = np.flatnonzero(np.diff(column[order], prepend=np.nan) != 0.0)
+    ordered = heights[order]
+    extent = np.maximum.reduceat(ordered, first) - np.minimum.reduceat(ordered, first)
+    if (extent > high_m).sum() <= STACKED_SHARE * len(first):
+        return None
+    return np.asarray(heights > 0.5 * (low + high), np.bool_)
 
 
 def connected_parts(graph: SurfelGraph, rows: Rows) -> list[Rows]:

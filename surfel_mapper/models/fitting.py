@@ -29,6 +29,7 @@ from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import AXIS_BITS, KEY_BITS
 from surfel_mapper.kernels.selection import copy_ranges, number_ranges
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.models.cloud_noise import estimate_noise
 from surfel_mapper.models.coarse_growth import (
     CoarseRules,
     extend_coarse,
@@ -36,7 +37,6 @@ from surfel_mapper.models.coarse_growth import (
     SPARSE_SHARE,
 )
 from surfel_mapper.models.growth import (
-    estimate_noise,
     grow,
     Grown,
     grown,

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The part of its plane that a patch covers: cells, and cuts of the boundary cells.
+The area of its plane that a patch covers: cells, and cuts of the boundary cells.
 
 A cut is one byte, in 1/255 of the pitch (2/255 for the triangle), rounded down, so that no point
 that the patch was fitted to lies outside.
@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
-from surfel_mapper.models.kernels.grid import find_covered, find_covered_squares
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -50,16 +48,29 @@ class Grid:
     corner: npt.NDArray[np.uint8]
     cuts: npt.NDArray[np.uint8]
 
-    @property
-    def _cells(self) -> tuple[npt.NDArray[Any], ...]:
-        """The tables, as the kernels take them."""
-        return self.filled, self.rim, self.corner, self.cuts
-
     def contains(self, xy: Array) -> npt.NDArray[np.bool_]:
         """Return which (M, 2) locations in the frame of the patch are covered, (M,) bool."""
-        inside = np.empty(len(xy), np.bool_)
-        find_covered(xy, self._cells, self.pitch_m, self.origin, inside)
+        offset, shape = xy - self.origin, np.array(self.filled.shape)
+        cell = np.floor(offset / self.pitch_m)
+        # the last point of a grid may stand on its end
+        cell = np.where(offset <= shape * self.pitch_m, np.minimum(cell, shape - 1), cell)
+        inside = np.asarray(((cell >= 0) & (cell < shape)).all(axis=1), np.bool_)
+        x, y = cell[inside].astype(np.int64).T
+        inside[inside] = self.filled[x, y] & ~self._is_cut_off(offset[inside], x, y)
         return inside
+
+    def _is_cut_off(self, offset: Array, x: Indices, y: Indices) -> npt.NDArray[np.bool_]:
+        """Return which offsets (M, 2) from the origin, m, are cut off their cells."""
+        corner, cuts = self.corner[x, y], self.cuts[x, y]
+        from_x = np.abs(offset[:, 0] - (x + (corner & 1)) * self.pitch_m)
+        from_y = np.abs(offset[:, 1] - (y + (corner >> 1)) * self.pitch_m)
+        strip, triangle = self.pitch_m / 255.0, 2.0 * self.pitch_m / 255.0
+        found: npt.NDArray[np.bool_] = (
+            (from_x < cuts[:, 0] * strip)
+            | (from_y < cuts[:, 1] * strip)
+            | (from_x + from_y < cuts[:, 2] * triangle)
+        )
+        return found
 
     def samples(self, step_m: float) -> Array:
         """Return covered locations (M, 2) at about this spacing, m."""
@@ -73,8 +84,13 @@ class Grid:
 
     def mask(self, per_side: int) -> npt.NDArray[np.bool_]:
         """Return which squares are covered at their centre; per_side^2 squares a cell."""
-        covered = np.empty(per_side * np.array(self.filled.shape), np.bool_)
-        find_covered_squares(per_side, self._cells, self.pitch_m, self.origin, covered)
+        covered = self.filled.repeat(per_side, axis=0).repeat(per_side, axis=1)
+        cells = np.argwhere(self.rim)  # only these are cut
+        inner = np.argwhere(np.ones((per_side, per_side), np.bool_))
+        squares = (per_side * cells[:, None] + inner).reshape(-1, 2)
+        x, y = cells.repeat(per_side**2, axis=0).T
+        offset = np.asarray((squares + 0.5) * (self.pitch_m / per_side), np.float64)
+        covered[squares[:, 0], squares[:, 1]] = ~self._is_cut_off(offset, x, y)
         return covered
 
     def area_m2(self, per_side: int = 16) -> float:
@@ -91,7 +107,25 @@ class Grid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """The cells of all patches, one row each; see models/kernels/grid.py."""
+    """
+    The cells of K patches, C rows, patch after patch, y within x.
+
+    Attributes
+    ----------
+    pitches : (K,) float64, m
+        Edge of the cells of each patch.
+    origins : (K, 2) float64, m
+        Lowest corner of the grid of each.
+    sizes : (K, 2) int64
+        Cells along x and y.
+    first : (K,) int64
+        First cell of each patch.
+    sums : (C, 4) float64
+        Sums of x, y and z of the points in each cell, and their number.
+    rim, corner, cuts : (C,) bool, (C,) uint8, (C, 3) uint8
+        See Grid.
+
+    """
 
     pitches: Array
     origins: Array
@@ -101,6 +135,110 @@ class Cells:
     rim: npt.NDArray[np.bool_]
     corner: npt.NDArray[np.uint8]
     cuts: npt.NDArray[np.uint8]
+
+    @classmethod
+    def around(
+        cls,
+        local: Array,
+        patch: Indices,
+        pitches: Array,
+        margin_m: float,
+        *,
+        snapped: bool,
+    ) -> Cells:
+        """
+        Return the cells that hold points, and cut the boundary cells.
+
+        A boundary cell loses two strips and a triangle that hold no points, at the corner
+        farthest from the mean of its points, unless the three other cells there hold points.
+
+        Parameters
+        ----------
+        local : (N, 3) float64, m
+            Points in the frames of their patches.
+        patch : (N,) int64
+            Patch of each point, ascending; each has points.
+        pitches : (K,) float64, m
+            Edges of the cells.
+        margin_m : float
+            Distance left between a cut and the points, m.
+        snapped : bool
+            Whether grids start at multiples of their pitch, else at the first point.
+
+        """
+        starts, pitch = np.searchsorted(patch, np.arange(len(pitches))), pitches[:, None]
+        xy = local[:, :2]
+        low = np.minimum.reduceat(xy, starts) if len(xy) else np.empty((0, 2))
+        high = np.maximum.reduceat(xy, starts) if len(xy) else np.empty((0, 2))
+        origins = np.floor(low / pitch) * pitch if snapped else low
+        sizes = ((high - origins) / pitch).astype(np.int64) + 1
+        ends = sizes.prod(axis=1).cumsum()
+        first, total = ends - sizes.prod(axis=1), int(ends[-1]) if len(ends) else 0
+        cell = ((xy - origins[patch]) / pitch[patch]).astype(np.int64)
+        cell = np.minimum(cell, sizes[patch] - 1)
+        row = first[patch] + cell[:, 0] * sizes[patch, 1] + cell[:, 1]
+        sums: Array = np.empty((total, 4))
+        for column, x in enumerate((*local.T, None)):
+            sums[:, column] = np.bincount(row, x, total)
+        cells = cls(
+            pitches=pitches,
+            origins=origins,
+            sizes=sizes,
+            first=first,
+            sums=sums,
+            rim=np.zeros(total, np.bool_),
+            corner=np.zeros(total, np.uint8),
+            cuts=np.zeros((total, 3), np.uint8),
+        )
+        cells._cut(xy - origins[patch], row, margin_m)
+        return cells
+
+    def _cut(self, offset: Array, row: Indices, margin_m: float) -> None:
+        """Cut boundary cells; offset (N, 2) of points in cells from the origin of their grid."""
+        filled = self.sums[:, 3] > 0.0
+        of = np.repeat(np.arange(len(self.sizes)), self.sizes.prod(axis=1))
+        x, y = np.divmod(np.arange(len(of)) - self.first[of], self.sizes[of, 1])
+        at = np.stack([x, y], axis=1)
+
+        def occupied(chosen: Indices, dx: Any, dy: Any) -> npt.NDArray[np.bool_]:
+            """Return which cells hold points some cells beside chosen ones (n,)."""
+            size, beside = self.sizes[of[chosen]], at[chosen] + np.stack([dx, dy], axis=1)
+            inside = ((beside >= 0) & (beside < size)).all(axis=1)
+            place = np.where(inside, chosen + dx * size[:, 1] + dy, 0)
+            found: npt.NDArray[np.bool_] = inside & filled[place]
+            return found
+
+        some = np.flatnonzero(filled)
+        zero, one = np.zeros(len(some), np.int64), np.ones(len(some), np.int64)
+        whole = np.logical_and.reduce(
+            [
+                occupied(some, -one, zero),
+                occupied(some, one, zero),
+                occupied(some, zero, -one),
+                occupied(some, zero, one),
+            ]
+        )
+        rim = some[~whole]
+        self.rim[rim] = True
+        pitch = self.pitches[of[rim]]
+        mean = self.sums[rim, :2] / self.sums[rim, 3:] - self.origins[of[rim]]
+        is_high = mean < (at[rim] + 0.5) * pitch[:, None]
+        self.corner[rim] = is_high @ [1, 2]
+        held = np.flatnonzero(self.rim[row])
+        number = np.cumsum(self.rim) - 1
+        which = number[row[held]]
+        away = np.abs(offset[held] - ((at[rim] + is_high) * pitch[:, None])[which])
+        least = np.full((len(rim), 3), np.inf)
+        for j, values in enumerate((away[:, 0], away[:, 1], away.sum(axis=1))):
+            np.minimum.at(least[:, j], which, values)
+        least -= margin_m * np.array([1.0, 1.0, np.sqrt(2.0)])
+        cuts = np.floor(least / (pitch[:, None] / 255.0 * np.array([1.0, 1.0, 2.0])))
+        dx, dy = (2 * is_high.astype(np.int64) - 1).T
+        surrounded = np.logical_and.reduce(
+            [occupied(rim, dx, 0 * dy), occupied(rim, 0 * dx, dy), occupied(rim, dx, dy)]
+        )
+        cuts[surrounded] = 0.0
+        self.cuts[rim] = np.clip(cuts, 0.0, 255.0).astype(np.uint8)
 
     def of(self, patch: int) -> slice:
         """Return the rows of a patch."""

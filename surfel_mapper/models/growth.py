@@ -26,21 +26,19 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.models.joining import join_patches, Pieces
+from surfel_mapper.models.frames import eigen, means_and_scatters, plane_frames
+from surfel_mapper.models.joining import join_patches, LEAST_COSINE, Pieces
+from surfel_mapper.models.kernels.frames import LEAST_WIDTH
 from surfel_mapper.models.kernels.growth import (
     assign_points,
-    classify_free,
     find_facets,
+    FREE,
     grow_patches,
-    sample_distances,
     SLOTS,
 )
-from surfel_mapper.models.kernels.joining import plane_frames, rename_owners, sort_owners
+from surfel_mapper.models.kernels.joining import sort_owners
 from surfel_mapper.models.kernels.voxel_points import (
-    block_noise,
     find_core,
-    LEAST_COSINE,
-    merge_owners,
     neighbour_table,
     owner_means,
 )
@@ -62,18 +60,6 @@ CORE_SHARE, CORE_POINTS = 0.12, 8
 MOST_SPARSE = 0.3
 """If more voxels are sparse, they are outliers; planes alone clip fewer to sparse ones."""
 
-BLOCKS, BLOCK_POINTS = 120, 100
-"""Blocks for the estimate of the noise, up to twice as many, and most points used in each."""
-
-NOISE_BINS, NOISE_QUANTILE = 4, 0.3
-"""Bins of range; the quantile is below the median, as edges add to the noise of a block."""
-
-LEAST_ALONE, CLIPPED_VOXELS = 0.25, 0.1
-"""Share of the voxels with enough points for an estimate of their own, and the most they tell."""
-
-CLIPPING = 2.0
-"""Correction of sigma by this times its square in voxels, for 5 to 15 mm at 3 cm within 10 %."""
-
 TOLERANCE_SIGMAS, TOLERANCE_VOXELS, MOST_TOLERANCE_VOXELS = 3.0, 0.03, 0.5
 """Tolerance of a patch: sigmas of its points and a share of a voxel, up to half a voxel."""
 
@@ -88,6 +74,9 @@ SAMPLES = 20_000
 
 RESOLVED_VOXELS = 0.2
 """Tolerance of facets in voxels of the cloud, or sigmas: in clutter patches are thicker."""
+
+LEAST_POINTS = 6
+"""Points that determine the plane of a voxel, at least."""
 
 FLAT_VOXELS = 0.6
 """Thickness of a flat voxel, 6 sigma, at most."""
@@ -108,7 +97,7 @@ class VoxelPoints:
 
     Attributes
     ----------
-    points : (P, 3) float32 or float64, m
+    points : (P, 3) float64, m
     rows : (P,) int32
         Row of each in the cloud.
     starts : (V + 1,) int64
@@ -118,7 +107,7 @@ class VoxelPoints:
 
     """
 
-    points: npt.NDArray[np.floating]
+    points: Array
     rows: npt.NDArray[np.int32]
     starts: Indices
     adjacent: tuple[Indices, npt.NDArray[np.int32]]
@@ -126,7 +115,7 @@ class VoxelPoints:
     @classmethod
     def of(
         cls,
-        points: npt.NDArray[np.floating],
+        points: Array,
         rows: npt.NDArray[np.int32],
         starts: Indices,
         keys: Indices,
@@ -144,55 +133,6 @@ class VoxelPoints:
         if len(core):
             find_core(self.starts, self.adjacent, CORE_SHARE, CORE_POINTS, core)
         return core if 1.0 - core.mean() > MOST_SPARSE else np.ones_like(core)
-
-
-def estimate_noise(
-    voxels: VoxelPoints, means: Array, core: npt.NDArray[np.bool_], size_m: float, view: Array
-) -> tuple[float, float]:
-    """
-    Return the noise of the points as n0, m, and n2, 1/m: sigma is n0 + n2 range^2.
-
-    Single voxels clip noise of more than a tenth of a voxel, blocks of three that of more than a
-    third (see CLIPPING), but these contain edges and corners, which are no noise.
-    """
-    rows = np.flatnonzero(core)
-    seeds = rows[:: max(len(rows) // BLOCKS, 1)]
-    range_sq = ((means[seeds] - view) ** 2).sum(axis=1)
-    state = voxels.points, voxels.starts, voxels.adjacent
-    sigma: Array = np.empty(len(seeds))
-    for alone in (True, False):
-        block_noise(*state, seeds, alone, BLOCK_POINTS, view, sigma)
-        known = sigma >= 0.0
-        enough = known.sum() >= max(LEAST_ALONE * len(seeds), 1.0)
-        if alone and enough and np.median(sigma[known]) < CLIPPED_VOXELS * size_m:
-            break
-    range_sq, sigma = range_sq[known], sigma[known]
-    if not len(sigma):
-        return 0.0, 0.0
-    bins = NOISE_BINS if len(sigma) >= 10 * NOISE_BINS else 1
-    parts = np.array_split(np.argsort(range_sq, kind='stable'), bins)
-    x = np.array([np.median(range_sq[part]) for part in parts])
-    y = np.array([np.quantile(sigma[part], NOISE_QUANTILE) for part in parts])
-    y *= 1.0 + CLIPPING * (y / size_m) ** 2
-    return line_above_zero(x, y)
-
-
-def line_above_zero(x: Array, y: Array) -> tuple[float, float]:
-    """
-    Return a and b of a + b x, neither negative, nearest to y relative to y.
-
-    If x does not determine b, b is 0: noise at one range says nothing of other ranges.
-    """
-    weight = 1.0 / np.maximum(y, 1e-9)
-    design = np.stack([np.ones_like(x), x], axis=1) * weight[:, None]
-    best, least = (0.0, 0.0), math.inf
-    for used in ([0], [0, 1], [1]):
-        part = np.zeros(2)
-        part[used] = np.linalg.lstsq(design[:, used], y * weight, rcond=None)[0]
-        error = float(((design @ part - y * weight) ** 2).sum())
-        if (part >= 0.0).all() and error < least - 1e-12:
-            best, least = (float(part[0]), float(part[1])), error
-    return best
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -272,9 +212,19 @@ def grow(
     num = len(patches) + len(add_facets(voxels, owner, len(patches), (size_m, facet_m), config))
     table = owner_table(voxels, owner)
     index, normals, curved = join_patches(pieces_of(voxels, table, num), view, noise, size_m)
-    rename_owners(voxels.starts, group, index, owner)
-    rename_owners(table[3], group, index, table[0])
-    return grown(owner, table, normals, curved, median_m)
+    owner = renamed(voxels.starts, group, index, owner)
+    return grown(owner, owner_table(voxels, owner), normals, curved, median_m)
+
+
+def renamed(starts: Indices, group: Owners, index: Owners, owner: Owners) -> Owners:
+    """
+    Return owners (P,), where patch k is index[k] and a free one -1 less the group of its voxel.
+
+    starts: first owner of each voxel, (V + 1,)
+    """
+    free = -1 - np.repeat(group, np.diff(starts))
+    found: Owners = np.where(owner >= 0, np.append(index, 0)[owner], free).astype(np.int32)
+    return found
 
 
 def grown(
@@ -284,11 +234,9 @@ def grown(
     curved: npt.NDArray[np.bool_],
     tolerance_m: float,
 ) -> Grown:
-    """Return the points by patch; the table is consumed."""
-    held = merge_owners(*table)
-    owners, first = table[0][:held], table[3]
-    low = min(int(owners.min(initial=0)), 0)
-    starts, _, points, _ = sorted_table((owners, *table[1:3], first), low, len(normals) - low)
+    """Return the points by patch."""
+    low = min(int(table[0].min(initial=0)), 0)
+    starts, _, points, _ = sorted_table(table, low, len(normals) - low)
     names = np.repeat(np.arange(low, len(normals), dtype=np.int32), np.diff(starts))
     return Grown(owner, points, names, normals, curved, tolerance_m)
 
@@ -361,8 +309,7 @@ def extend_planes(
         return
     table = owner_table(voxels, owner)
     starts, voxel, points, weights = sorted_table(table, 0, number)
-    means, normals, values = np.empty((3, number, 3))
-    plane_frames(points, weights, starts, means, normals, values)
+    means, normals, values = plane_frames(points, weights, starts)
     planes = np.column_stack([normals, -np.einsum('ij,ij->i', normals, means)])
     sigma = np.sqrt(np.maximum(values[:, 0], 0.0))
     tolerance = np.minimum(TOLERANCE_SIGMAS * sigma, FAR_SIGMAS * sigma + sizes[1])
@@ -406,7 +353,9 @@ def add_facets(
     )
     planes = np.empty((number + MOST_FACETS, 4))
     state = voxels.points, voxels.starts, voxels.adjacent
-    num = find_facets(*state, free, rules, owner, planes, number)
+    seeds = np.flatnonzero(free[1])
+    seeds = seeds[np.argsort(-free[0][seeds], kind='stable')]
+    num = find_facets(*state, free, seeds, rules, owner, planes, number)
     return planes[number:num, :3]
 
 
@@ -441,11 +390,13 @@ def tolerances(
 ) -> Array:
     """Return the distance (K,) up to which a point lies on each patch, m; noise (K,) across it."""
     number = len(noise)
-    held = int(np.diff(voxels.starts)[label >= 0].sum())
-    who, distance = np.empty(held, np.int32), np.empty(held)
-    stride = 1 + held // SAMPLES
-    num = sample_distances(voxels.points, voxels.starts, label, tangent, stride, who, distance)
-    order = np.argsort(who[:num], kind='stable')
+    voxel = np.repeat(np.arange(len(label)), np.diff(voxels.starts))
+    rows = np.flatnonzero(label[voxel] >= 0)
+    rows = rows[:: 1 + len(rows) // SAMPLES]
+    voxel = voxel[rows]
+    who, plane = label[voxel], tangent[voxel]
+    distance = np.abs(np.einsum('ij,ij->i', voxels.points[rows], plane[:, :3]) + plane[:, 3])
+    order = np.argsort(who, kind='stable')
     ends = np.searchsorted(who[order], np.arange(1, number))
     sigma = [
         1.4826 * float(np.median(part)) if len(part) else 0.0
@@ -461,9 +412,13 @@ def free_surfels(
     voxels: VoxelPoints, owner: Owners, size_m: float, tolerance_m: float
 ) -> FreeSurfels:
     """Return number, flatness, mean and normal of the free points of every voxel."""
-    number = len(voxels.starts) - 1
-    count, flat = np.empty(number, np.int64), np.empty(number, np.bool_)
-    mean, normal = np.zeros((number, 3)), np.zeros((number, 3))
     thickness = min(FLAT_VOXELS * size_m, 8.0 / TOLERANCE_SIGMAS * tolerance_m)
-    classify_free(voxels.points, voxels.starts, owner, thickness, count, flat, mean, normal)
-    return count, flat, mean, normal
+    weights = (owner == FREE).astype(np.float64)
+    total, mean, scatters = means_and_scatters(voxels.points, weights, voxels.starts)
+    flat, normal = np.zeros(len(total), np.bool_), np.zeros_like(mean)
+    enough = np.flatnonzero(total >= LEAST_POINTS)
+    values, axes = eigen(scatters[enough] / total[enough, None, None])
+    is_flat = 36.0 * values[:, 0] < thickness**2
+    is_flat &= values[:, 1] > LEAST_WIDTH * values[:, 2]
+    flat[enough], normal[enough] = is_flat, axes[:, 0]
+    return total.astype(np.int64), flat, mean, normal

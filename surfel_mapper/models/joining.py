@@ -20,14 +20,15 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.joining import plane_frames, touching_patches
+from surfel_mapper.models.frames import plane_frames
+from surfel_mapper.models.kernels.joining import touching_patches
 from surfel_mapper.models.kernels.region_joining import (
+    CHUNK,
     describe_regions,
     join_layers,
     join_smooth,
     Regions,
 )
-from surfel_mapper.models.kernels.voxel_points import LEAST_COSINE
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -37,6 +38,9 @@ LEAST_TOUCH = 2
 
 LAYER_SHARE = 0.6
 """Least share of the voxels of a layer that touch the larger patch."""
+
+LEAST_COSINE = 0.5
+"""Noise is along the ray; at grazing incidence other errors dominate."""
 
 FLOOR_VOXELS = 0.02
 """Residuals are not resolved below this, in voxels: exact surfaces would otherwise never join."""
@@ -121,7 +125,7 @@ def join_patches(
     state = pieces.means, pieces.weights, pieces.starts
     join_layers(layers(pairs, pieces, regions), *state, regions)
     edges, adjacent = touching_regions(pairs, regions.root)
-    join_smooth(edges, adjacent, *state, floor, regions)
+    join_smooth(edges, adjacent, *state, chunk_boxes(pieces.means), floor, regions)
     index, normals, curved, is_worse = described(regions, state, size_m)
     if is_worse.any():
         undone = np.append(is_worse, np.True_)[index]  # the last: patches without points
@@ -149,7 +153,8 @@ def described(
     normals, found = np.empty((len(names), 3)), np.empty((len(names), 4))
     floor = (FLOOR_VOXELS * size_m) ** 2
     limits = CURVED_GAIN, math.radians(LEAST_TURN_DEG), LEAST_BEND_VOXELS * size_m
-    describe_regions(names, *state, floor, regions, limits, normals, found)
+    places = *state, chunk_boxes(state[0]), floor
+    describe_regions(names, places, regions, limits, normals, found)
     index = np.searchsorted(names, regions.root).astype(np.int32)
     gains, turns, bends = (found[:, :3] > limits).T
     curved = gains & turns & bends
@@ -166,8 +171,7 @@ def single_regions(
 ) -> Regions:
     """Return a region for every patch."""
     number = len(pieces.starts) - 1
-    means, normals, values = np.empty((3, number, 3))
-    plane_frames(pieces.means, pieces.weights, pieces.starts, means, normals, values)
+    means, normals, values = plane_frames(pieces.means, pieces.weights, pieces.starts)
     towards = view - means
     normals[np.einsum('ij,ij->i', towards, normals) < 0.0] *= -1.0
     counts = np.diff(pieces.starts)
@@ -190,6 +194,15 @@ def single_regions(
         patch_points=points,
         patch_sigma=np.maximum(sigma, np.sqrt(np.maximum(values[:, 0], floor))),
     )
+
+
+def chunk_boxes(points: Array) -> Array:
+    """Return the least and greatest coordinates of CHUNK points each, (C, 2, 3) m."""
+    if not len(points):
+        return np.empty((0, 2, 3))
+    starts = np.arange(0, len(points), CHUNK)
+    ends = [end.reduceat(points, starts) for end in (np.minimum, np.maximum)]
+    return np.stack(ends, axis=1)
 
 
 def layers(pairs: Indices, pieces: Pieces, regions: Regions) -> Indices:

@@ -18,15 +18,19 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.mapping.moments import unpack_keys
-from surfel_mapper.models.bspline import fit_grids, HeightField, is_small
-from surfel_mapper.models.bspline_incremental import DEGREE, fit_field, FittedField, SMOOTHING
+from surfel_mapper.models.bspline import fit_cells, HeightField
+from surfel_mapper.models.bspline_incremental import (
+    DEGREE,
+    fit_field,
+    FittedField,
+    is_large,
+    SMOOTHING,
+)
 from surfel_mapper.models.grid import Cells
-from surfel_mapper.models.kernels.bspline import rms_off_field
-from surfel_mapper.models.kernels.patches import describe_patches
 from surfel_mapper.models.kernels.surfel_classes import FLAT
 from surfel_mapper.models.kernels.surfel_groups import mean_normals, merge_voxels, sample_voxels
 from surfel_mapper.models.multi_model import Plane, Surface
-from surfel_mapper.models.patches import cells_of, PatchPoints, rms_across
+from surfel_mapper.models.patches import cells_of, described, PatchPoints, rms_across
 from surfel_mapper.models.surfel_graph import SurfelGraph
 
 Array = npt.NDArray[np.float64]
@@ -176,8 +180,8 @@ class PatchFitter:
         samples, frames, curved, means = groups.samples, groups.frames, groups.curved, groups.means
         origins, stays = self._steadied(before, groups)
         pitches = np.where(curved, self._surface_pitch_m, PLANE_PITCH_VOXELS * self._size_m)
-        placed = origins, frames, pitches, np.empty_like(samples.points)
-        cells = cells_of(samples, placed, 0.5 * self._size_m, snapped=True)
+        placed = origins, frames, pitches
+        cells, _ = cells_of(samples, placed, 0.5 * self._size_m, snapped=True)
         known = [t.fitted if t and stay else None for t, stay in zip(before, stays, strict=True)]
         ends = np.array([len(part) for part in beyond])
         fields = self._fields(cells, np.flatnonzero(curved & (ends == 0)), known)
@@ -221,23 +225,20 @@ class PatchFitter:
         starts = np.concatenate([[0], ends])
         groups = PatchPoints(points, starts, samples.normals[chosen], samples.thickness[chosen])
         origins, axes, pitches = (part[chosen] for part in frames)
-        placed = origins, axes, pitches, np.empty_like(points)
-        return cells_of(groups, placed, 0.5 * self._size_m, snapped=True)
+        return cells_of(groups, (origins, axes, pitches), 0.5 * self._size_m, snapped=True)[0]
 
     def _fields(
         self, cells: Cells, chosen: Indices, before: list[FittedField | None]
     ) -> dict[int, FittedField]:
         """Return the fields of chosen patches: small ones anew, large ones near changes."""
-        small = is_small(cells.sizes[chosen], DEGREE)
-        fitted, heights = fit_grids(cells, chosen[small], DEGREE, SMOOTHING)
-        found = {
-            k: FittedField(field, heights[cells.of(k)].reshape(cells.sizes[k]).copy())
-            for k, field in zip(chosen[small].tolist(), fitted, strict=True)
-        }
-        for k in chosen[~small].tolist():
-            sums = cells.sums[cells.of(k)].reshape(*cells.sizes[k], 4)
-            pitch_m, origin = float(cells.pitches[k]), cells.origins[k].copy()
-            found[k] = fit_field(pitch_m, origin, sums, before[k], self._still_m)
+        found = {}
+        for k in chosen.tolist():
+            if is_large(cells.sizes[k]):
+                sums = cells.sums[cells.of(k)].reshape(*cells.sizes[k], 4)
+                pitch_m, origin = float(cells.pitches[k]), cells.origins[k].copy()
+                found[k] = fit_field(pitch_m, origin, sums, before[k], self._still_m)
+            else:
+                found[k] = FittedField(*fit_cells(cells, k, DEGREE, SMOOTHING))
         return found
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
@@ -260,20 +261,8 @@ class PatchFitter:
 
     def _frames(self, groups: PatchPoints) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Return the frames (K, 3, 3) of groups as surfaces, and whether they are curved."""
-        number = len(groups.thickness)
-        means, frames = np.empty((number, 3)), np.empty((number, 3, 3))
-        covariances, curved = np.empty((number, 3, 3)), np.empty(number, np.bool_)
-        describe_patches(
-            groups.points,
-            groups.starts,
-            groups.normals,
-            np.zeros(3),
-            (groups.thickness, self._surface_pitch_m, True, True),
-            means,
-            covariances,
-            frames,
-            curved,
-        )
+        rules = groups.thickness, self._surface_pitch_m, True, True
+        _, _, frames, curved = described(groups, np.zeros(3), rules)
         return frames, curved
 
     def _steadied(
@@ -308,9 +297,11 @@ class PatchFitter:
 
     def _rms_m(self, field: HeightField, frame: Array, origin: Array, rows: Rows) -> float:
         """Return the root mean square distance of the points of voxels from a field, m."""
-        held = self._graph.count, self._graph.position, self._graph.eigenvalues
-        found: float = rms_off_field(rows, held, frame, origin, field.parts())
-        return found
+        graph = self._graph
+        local = (graph.position[rows] - origin) @ frame.T
+        away = local[:, 2] - field.heights(local[:, :2])
+        squares = away**2 + graph.eigenvalues[rows, 0]
+        return float(np.sqrt(np.average(squares, weights=graph.count[rows])))
 
 
 def turned(x: Array, normals: Array) -> Array:

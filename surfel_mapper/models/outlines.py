@@ -23,11 +23,11 @@ from surfel_mapper.models.kernels.outlines import (
     mark_sides,
     simplify_loop,
     trace_loops,
-    triangulate_rings,
 )
 from surfel_mapper.models.multi_model import Plane
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 PARTS = 4
 """Squares along either side of a cell, for outlines."""
@@ -124,11 +124,70 @@ def triangulated(rings: Sequence[Array]) -> Array:
         whatever the direction of the rings.
 
     """
-    corners = np.concatenate([np.empty((0, 2)), *rings])
-    found: Array = triangulate_rings(
-        corners, np.cumsum([len(ring) for ring in rings], dtype=np.int64)
-    )
-    return found
+    starts, stops = sloped_sides(rings)
+    heights = np.stack([starts[:, 1], stops[:, 1]])
+    levels, place = np.unique(heights, return_inverse=True)
+    lowest, highest = np.sort(place.reshape(2, -1), axis=0)
+    left, right, low, high = trapezoids((starts, stops), levels, lowest, highest)
+
+    def corner(side: Indices, level: Indices) -> Array:
+        return np.stack([sides_x(starts, stops, side, levels[level]), levels[level]], axis=1)
+
+    a, b = corner(left, low), corner(right, low)
+    c, d = corner(right, high), corner(left, high)
+    found = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return found[areas(found) > 0.0]
+
+
+def sloped_sides(rings: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the starts and the ends, (E, 2) each, of the sides of rings that are not level."""
+    starts = np.concatenate([np.empty((0, 2)), *rings])
+    stops = np.concatenate([np.empty((0, 2)), *map(next_corners, rings)])
+    sloped = starts[:, 1] != stops[:, 1]
+    return starts[sloped], stops[sloped]
+
+
+def sides_x(starts: Array, stops: Array, side: Indices, height: Array) -> Array:
+    """Return x (n,) of sides at heights."""
+    first, last = starts[side], stops[side]
+    share = (height - first[:, 1]) / (last[:, 1] - first[:, 1])
+    x: Array = first[:, 0] + share * (last[:, 0] - first[:, 0])
+    return x
+
+
+def trapezoids(
+    sides: tuple[Array, Array], levels: Array, lowest: Indices, highest: Indices
+) -> tuple[Indices, Indices, Indices, Indices]:
+    """
+    Return the trapezoids between sides: left and right side, lowest and highest level, (F,) each.
+
+    The plane is cut into slabs at the height of every corner. No side ends within a slab, so the
+    areas between the first and second side, the third and fourth and so on are trapezoids. Those
+    between the same two sides in neighbouring slabs are merged.
+
+    Parameters
+    ----------
+    sides : (E, 2), (E, 2) float64
+        Starts and ends; none is level, and as many go up as down through any height.
+    levels : (L,) float64
+        All heights of corners, ascending.
+    lowest, highest : (E,) int64
+        Levels at which each side starts and ends.
+
+    """
+    spans = highest - lowest
+    side = np.repeat(np.arange(len(spans)), spans)
+    slab = np.arange(len(side)) + np.repeat(highest - np.cumsum(spans), spans)
+    x = sides_x(*sides, side, 0.5 * (levels[slab] + levels[slab + 1]))
+    order = np.lexsort((side, x, slab))
+    left, right, slab = side[order[::2]], side[order[1::2]], slab[order[::2]]
+    order = np.lexsort((slab, right, left))
+    left, right, slab = left[order], right[order], slab[order]
+    is_new = np.ones(len(slab), np.bool_)
+    is_new[1:] = (left[1:] != left[:-1]) | (right[1:] != right[:-1]) | (slab[1:] != slab[:-1] + 1)
+    is_last = np.ones(len(slab), np.bool_)
+    is_last[:-1] = is_new[1:]
+    return left[is_new], right[is_new], slab[is_new], slab[is_last] + 1
 
 
 def areas(triangles: Array) -> Array:

@@ -15,17 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.models.bspline import (
-    fit_grids,
-    fit_lsqr,
-    fit_pspline,
-    HeightField,
-    initial_field,
-    is_small,
-)
+from surfel_mapper.models.bspline import fit_cells, HeightField
+from surfel_mapper.models.frames import eigen, means_and_scatters
 from surfel_mapper.models.grid import Cells
-from surfel_mapper.models.kernels.grid import fill_cells, place_grids
-from surfel_mapper.models.kernels.patches import describe_patches
 from surfel_mapper.models.multi_model import Plane, Surface
 from surfel_mapper.models.segmentation import is_paper
 
@@ -36,6 +28,9 @@ PAPER_PLANE_PITCH_VOXELS = 5.0
 """Edge of the cells of planes in profile paper."""
 SURFACE_PITCH_VOXELS = 3.0
 """Edge of the cells of surfaces."""
+LEAST_CELLS = 8
+"""The curvature of a patch is not tested with fewer cells."""
+
 MARGIN_VOXELS = 0.5
 """Distance between a cut and the points."""
 
@@ -76,27 +71,14 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     """Return a Plane or Surface for every group, in order; None for multi-valued ones."""
     number, by_paper = len(groups.thickness), is_paper(config)
     a = config.voxel_size_m
-    means, frames = np.empty((number, 3)), np.empty((number, 3, 3))
-    covariances, curved = np.empty((number, 3, 3)), np.empty(number, np.bool_)
     thickness, bent = groups.thickness, not by_paper
     if groups.curved is not None:
         thickness, bent = np.where(groups.curved, 0.0, np.inf), False
-    rules = (thickness, SURFACE_PITCH_VOXELS * a, bent, not by_paper)
-    describe_patches(
-        groups.points,
-        groups.starts,
-        groups.normals,
-        viewpoint,
-        rules,
-        means,
-        covariances,
-        frames,
-        curved,
-    )
-    local = np.empty_like(groups.points)
+    rules = thickness, SURFACE_PITCH_VOXELS * a, bent, not by_paper
+    means, covariances, frames, curved = described(groups, viewpoint, rules)
     plane_pitch = PAPER_PLANE_PITCH_VOXELS if by_paper else config.plane_pitch_voxels
     pitches = np.where(curved, SURFACE_PITCH_VOXELS, plane_pitch) * a
-    cells = cells_of(groups, (means, frames, pitches, local), a, snapped=not by_paper)
+    cells, local = cells_of(groups, (means, frames, pitches), a, snapped=not by_paper)
     splines = splines_of(cells, np.flatnonzero(curved), config)
     numbers, grids = np.diff(groups.starts), cells.grids()
     rms_m = rms_across(covariances, frames[:, 2], numbers)
@@ -117,65 +99,125 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     return found
 
 
+def described(
+    groups: PatchPoints, viewpoint: Array, rules: tuple[Array, float, bool, bool]
+) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
+    """
+    Return mean (K, 3), covariance and frame (K, 3, 3) of every patch, and which are curved.
+
+    Parameters
+    ----------
+    groups : PatchPoints
+        The points.
+    viewpoint : (3,) float64, m
+        Normals face it.
+    rules : tuple
+        Thickness (K,) of a plane, m; edge of the cells for the test of curvature, m; whether it
+        is tested; whether the z of a surface is its mean normal.
+
+    """
+    thickness, pitch_m, bent, mean_normal = rules
+    starts, weights = groups.starts, np.ones(len(groups.points))
+    _, means, scatters = means_and_scatters(groups.points, weights, starts)
+    covariances = scatters / np.maximum(np.diff(starts) - 1, 1)[:, None, None]
+    values, axes = eigen(covariances)
+    frames = oriented(axes, viewpoint - means)
+    turned = aligned(frames, groups.normals)
+    thick = 6.0 * np.sqrt(values[:, 0])
+    curved: npt.NDArray[np.bool_] = thick >= thickness
+    for k in np.flatnonzero(curved) if bent else ():  # what bends by a thickness is thicker
+        local = (groups.points[starts[k] : starts[k + 1]] - means[k]) @ turned[k].T
+        bend_m = bend_height(local, pitch_m)
+        if bend_m >= 0.0:
+            curved[k] = bend_m > thickness[k] or thick[k] >= 2.0 * thickness[k]
+    if mean_normal:
+        frames[curved] = turned[curved]
+    return means, covariances, frames, curved
+
+
+def oriented(axes: Array, towards: Array) -> Array:
+    """
+    Return frames (K, 3, 3) of eigenvectors, rows ascending by eigenvalue.
+
+    The normal is on the side of a direction (K, 3), and the largest component of x is positive.
+    """
+    side = np.where(np.einsum('ij,ij->i', axes[:, 0], towards) < 0.0, -1.0, 1.0)
+    z, x = axes[:, 0] * side[:, None], axes[:, 2]  # its largest component is positive
+    frames: Array = np.stack([x, np.cross(z, x), z], axis=1)
+    return frames
+
+
+def aligned(frames: Array, normals: Array) -> Array:
+    """Return frames (K, 3, 3) with other normals (K, 3), turned so that x changes least."""
+    x = frames[:, 0] - np.einsum('ij,ij->i', frames[:, 0], normals)[:, None] * normals
+    length = np.linalg.norm(x, axis=1)
+    found = frames.copy()
+    kept = np.flatnonzero(length >= 1e-6)
+    x = x[kept] / length[kept, None]
+    found[kept] = np.stack([x, np.cross(normals[kept], x), normals[kept]], axis=1)
+    return found
+
+
+def bend_height(local: Array, pitch_m: float) -> float:
+    """
+    Return the 5th to 95th percentile range of the curved part of points (n, 3) in a frame, m.
+
+    0 if a quadric does not fit twice as well as a plane; -1 if there are too few cells.
+    """
+    x, y = ((local[:, :2] - local[:, :2].min(axis=0)) / pitch_m).astype(np.int64).T
+    cell = x * (y.max() + 1) + y
+    number = np.bincount(cell)
+    used = np.flatnonzero(number)
+    if len(used) < LEAST_CELLS:
+        return -1.0
+    scale = float(np.abs(local[:, :2]).max())
+    weight: Array = number[used].astype(np.float64)
+    x, y, z = (np.bincount(cell, values)[used] / (weight * scale) for values in local.T)
+    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    plane, quadric = (weighted_fit(basis[:, :terms], z, weight) for terms in (3, 6))
+    errors = [float(weight @ (z - basis[:, : len(fit)] @ fit) ** 2) for fit in (plane, quadric)]
+    if not errors[1] < 0.25 * errors[0]:  # squares: half of the root mean square
+        return 0.0
+    rise, last = np.sort(basis[:, 3:] @ quadric[3:]), len(used) - 1
+    return scale * float(rise[int(0.95 * last)] - rise[int(0.05 * last)])
+
+
+def weighted_fit(basis: Array, z: Array, weight: Array) -> Array:
+    """Return the coefficients (T,) of a basis (n, T) that fit values best, by a small ridge."""
+    matrix, right = basis.T @ (basis * weight[:, None]), basis.T @ (weight * z)
+    matrix += 1e-12 * weight.sum() * np.eye(basis.shape[1])
+    return np.asarray(np.linalg.solve(matrix, right), np.float64)
+
+
 def cells_of(
-    groups: PatchPoints, frames: tuple[Array, Array, Array, Array], a: float, *, snapped: bool
-) -> Cells:
-    """Return the cells of all patches; frames: means, rotations, pitches, local coordinates."""
-    means, rotations, pitches, local = frames
-    origins, sizes = np.empty((len(means), 2)), np.empty((len(means), 2), np.int64)
-    place_grids(
-        groups.points, groups.starts, means, rotations, pitches, snapped, local, origins, sizes
-    )
-    ends = np.cumsum(sizes.prod(axis=1))
-    total = int(ends[-1]) if len(ends) else 0
-    cells = Cells(
-        pitches=pitches,
-        origins=origins,
-        sizes=sizes,
-        first=ends - sizes.prod(axis=1),
-        sums=np.zeros((total, 4)),
-        rim=np.zeros(total, np.bool_),
-        corner=np.zeros(total, np.uint8),
-        cuts=np.zeros((total, 3), np.uint8),
-    )
-    fill_cells(
-        local,
-        groups.starts,
-        pitches,
-        origins,
-        sizes,
-        cells.first,
-        cells.sums,
-        cells.rim,
-        cells.corner,
-        cells.cuts,
-        MARGIN_VOXELS * a,
-    )
-    return cells
+    groups: PatchPoints, frames: tuple[Array, Array, Array], a: float, *, snapped: bool
+) -> tuple[Cells, Array]:
+    """
+    Return the cells of all patches, and the points (N, 3) in their frames.
+
+    Parameters
+    ----------
+    groups : PatchPoints
+        The points.
+    frames : tuple
+        Origins (K, 3) and axes (K, 3, 3) of the frames, edges of the cells (K,), m.
+    a : float
+        Edge of the voxels, m.
+    snapped : bool
+        Whether grids start at multiples of the edges of their cells.
+
+    """
+    origins, axes, pitches = frames
+    patch = np.repeat(np.arange(len(origins)), np.diff(groups.starts))
+    local = np.einsum('nij,nj->ni', axes[patch], groups.points - origins[patch])
+    return Cells.around(local, patch, pitches, MARGIN_VOXELS * a, snapped=snapped), local
 
 
 def splines_of(cells: Cells, curved: Indices, config: ModelsConfig) -> dict[int, HeightField]:
     """Return the splines of the curved patches."""
     by_lsqr = is_paper(config) or config.solver == 'lsqr'
-    together = is_small(cells.sizes[curved], config.degree) & (not by_lsqr)
-    chosen = curved[together]
-    fields, _ = fit_grids(cells, chosen, config.degree, config.smoothing)
-    found = dict(zip(chosen.tolist(), fields, strict=True))
-    for k in curved[~together].tolist():
-        sums, shape = cells.sums[cells.of(k)], cells.sizes[k]
-        used = sums[:, 3] > 0.0
-        means = np.zeros((len(sums), 3))
-        means[used] = sums[used, :3] / sums[used, 3:]
-        heights, filled = means[:, 2].reshape(shape), used.reshape(shape)
-        pitch_m = float(cells.pitches[k])
-        start = initial_field(pitch_m, cells.origins[k], heights, filled, config.degree)
-        xy, z = means[used, :2], means[used, 2]
-        found[k] = (
-            fit_lsqr(start, xy, z)
-            if by_lsqr
-            else fit_pspline(start, xy, z, sums[used, 3], config.smoothing)
-        )
-    return found
+    smoothing = None if by_lsqr else config.smoothing
+    return {k: fit_cells(cells, k, config.degree, smoothing)[0] for k in curved.tolist()}
 
 
 def surface_of(plane: Plane, spline: HeightField, points: Array, far_m: float) -> Surface | None:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models.kernels.bisection import bisect_cloud, NOISE_SPREAD
 from surfel_mapper.models.kernels.charts import bisect_folded
-from surfel_mapper.models.kernels.region_merging import merge_regions
+from surfel_mapper.models.kernels.region_merging import find_pairs, merge_pairs
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -175,20 +175,26 @@ def merged(
         FAR_GAP_VOXELS * a,
         NEAR_GAP_VOXELS * a,
     )
-    parent = np.empty(len(members), np.int64)
-    merge_regions(
-        clusters.points,
-        clusters.rows[members],
-        clusters.mean[members],
-        clusters.eigenvalues[members],
-        clusters.frames[members],
-        scales[members],
-        rules,
-        parent,
-    )
+    rows, scales = clusters.rows[members], scales[members]
+    shapes = clusters.mean[members], clusters.eigenvalues[members], clusters.frames[members]
+    pairs, lengths = np.empty((1024, 2), np.int64), np.empty(1024)
+    number = find_pairs(*shapes, scales, rules, pairs, lengths)
+    if number > len(pairs):
+        pairs, lengths = np.empty((number, 2), np.int64), np.empty(number)
+        find_pairs(*shapes, scales, rules, pairs, lengths)
+    nearest = np.argsort(lengths[:number], kind='stable')
+    boxes, parent = boxes_of(clusters.points, rows), np.empty(len(members), np.int64)
+    merge_pairs(clusters.points, rows, boxes, pairs[nearest], rules[5], parent)
     order = np.argsort(parent, kind='stable')
     ends = np.flatnonzero(np.diff(parent[order])) + 1
     return [part for part in np.split(members[order], ends) if len(part)]
+
+
+def boxes_of(points: Array, rows: Indices) -> Array:
+    """Return the least and greatest coordinates (K, 2, 3) of ranges of rows (K, 2), none empty."""
+    edges = rows.ravel()[: np.searchsorted(rows.ravel(), len(points))]  # the end is no row
+    ends = [end.reduceat(points, edges)[::2] for end in (np.minimum, np.maximum)]
+    return np.stack(ends, axis=1)
 
 
 def mean_normal(clusters: Clusters, members: Indices) -> Array:

@@ -20,14 +20,13 @@ import numpy.typing as npt
 
 from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.kernels.layout import INDEX_BITS
-from surfel_mapper.models.charts import STACKED_VOXELS
+from surfel_mapper.models.charts import chart_side, STACKED_VOXELS
 from surfel_mapper.models.coarse_growth import (
     CoarseRules,
     extend_coarse,
     grow_coarse,
     SPARSE_SHARE,
 )
-from surfel_mapper.models.kernels.charts import bisect_chart
 from surfel_mapper.models.kernels.surfel_classes import FLAT
 from surfel_mapper.models.kernels.surfel_groups import find_doubtful, find_pieces, mean_normals
 from surfel_mapper.models.surfel_graph import SurfelGraph
@@ -166,8 +165,8 @@ class SurfelJoining:
         if not doubtful[0]:
             return False
         rows = rows[np.argsort(graph.key[rows])]
-        side = np.empty(len(rows), np.bool_)
-        return bool(bisect_chart(graph.normal[rows], graph.position[rows], *rules, size_m, side))
+        side = chart_side(graph.normal[rows], graph.position[rows], self._limit, size_m)
+        return side is not None
 
     def _joined(self, rows: Indices, piece: Rows) -> Rows:
         """Return the region (n,) of each row of a block, in the order of their keys, or -1."""

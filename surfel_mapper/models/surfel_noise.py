@@ -18,7 +18,7 @@ import numpy as np
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.coarsening import coarse_surfels
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.models.growth import CLIPPED_VOXELS, CLIPPING, NOISE_QUANTILE
+from surfel_mapper.models.cloud_noise import CLIPPED_VOXELS, CLIPPING, NOISE_QUANTILE
 
 LEVELS = 4
 """Voxels of up to 8 times the size are tried."""

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.symmetric3 import decompose, eigen_frame
+from surfel_mapper.kernels.symmetric3 import decompose
 from test.kernels.modes import both, compiled, interpreted
 
 pytestmark = pytest.mark.filterwarnings('error')
@@ -191,23 +191,3 @@ ENTRY = st.floats(-1e3, 1e3) | st.sampled_from([0.0, -0.0, 1.0, 1e-9, 1e9, -1.0]
 def test_any_sum_of_outer_products_is_decomposed_as_by_eigh(vectors):
     vectors = np.array(vectors)
     assert_as_eigh((vectors.T @ vectors)[None])
-
-
-@both
-def test_a_frame_holds_all_eigenvectors_of_one_matrix(call):
-    matrices = with_spectrum(np.abs(np.random.default_rng(8).normal(size=(60, 3))), seed=9)
-    for matrix in matrices:
-        values, vectors = np.empty(3), np.empty((3, 3))
-        call(eigen_frame, matrix, values, vectors)
-        np.testing.assert_allclose(values, np.linalg.eigvalsh(matrix), atol=1e-12 * values[2])
-        np.testing.assert_allclose(vectors @ vectors.T, np.eye(3), atol=1e-12)
-        np.testing.assert_allclose((vectors.T * values) @ vectors, matrix, atol=1e-12 * values[2])
-        assert (vectors[range(3), np.abs(vectors).argmax(axis=1)] > 0).all()
-
-
-@both
-def test_the_frame_of_the_zero_matrix_is_the_identity(call):
-    values, vectors = np.empty(3), np.empty((3, 3))
-    call(eigen_frame, np.zeros((3, 3)), values, vectors)
-    assert not values.any()
-    np.testing.assert_array_equal(vectors, np.eye(3))

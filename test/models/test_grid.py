@@ -9,8 +9,7 @@ import pytest
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
-from surfel_mapper.models.kernels.grid import fill_cells, find_covered, find_covered_squares
-from test.kernels.modes import compiled, interpreted
+from surfel_mapper.models.grid import Cells
 from test.models.scenes import A, room, sheet, VIEW
 
 PITCH = 3 * A
@@ -91,18 +90,13 @@ def slow_contains(grid, xy):
     return inside
 
 
-@pytest.mark.parametrize('call', [compiled, interpreted])
-def test_coverage_queries_equal_the_slow_twin(call):
+def test_coverage_queries_equal_the_slow_twin():
     (plane,) = fit(shape(SHAPES['triangle'][0]), ModelsConfig(voxel_size_m=A), (0, 0, 5)).planes
     grid, end = plane.grid, np.array(plane.grid.filled.shape) * plane.grid.pitch_m
     places = np.random.default_rng(2).uniform(-0.1, 1.1, (3000, 2)) * end
     places = grid.origin + np.concatenate([places, end * [[1, 1], [1, 0.5], [0, 0]]])
-    cells = grid.filled, grid.rim, grid.corner, grid.cuts
-    inside = np.empty(len(places), bool)
-    call(find_covered, places, cells, grid.pitch_m, grid.origin, inside)
-    assert np.array_equal(inside, slow_contains(grid, places))
-    parts = np.empty((3 * grid.filled.shape[0], 3 * grid.filled.shape[1]), bool)
-    call(find_covered_squares, 3, cells, grid.pitch_m, grid.origin, parts)
+    assert np.array_equal(grid.contains(places), slow_contains(grid, places))
+    parts = grid.mask(3)
     middles = grid.origin + (np.argwhere(np.ones_like(parts)) + 0.5) * (grid.pitch_m / 3)
     assert np.array_equal(parts.reshape(-1), slow_contains(grid, middles))
 
@@ -112,16 +106,12 @@ def test_a_corner_that_cells_surround_is_not_cut():
     around = [(x, y) for x in range(3) for y in range(3) if (x, y) not in ((1, 1), (2, 1))]
     middles = [(x + 0.5, y + 0.5) for x, y in around]
     local = np.array([(x, y, 0.0) for x, y in [*middles, (1.9, 1.4), (2.99, 2.99), (0.0, 0.0)]])
-    rim, corner = np.zeros(9, bool), np.zeros(9, np.uint8)
-    sums, cuts = np.zeros((9, 4)), np.zeros((9, 3), np.uint8)
-    starts, first = np.array([0, len(local)]), np.array([0])
-    origins, sizes = np.zeros((1, 2)), np.full((1, 2), 3)
-    pitches = np.ones(1)
-    fill_cells(local, starts, pitches, origins, sizes, first, sums, rim, corner, cuts, 0.1)
+    cells = Cells.around(local, np.zeros(len(local), int), np.ones(1), 0.1, snapped=True)
+    assert cells.sizes.tolist() == [[3, 3]]
     middle = 4
-    assert rim[middle]
-    assert corner[middle] == 2  # low x, high y: all around it is filled
-    assert not cuts[middle].any()
+    assert cells.rim[middle]
+    assert cells.corner[middle] == 2  # low x, high y: all around it is filled
+    assert not cells.cuts[middle].any()
     beside = 7  # empty
-    assert not rim[beside]
-    assert cuts[8].any()  # its corner is that of the grid
+    assert not cells.rim[beside]
+    assert cells.cuts[8].any()  # its corner is that of the grid

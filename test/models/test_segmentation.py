@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.kernels.symmetric3 import eigen_frame
 from surfel_mapper.models import fit
-from surfel_mapper.models.kernels.frames import orient, range_moments
+from surfel_mapper.models.frames import means_and_scatters
+from surfel_mapper.models.kernels.frames import eigen_frame, orient
 from surfel_mapper.models.kernels.region_merging import gap, same_surface
 from surfel_mapper.models.segmentation import merge_clusters, segment_cloud
 from surfel_mapper.models.thinning import thin
@@ -131,9 +131,8 @@ def test_frames_are_right_handed_ascending_and_face_the_viewpoint():
     rng = np.random.default_rng(6)
     for _ in range(50):
         points = rng.standard_normal((30, 3)) * rng.uniform(0.01, 3.0, 3) + 100.0
-        mean, scatter = np.empty(3), np.empty((3, 3))
+        _, (mean,), (scatter,) = means_and_scatters(points, np.ones(30), np.array([0, 30]))
         values, frame = np.empty(3), np.empty((3, 3))
-        range_moments(points, 0, 30, mean, scatter)
         expected = np.linalg.eigvalsh(np.cov(points.T) * 29)
         eigen_frame(scatter, values, frame)
         orient(frame, mean, np.zeros(3))

@@ -17,11 +17,10 @@ for the tests; the correction of the density test by direction is our own.
 
 import math
 
-from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.symmetric3 import eigen_frame
-from surfel_mapper.models.kernels.frames import orient
+from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.models.kernels.frames import eigen_frame, orient
 from surfel_mapper.models.kernels.gaussian_mixture import split_mixture
 
 MEANS_ITERATIONS = 10
@@ -34,7 +33,7 @@ SETTLED_SHARE = 0.002
 THREE_SIGMA_SQ = 9.0
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath={'reassoc'})
+@kernel(error_model='numpy', fastmath={'reassoc'})
 def cluster_moments(x, y, z, mean, scatter):
     """
     Compute mean and scatter of at least one point, in one pass about the first of them.
@@ -68,7 +67,7 @@ def cluster_moments(x, y, z, mean, scatter):
     scatter[1, 2] = scatter[2, 1] = yz - sy * mz
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath={'reassoc'})
+@kernel(error_model='numpy', fastmath={'reassoc'})
 def num_outliers(x, y, z, mean, value, frame):
     """Return how many points lie beyond three sigma; rounding on an exact plane is ignored."""
     mx, my, mz = mean[0], mean[1], mean[2]
@@ -86,7 +85,7 @@ def num_outliers(x, y, z, mean, value, frame):
     return found
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def split_two_means(x, y, z, mean, value, frame, share, scratch):
     """
     Assign each point to the nearer of two means; return how many are assigned to the second.
@@ -102,7 +101,7 @@ def split_two_means(x, y, z, mean, value, frame, share, scratch):
     sample, side = scratch[:3, :number], scratch[3, :number]
     total, centre = np.empty(3), np.empty((2, 3))
     subsample(x, y, z, mean, stride, sample, total)
-    reach = np.sqrt(2.0 * value[2] / np.pi)
+    reach = math.sqrt(2.0 * value[2] / math.pi)
     for j in range(3):
         centre[1, j] = reach * frame[0, j]
         centre[0, j] = -centre[1, j]
@@ -122,19 +121,20 @@ def split_two_means(x, y, z, mean, value, frame, share, scratch):
     return assign_sides(x, y, z, plane, mean, share)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def subsample(x, y, z, mean, stride, sample, total):
     """Copy every stride-th point, relative to the mean, and sum the copies."""
-    for j, values in enumerate((x, y, z)):
-        sample_sum = 0.0
-        for i in range(sample.shape[1]):
-            away = values[i * stride] - mean[j]
-            sample[j, i] = away
-            sample_sum += away
-        total[j] = sample_sum
+    total[0] = total[1] = total[2] = 0.0
+    for i in range(sample.shape[1]):
+        at = i * stride
+        u, v, w = x[at] - mean[0], y[at] - mean[1], z[at] - mean[2]
+        sample[0, i], sample[1, i], sample[2, i] = u, v, w
+        total[0] += u
+        total[1] += v
+        total[2] += w
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath={'reassoc'})
+@kernel(error_model='numpy', fastmath={'reassoc'})
 def sum_side(x, y, z, plane, side, sums):
     """
     Sum the points beyond a plane.
@@ -156,7 +156,7 @@ def sum_side(x, y, z, plane, side, sums):
     sums[0], sums[1], sums[2], sums[3], sums[4] = sx, sy, sz, second, changed
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def bisecting_plane(centre, plane):
     """Compute the bisecting plane of two means: direction to the second one, and offset."""
     plane[3] = 0.0
@@ -165,7 +165,7 @@ def bisecting_plane(centre, plane):
         plane[3] += 0.5 * (centre[1, j] ** 2 - centre[0, j] ** 2)
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath={'reassoc'})
+@kernel(error_model='numpy', fastmath={'reassoc'})
 def assign_sides(x, y, z, plane, mean, share):
     """Write 1 for points beyond a plane, relative to the mean, else 0; return how many."""
     px, py, pz, offset = plane[0], plane[1], plane[2], plane[3]
@@ -179,7 +179,7 @@ def assign_sides(x, y, z, plane, mean, share):
     return np.int64(number)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def partition(points, order, low, middle, high, share, to_points, to_order):
     """
     Partition a range of rows stably into the two children.
@@ -201,13 +201,13 @@ def partition(points, order, low, middle, high, share, to_points, to_order):
         second += np.uint64(beyond)
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath={'reassoc'})
+@part(error_model='numpy')
 def count_beyond(share):
     """Return how many shares are above a half."""
-    number = 0.0
+    number = 0
     for i in range(len(share)):
-        number += 1.0 if share[i] > 0.5 else 0.0
-    return np.int64(number)
+        number += share[i] > 0.5
+    return number
 
 
 MAX_DEPTH = 66
@@ -224,7 +224,7 @@ MEAN_CROSSED = 1.5
 """|n_x| + |n_y| + |n_z| of a unit normal, averaged over all directions."""
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, values, frames):
     """
     Cluster points; return how many clusters there are.
@@ -282,9 +282,10 @@ def bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, valu
                 order[i] = orders[own, i]
             rows[num, 0], rows[num, 1] = low, high
             flat[num] = is_flat
-            means[num] = mean
-            values[num] = value
-            frames[num] = frame
+            for i in range(3):
+                means[num, i], values[num, i] = mean[i], value[i]
+                for j in range(3):
+                    frames[num, i, j] = frame[i, j]
             num += 1
             continue
         other = 1 - own
@@ -292,8 +293,8 @@ def bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, valu
             buffers[own], orders[own], low, middle, high, share, buffers[other], orders[other]
         )
         smaller_last = middle - low > high - middle
-        for part in range(2):
-            left = (part == 0) == smaller_last
+        for child in range(2):
+            left = (child == 0) == smaller_last
             stack[depth, 0] = low if left else middle
             stack[depth, 1] = middle if left else high
             stack[depth, 2] = other
@@ -301,7 +302,7 @@ def bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, valu
     return num
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def is_flat_cluster(x, y, z, mean, value, frame, viewpoint, rules):
     """
     Return whether a cluster is thin, dense and without outliers, so a piece of a plane.

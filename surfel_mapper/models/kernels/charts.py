@@ -1,17 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Bisection of surfaces that are no height field, by their normals or by their heights.
+Bisection of surfaces that are no height field by their normals, and small curved surfaces.
 
 A surface has a few dozen surfels, for which numpy calls take ten times as long.
 """
 
-import math
-
-from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.symmetric3 import eigen_frame
+from surfel_mapper.kernels.compiling import kernel, part
 
 MEANS_ITERATIONS = 20
 """Most iterations of 2-means on normals."""
@@ -28,10 +25,6 @@ A surface is folded unless this percentage of normals is near the mean, and at m
 not: a cup on a table has less than 2 % of the voxels of both.
 """
 
-STACKED_SHARE = 0.05
-"""A chart overlaps itself if more than this share of its columns is too high."""
-
-
 LEAST_CURVED_VOXELS, LEAST_CURVED_POINTS = 15, 1000
 """
 A curved chart has at least this number of voxels, or of points: round objects close to a camera.
@@ -40,7 +33,7 @@ Others are mostly parts of tree crowns, of which one in nine merges within a met
 """
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def find_small_curved(rows, starts, count, normal, limit, found):
     """
     Find curved charts that are too small.
@@ -68,7 +61,7 @@ def find_small_curved(rows, starts, count, normal, limit, found):
         found[k] = least < limit and num_points < LEAST_CURVED_POINTS
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def bisect_normals(normals, side):
     """
     Bisect normals by 2-means; return whether both halves hold some.
@@ -77,75 +70,47 @@ def bisect_normals(normals, side):
     side     (n,) bool, out
     """
     number = len(normals)
-    mean, spread = np.zeros(3), np.zeros(3)
-    for i in range(number):
-        for j in range(3):
+    mean, spread, plane = np.zeros(3), np.zeros(3), np.zeros(4)
+    for j in range(3):
+        for i in range(number):
             mean[j] += normals[i, j] / number
-    for i in range(number):
-        for j in range(3):
+        for i in range(number):
             spread[j] += (normals[i, j] - mean[j]) ** 2
     axis = 0
-    while spread[axis] < STEADY_SHARE * spread.max():
+    while spread[axis] < STEADY_SHARE * max(spread[0], spread[1], spread[2]):
         axis += 1
-    plane = np.zeros(4)
     plane[axis], plane[3] = 1.0, mean[axis]
-    sums, counts = np.empty((2, 3)), np.empty(2)
+    sums = np.empty((2, 4))
     for iteration in range(MEANS_ITERATIONS + 1):
         sums[:] = 0.0
-        counts[:] = 0.0
         changed = False
         for i in range(number):
-            dot_products = 0.0
-            for j in range(3):
-                dot_products += normals[i, j] * plane[j]
-            beyond = dot_products > plane[3]
+            beyond = dot(normals[i], plane) > plane[3]
             changed = changed or beyond != side[i]
             side[i] = beyond
             half = 1 if beyond else 0
-            counts[half] += 1.0
+            sums[half, 3] += 1.0
             for j in range(3):
                 sums[half, j] += normals[i, j]
-        if counts[0] == 0.0 or counts[1] == 0.0:
+        if sums[0, 3] == 0.0 or sums[1, 3] == 0.0:
             return False
         if iteration > 0 and not changed:
             break
         plane[3] = 0.0
         for j in range(3):
-            first, second = sums[1, j] / counts[1], sums[0, j] / counts[0]
+            first, second = sums[1, j] / sums[1, 3], sums[0, j] / sums[0, 3]
             plane[j] = first - second
             plane[3] += 0.5 * (first * first - second * second)
     return True
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def bisect_chart(normals, points, limit, height, size, side):
-    """
-    Bisect a chart that has several heights over one plane; return whether it has.
-
-    normals  (n, 3) float64, unit
-    points   (n, 3) float64, m
-    limit    least cosine to the mean normal for nearly all normals
-    height   m, of a column that overlaps itself
-    size     m, width of a column
-    side     (n,) bool, out: one half
-    """
-    mean = np.zeros(3)
-    for i in range(len(normals)):
-        for j in range(3):
-            mean[j] += normals[i, j]
-    length = math.sqrt(mean[0] * mean[0] + mean[1] * mean[1] + mean[2] * mean[2])
-    if length > 0.0:
-        mean /= length
-    if bisect_folded(normals, mean, limit, side):
-        axis = dominant_axis(normals)
-        cosines = dot_products(normals, axis)
-        if is_folded(np.abs(cosines), limit):
-            return True
-        mean = axis  # equal up to sign: the voxels have no common viewpoint
-    return bisect_stacked(points, mean, height, size, side)
+@part(error_model='numpy')
+def dot(a, b):
+    """Return the scalar product of the first three elements."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def bisect_folded(normals, mean, limit, side):
     """
     Bisect a surface whose normals deviate too far from their mean; return whether they do.
@@ -155,86 +120,28 @@ def bisect_folded(normals, mean, limit, side):
     limit    least cosine to the mean normal for nearly all normals
     side     (n,) bool, out: one half
     """
-    cosines = dot_products(normals, mean)
-    if len(normals) < 2 or cosines.min() >= limit:
-        return False
-    return is_folded(cosines, limit) and bisect_normals(normals, side)
+    return is_folded(normals, mean, limit) and bisect_normals(normals, side)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def is_folded(cosines, limit):
-    """Return whether too many cosines (n,) to the mean normal are below the limit."""
-    if (cosines < limit).sum() > MOST_FOLDED:
-        return True
-    return percentile(cosines, 100.0 - FOLD_PERCENTILE) < limit
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def bisect_stacked(points, normal, height, size, side):
+@part(error_model='numpy')
+def is_folded(normals, mean, limit):
     """
-    Find the upper half of a surface that overlaps itself; return whether it does.
+    Return whether too many cosines of normals (n, 3) to their mean are below a limit.
 
-    points, height, size, side  of bisect_chart
-    normal                      (3,) float64, unit or 0
+    They are if a percentile of the cosines, with linear interpolation as numpy's, is below it.
     """
-    heights = dot_products(points, normal)
-    low, high = heights.min(), heights.max()
-    if high - low <= height:
-        return False
-    least = np.abs(normal).argmin()
-    x, y = np.zeros(3), np.empty(3)
-    j, k = (least + 1) % 3, (least + 2) % 3
-    length = math.hypot(normal[j], normal[k])
-    x[j], x[k] = -normal[k] / length, normal[j] / length
-    for axis in range(3):
-        j, k = (axis + 1) % 3, (axis + 2) % 3
-        y[axis] = normal[j] * x[k] - normal[k] * x[j]
-    # voxel indices have 21 bits, so column numbers are unique
-    row, place = dot_products(points, x) / size, dot_products(points, y) / size
-    column = np.floor(row) * 2.0**26 + np.floor(place)
-    order = np.argsort(column, kind='mergesort')
-    columns = stacked = begin = 0
-    for end in range(1, len(order) + 1):
-        if end < len(order) and column[order[end]] == column[order[begin]]:
-            continue
-        inside = heights[order[begin:end]]
-        columns += 1
-        stacked += inside.max() - inside.min() > height
-        begin = end
-    for i in range(len(heights)):
-        side[i] = heights[i] > 0.5 * (low + high)
-    return stacked > STACKED_SHARE * columns
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def dot_products(vectors, direction):
-    """Return the products of vectors (n, 3) with a direction (3,)."""
-    found = np.empty(len(vectors))
-    for i in range(len(vectors)):
-        found[i] = (
-            vectors[i, 0] * direction[0]
-            + vectors[i, 1] * direction[1]
-            + vectors[i, 2] * direction[2]
-        )
-    return found
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def dominant_axis(normals):
-    """Return the axis (3,) that normals (n, 3) are nearest to, regardless of their sign."""
-    products, values, axes = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    below, highest, lowest = 0, -2.0, 2.0
     for i in range(len(normals)):
-        for j in range(3):
-            for k in range(3):
-                products[j, k] += normals[i, j] * normals[i, k]
-    eigen_frame(products, values, axes)
-    return axes[2].copy()
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def percentile(values, share):
-    """Return a percentile with linear interpolation, as numpy does."""
-    ordered, place = np.sort(values), 0.01 * share * (len(values) - 1)
+        cosine = dot(normals[i], mean)
+        if cosine < limit:
+            below += 1
+            highest = max(highest, cosine)
+        else:
+            lowest = min(lowest, cosine)
+    if len(normals) < 2 or below == 0 or below > MOST_FOLDED:
+        return len(normals) >= 2 and below > 0
+    place = 0.01 * (100.0 - FOLD_PERCENTILE) * (len(normals) - 1)
     low = int(place)
-    high = min(low + 1, len(values) - 1)
-    return ordered[low] + (place - low) * (ordered[high] - ordered[low])
+    if below != low + 1:
+        return below > low
+    return highest + (place - low) * (lowest - highest) < limit

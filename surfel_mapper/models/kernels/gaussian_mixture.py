@@ -14,8 +14,9 @@ singular.
 
 import math
 
-from numba import njit
 import numpy as np
+
+from surfel_mapper.kernels.compiling import kernel, part
 
 ITERATIONS = 10
 """Most EM iterations."""
@@ -32,7 +33,7 @@ TERMS = 10
 """1, x, y, z, xx, xy, xz, yy, yz, zz: moments, and coefficients of a quadric."""
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def split_mixture(x, y, z, mean, share):
     """
     Compute for each point the responsibility of the second of two Gaussians.
@@ -55,7 +56,7 @@ def split_mixture(x, y, z, mean, share):
             break
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath={'reassoc'})
+@kernel(error_model='numpy', fastmath={'reassoc'})
 def em_step(x, y, z, mean, share, quadric, second):
     """Update responsibilities and moments of the second component; return how many change."""
     mx, my, mz = mean[0], mean[1], mean[2]
@@ -106,18 +107,18 @@ def em_step(x, y, z, mean, share, quadric, second):
     return changing
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def sum_moments(x, y, z, mean, share, total, second):
     """Sum the moments (TERMS,) about the mean, of all points and of the second component."""
-    total[:] = 0.0
-    second[:] = 0.0
-    for i in range(len(x)):
-        a, b, c = x[i] - mean[0], y[i] - mean[1], z[i] - mean[2]
-        add_moments(total, 1.0, a, b, c)
-        add_moments(second, share[i], a, b, c)
+    for side in range(2):
+        moments = second if side else total
+        moments[:] = 0.0
+        for i in range(len(x)):
+            weight = share[i] if side else 1.0
+            add_moments(moments, weight, x[i] - mean[0], y[i] - mean[1], z[i] - mean[2])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def add_moments(moments, weight, x, y, z):
     """Add a weighted point to moments (TERMS,)."""
     moments[0] += weight
@@ -132,7 +133,7 @@ def add_moments(moments, weight, x, y, z):
     moments[9] += weight * z * z
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def subtract_log_density(moments, number, quadric, factor):
     """
     Subtract factor times the logarithm of a Gaussian's weighted density; False if it is empty.

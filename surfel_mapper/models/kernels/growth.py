@@ -19,9 +19,9 @@ Source: Besl and Jain 1988 (region growing from seeds).
 
 import math
 
-from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.models.kernels.frames import LEAST_WIDTH, plane_of
 
 SLOTS = 4
@@ -32,9 +32,6 @@ LEAST_SHARE = 0.25
 
 LEAST_FREE_SHARE = 1.0 / 3.0
 """Share of the free points of a voxel on a facet for it to be grown from."""
-
-LEAST_POINTS = 6
-"""Points that determine the plane of a voxel, at least."""
 
 FREE = -1
 """Owner of a point on no patch."""
@@ -49,7 +46,7 @@ of n voxels is grown n times, and 160 m of it in voxels of 4 cm take 2 s.
 """
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def plane_distance(points, i, plane):
     """Return the distance of a point from a plane, m."""
     return abs(
@@ -57,60 +54,7 @@ def plane_distance(points, i, plane):
     )
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def sample_distances(points, starts, label, tangent, stride, patch, distance):
-    """
-    Sample distances of points from their patches; return how many there are.
-
-    label    (V,) int32, patch of each voxel, -1 for none
-    tangent  (V, 4) float64, plane of the patch there
-    stride   every stride-th point of patches is used
-    patch    (P,) int32, distance (P,) float64, out
-    """
-    num = skip = 0
-    for v in range(len(label)):
-        if label[v] < 0:
-            continue
-        i, end = starts[v] + skip, starts[v + 1]
-        while i < end:
-            patch[num], distance[num] = label[v], plane_distance(points, i, tangent[v])
-            num += 1
-            i += stride
-        skip = i - end
-    return num
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def classify_free(points, starts, owner, thickness, count, flat, mean, normal):
-    """
-    Fit a plane to the free points of every voxel.
-
-    owner      (P,) int32
-    thickness  m, 6 sigma, of a flat voxel
-    count      (V,) int64, out: free points
-    flat       (V,) bool, out
-    mean       (V, 3), normal (V, 3) float64, out for voxels with free points, flat voxels
-    """
-    scatter, value, axes = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    sums = np.empty(10)
-    for v in range(len(starts) - 1):
-        sums[:] = 0.0
-        low, high = starts[v], starts[v + 1]
-        for i in range(low, high):
-            if owner[i] == FREE:
-                add_point(points, i, points[low], sums)
-        count[v], flat[v] = np.int64(sums[0]), False
-        if count[v] > 0:
-            for j in range(3):
-                mean[v, j] = points[low, j] + sums[1 + j] / sums[0]
-        if count[v] >= LEAST_POINTS:
-            plane_of(sums, sums[0], scatter, value, axes)
-            if 36.0 * value[0] < thickness**2 and value[1] > LEAST_WIDTH * value[2]:
-                flat[v] = True
-                normal[v] = axes[0]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def add_point(points, i, origin, sums):
     """Add a point to moments (10,) about an origin: 1, x, y, z, xx, xy, xz, yy, yz, zz."""
     x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
@@ -126,7 +70,7 @@ def add_point(points, i, origin, sums):
     sums[9] += z * z
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def grow_patches(
     points, starts, adjacent, label, tangent, tolerance, free, candidate, candidate_plane
 ):
@@ -154,7 +98,8 @@ def grow_patches(
         u, slot = queue[head, 0], queue[head, 1]
         head += 1
         patch = label[u] if slot < 0 else candidate[u, slot]
-        plane[:] = tangent[u] if slot < 0 else candidate_plane[u, slot]
+        for j in range(4):
+            plane[j] = tangent[u, j] if slot < 0 else candidate_plane[u, slot, j]
         for k in range(first[u], first[u + 1]):
             v = rows[k]
             place = -1 if label[v] == patch else slot_of(candidate[v], patch)
@@ -167,13 +112,15 @@ def grow_patches(
                 continue
             if label[v] < 0 and flat[v] and abs_cosine(normal[v], plane) < least_cosine:
                 continue
-            candidate[v, place], candidate_plane[v, place] = patch, plane
+            candidate[v, place] = patch
+            for j in range(4):
+                candidate_plane[v, place, j] = plane[j]
             if label[v] < 0 and num >= LEAST_SHARE * (starts[v + 1] - starts[v]):
                 queue[tail, 0], queue[tail, 1] = v, place
                 tail += 1
 
 
-@njit(cache=True, nogil=True)
+@part(error_model='numpy')
 def slot_of(candidates, patch):
     """Return the free slot for a patch; -1 if it is a candidate already or all are taken."""
     for slot in range(SLOTS):
@@ -184,13 +131,13 @@ def slot_of(candidates, patch):
     return -1
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def abs_cosine(normal, plane):
     """Return the cosine of the angle between two planes."""
     return abs(normal[0] * plane[0] + normal[1] * plane[1] + normal[2] * plane[2])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def assign_points(points, starts, label, tangent, tolerance, candidate, candidate_plane, owner):
     """
     Assign each point to the patch of its voxel, or to the nearest candidate if that fits better.
@@ -215,14 +162,15 @@ def assign_points(points, starts, label, tangent, tolerance, candidate, candidat
             owner[i] = own
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def find_facets(points, starts, adjacent, free, rules, owner, planes, num_planes):
+@kernel(error_model='numpy')
+def find_facets(points, starts, adjacent, free, order, rules, owner, planes, num_planes):
     """
     Grow facets from flat voxels of free points, the densest first; return the number of planes.
 
     adjacent    of grow_patches
-    free        count (V,), flat (V,), mean (V, 3), normal (V, 3) of classify_free; count and flat
-                are consumed
+    free        count (V,) int64, flat (V,) bool, mean (V, 3), normal (V, 3) float64 of the free
+                points of each voxel; count and flat are consumed
+    order       (S,) int64, voxels in the order in which they are seeds
     rules       tolerance m; least voxels; least points; least cosine of the normals of a flat
                 voxel and the facet; least width, m
     owner       (P,) int32, in place
@@ -231,20 +179,22 @@ def find_facets(points, starts, adjacent, free, rules, owner, planes, num_planes
     """
     count, flat, mean, normal = free
     tolerance, least_voxels, least_points, _, least_width = rules
-    visited, region = np.zeros(len(count), np.int32), np.empty(len(count), np.int64)
-    sums, plane, start = np.empty(10), np.empty(4), np.empty(3)
-    scatter, value, axes = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    rejected, mark = np.zeros(len(count), np.bool_), 0
-    for seed in np.argsort(-count, kind='mergesort'):
+    marks = np.zeros((3, len(count)), np.int64)
+    visited, region, rejected = marks[0], marks[1], marks[2]
+    plane, start, sums = np.empty(4), np.empty(3), np.empty(10)
+    value, axes, mark = np.empty(3), np.empty((3, 3)), 0
+    for seed in order:
         if num_planes == len(planes):
             break
-        if rejected[seed] or not flat[seed] or count[seed] < LEAST_POINTS:
+        if rejected[seed] or not flat[seed]:
             continue
-        start[:] = normal[seed]
-        set_plane(start, mean[seed], plane)
+        for j in range(3):
+            start[j] = mean[seed, j]
+            axes[0, j] = normal[seed, j]
         size = 0
         for turn in range(ROUNDS):
             mark += 1
+            set_plane(axes[0], start, plane)
             size = grow_facet(
                 points,
                 starts,
@@ -262,20 +212,22 @@ def find_facets(points, starts, adjacent, free, rules, owner, planes, num_planes
             )
             is_small = sums[0] < least_points or size < least_voxels
             if not is_small:
-                plane_of(sums, sums[0], scatter, value, axes)
+                plane_of(sums, sums[0], value, axes)
                 is_small = math.sqrt(12.0 * max(value[1], 0.0)) < least_width
             if is_small:
                 if size > LARGE_REGION:
-                    rejected[region[:size]] = True
+                    for k in range(size):
+                        rejected[region[k]] = 1
                 size = 0
                 break
             for j in range(3):
                 start[j] = mean[seed, j] + sums[1 + j] / sums[0]
-            set_plane(axes[0], start, plane)
         flat[seed] = False
         if size == 0:
             continue
-        planes[num_planes] = plane
+        set_plane(axes[0], start, plane)
+        for j in range(4):
+            planes[num_planes, j] = plane[j]
         for k in range(size):
             u = region[k]
             flat[u] = False
@@ -287,7 +239,7 @@ def find_facets(points, starts, adjacent, free, rules, owner, planes, num_planes
     return num_planes
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def set_plane(normal, point, plane):
     """Set a plane through a point."""
     plane[3] = 0.0
@@ -296,7 +248,7 @@ def set_plane(normal, point, plane):
         plane[3] -= normal[j] * point[j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def grow_facet(
     points, starts, adjacent, free, rules, owner, seed, adapts, plane, sums, visited, region, mark
 ):
@@ -307,14 +259,13 @@ def grow_facet(
     adapts            whether the plane is refitted whenever the points have doubled
     plane             (4,) float64, in place
     sums              (10,) float64, out: moments of the points, about the mean of the seed
-    visited           (V,) int32: mark for voxels that were tested
+    visited           (V,) int64: mark for voxels that were tested
     region            (V,) int64, out
     """
     first, rows = adjacent
     count, flat, mean, normal = free
     tolerance, _, _, least_cosine, _ = rules
-    centre = np.empty(3)
-    scatter, value, axes = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    value, axes, centre = np.empty(3), np.empty((3, 3)), np.empty(3)
     sums[:] = 0.0
     region[0], visited[seed] = seed, mark
     size, head, refit = 1, 0, 20.0
@@ -326,7 +277,7 @@ def grow_facet(
                 add_point(points, i, mean[seed], sums)
         if adapts and sums[0] >= refit:
             refit = 2.0 * sums[0]
-            plane_of(sums, sums[0], scatter, value, axes)
+            plane_of(sums, sums[0], value, axes)
             if value[1] > 0.5 * LEAST_WIDTH * value[2] and (
                 abs_cosine(normal[seed], axes[0]) > least_cosine
             ):

@@ -14,10 +14,10 @@ from heapq import heappop, heappush
 import math
 from typing import NamedTuple
 
-from numba import njit
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.kernels.compiling import kernel, part, stay_apart
 from surfel_mapper.models.kernels.joining import gather, height_errors, TERMS
 
 JOIN_COSINE = math.cos(math.radians(50.0))
@@ -87,7 +87,7 @@ class Regions(NamedTuple):
     patch_sigma: npt.NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def join_layers(pairs, points, weights, starts, regions):
     """
     Join patches that lie within the noise of a larger one, in front of or behind it.
@@ -103,34 +103,35 @@ def join_layers(pairs, points, weights, starts, regions):
             continue
         mean, normal = regions.mean[large], regions.patch_normal[large]
         squares = total = 0.0
-        part = small
-        while part >= 0:
-            for row in range(starts[part], starts[part + 1]):
+        patch = small
+        while patch >= 0:
+            for row in range(starts[patch], starts[patch + 1]):
                 away = 0.0
                 for j in range(3):
                     away += (points[row, j] - mean[j]) * normal[j]
                 squares += weights[row] * away * away
                 total += weights[row]
-            part = regions.after[part]
+            patch = regions.after[patch]
         away = math.sqrt(squares / total)
         if away < LAYER_SIGMAS * regions.patch_sigma[large]:
-            part = small
-            while part >= 0:
-                regions.patch_normal[part] = normal
-                regions.patch_sigma[part] = max(regions.patch_sigma[part], away)
-                part = regions.after[part]
+            patch = small
+            while patch >= 0:
+                for j in range(3):
+                    regions.patch_normal[patch, j] = normal[j]
+                regions.patch_sigma[patch] = max(regions.patch_sigma[patch], away)
+                patch = regions.after[patch]
             for j in range(3):
                 regions.normal[small, j] = normal[j] * regions.patch_points[small]
             join_pair(small, large, regions)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def join_pair(small, large, regions):
     """Join two regions; the large one keeps its name."""
-    part = small
-    while part >= 0:
-        regions.root[part] = large
-        part = regions.after[part]
+    patch = small
+    while patch >= 0:
+        regions.root[patch] = large
+        patch = regions.after[patch]
     regions.after[regions.last[large]] = small
     regions.last[large] = regions.last[small]
     regions.patches[large] += regions.patches[small]
@@ -146,166 +147,165 @@ def join_pair(small, large, regions):
     regions.extent[large] = max(regions.extent[large], extent, 0.5 * (math.sqrt(apart) + extent))
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def join_smooth(edges, adjacent, points, weights, starts, floor, regions):
+@kernel(error_model='numpy')
+def join_smooth(edges, adjacent, points, weights, starts, boxes, floor, regions):
     """
     Join touching regions, those first that gain most.
 
     edges     (E, 2) int64, pairs of touching regions, the lesser first
     adjacent  first (K + 1,) int64 and regions (2 E,) int64 that touch each of them
     points, weights, starts  see above
+    boxes     (C, 2, 3) float64, least and greatest coordinates of CHUNK points each
     floor     square of the residuals that are not resolved, m^2
     regions   Regions, in place
     """
     first, others = adjacent
-    state = points, weights, starts, chunk_boxes(points), floor
+    state = points, weights, starts, boxes, floor
+    scratch = np.empty((2, len(points)), np.int64), np.empty((4, 2 * len(points)))
     root, patches = regions.root, regions.patches
     heap = [(math.inf, np.int64(-1), np.int64(-1), np.int64(0), np.int64(0))]  # the last
-    marked = np.full(len(root), -1, np.int64)
+    marked, joined = np.empty(len(root), np.int64), 0
+    pairs, num = np.empty((len(edges) + len(root) + 1, 2), np.int64), len(edges)
+    for k in range(len(root)):
+        marked[k] = -1
     for i in range(len(edges)):
-        push(heap, edges[i, 0], edges[i, 1], state, regions)
-    joined = 0
-    while heap[0][0] < 0.0:
+        pairs[i, 0], pairs[i, 1] = edges[i, 0], edges[i, 1]
+    while True:
+        for i in range(num):
+            push(heap, pairs[i, 0], pairs[i, 1], state, scratch, regions)
+        num = 0
+        if not heap[0][0] < 0.0:
+            break
         _, a, b, size_a, size_b = heappop(heap)
         if root[a] != a or root[b] != b:
             continue
         if patches[a] != size_a or patches[b] != size_b:
             known_a = patches[a] == size_a or size_a > LARGE_REGION
             if known_a and (patches[b] == size_b or size_b > LARGE_REGION):
-                push(heap, a, b, state, regions)
+                pairs[0, 0], pairs[0, 1], num = a, b, 1
             continue
         small, large = (a, b) if regions.rows[a] < regions.rows[b] else (b, a)
-        part = large if patches[large] <= LARGE_REGION else small  # a chain ends with the latest
+        patch = large if patches[large] <= LARGE_REGION else small  # a chain ends with the latest
         join_pair(small, large, regions)
-        while part >= 0:
-            for n in range(first[part], first[part + 1]):
+        while patch >= 0:
+            for n in range(first[patch], first[patch + 1]):
                 other = root[others[n]]
                 if other != large and marked[other] != joined:
                     marked[other] = joined
-                    push(heap, large, other, state, regions)
-            part = regions.after[part]
+                    pairs[num, 0], pairs[num, 1] = large, other
+                    num += 1
+            patch = regions.after[patch]
         joined += 1
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def push(heap, a, b, state, regions):
+@part(error_model='numpy')
+def push(heap, a, b, state, scratch, regions):
     """Queue a pair that gains by being joined."""
-    gain = gain_of(a, b, state, regions)
+    gain = gain_of(a, b, state, scratch, regions)
     if gain > 0.0:
         heappush(heap, (-gain, a, b, regions.patches[a], regions.patches[b]))
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def gain_of(a, b, state, regions):
+@part(error_model='numpy')
+def gain_of(a, b, state, scratch, regions):
     """
     Return by how much a common height field of two regions is better than two; 0 for none.
 
-    state  points, weights and starts, see above, boxes of chunk_boxes, floor of join_smooth
+    state    points, weights and starts, see above, boxes and floor of join_smooth
+    scratch  (2, P) int64, (4, 2 P) float64
     """
-    total_a, total_b = regions.normal[a], regions.normal[b]
-    lengths = max(length_of(total_a), 1e-12) * max(length_of(total_b), 1e-12)
-    cosine = dot(total_a, total_b) / lengths  # before any copy: most pairs end here
+    normals = np.empty((3, 3))
+    for j in range(3):
+        normals[0, j], normals[1, j] = regions.normal[a, j], regions.normal[b, j]
+        normals[2, j] = regions.normal[a, j] + regions.normal[b, j]
+    for i in range(3):
+        normalise(normals[i])
+    cosine = dot(normals[0], normals[1])
     if cosine < JOIN_COSINE:
         return 0.0
-    normal_a, normal_b, mean = unit(total_a), unit(total_b), unit(total_a + total_b)
-    for region in (a, b):
-        part = region
-        while part >= 0:
-            if dot(regions.patch_normal[part], mean) < CHART_COSINE:
+    for side in range(2):
+        patch = b if side else a
+        while patch >= 0:
+            if dot(regions.patch_normal[patch], normals[2]) < CHART_COSINE:
                 return 0.0
-            part = regions.after[part]
+            patch = regions.after[patch]
     small = a if regions.extent[a] < regions.extent[b] else b
-    rows_a, rows_b = rows_near(a, small, state, regions), rows_near(b, small, state, regions)
-    stride = 1 + (len(rows_a) + len(rows_b)) // MOST_ROWS
-    rows_a, rows_b = rows_a[::stride], rows_b[::stride]
-    least = min(len(rows_a), len(rows_b))
+    rows, points = scratch
+    num_a = rows_near(a, small, state, regions, rows[0])
+    num_b = rows_near(b, small, state, regions, rows[1])
+    stride = 1 + (num_a + num_b) // MOST_ROWS
+    zero = np.int64(0)  # a literal would be compiled for on its own
+    middle = end = zero
+    for side in range(2):
+        middle = end
+        number = num_b if side else num_a
+        end = gather(rows[side], number, stride, state[0], state[1], points, middle)
+    least = min(middle, end - middle)
     if least < 3:
         return 0.0
-    points = np.empty((4, len(rows_a) + len(rows_b)))
-    gather(rows_a, state[0], state[1], points[:, : len(rows_a)])
-    gather(rows_b, state[0], state[1], points[:, len(rows_a) :])
-    points_a, points_b = points[:, : len(rows_a)].copy(), points[:, len(rows_a) :].copy()
-    floor = state[4]
-    both = heights(points, mean, True, floor)
-    heights_a = heights(points_a, normal_a, False, floor)
-    heights_b = heights(points_b, normal_b, False, floor)
-    gain = heights_a[0] + heights_b[0] - both[0]
-    if gain > 0.0:  # quartics only lower it
-        heights_a = heights(points_a, normal_a, True, floor)
-        heights_b = heights(points_b, normal_b, True, floor)
-        gain = heights_a[0] + heights_b[0] - both[0]
-    if cosine > COPLANAR_COSINE:
-        sigma = max(regions.patch_sigma[a], regions.patch_sigma[b])
-        if both[2] < COPLANAR_GROWTH * max(heights_a[2], heights_b[2], sigma):
-            gain = max(gain, float(least))
+    rms_m = max(regions.patch_sigma[a], regions.patch_sigma[b])
+    both_m = gain = cost = 0.0
+    for turn in range(5):  # both, then each, then each with quartics, which only lower the gain
+        if turn == 3 and not gain > 0.0:
+            break
+        low, high = middle if turn % 2 == 0 and turn else zero, middle if turn % 2 else end
+        normal = normals[2] if turn == 0 else normals[(turn - 1) % 2]
+        fit = heights(points, low, high, normal, turn == 0 or turn > 2, state[4])
+        if turn == 0:
+            cost, both_m = fit[0], fit[2]
+        else:
+            gain = (gain if turn % 2 == 0 else -cost) + fit[0]
+            rms_m = max(rms_m, fit[2])
+    if cosine > COPLANAR_COSINE and both_m < COPLANAR_GROWTH * rms_m:
+        gain = max(gain, float(least))
     return gain
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def chunk_boxes(points):
-    """Return least and greatest coordinates of CHUNK points each, (C, 2, 3) float64."""
-    boxes = np.empty(((len(points) + CHUNK - 1) // CHUNK, 2, 3))
-    boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
-    for i in range(len(points)):
-        box = boxes[i // CHUNK]
-        for j in range(3):
-            box[0, j] = min(box[0, j], points[i, j])
-            box[1, j] = max(box[1, j], points[i, j])
-    return boxes
+@kernel(error_model='numpy')
+def rows_near(region, small, state, regions, rows):
+    """
+    List the rows of a region near a small one; return how many there are.
 
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def rows_near(region, small, state, regions):
-    """Return the rows of a region near a small one, (n,) int64; state as of gain_of."""
+    state  of gain_of
+    rows   (P,) int64, out
+    """
     points, _, starts, boxes, _ = state
     limit = REACH * regions.extent[small]
-    if region == small or regions.extent[region] < limit:
-        return rows_of(region, starts, regions)
-    rows = np.empty(regions.rows[region], np.int64)
-    x, y, z = regions.mean[small]
-    part, num = region, 0
-    while part >= 0:
-        i, end = starts[part], starts[part + 1]
+    limit_sq = np.inf if region == small or regions.extent[region] < limit else limit * limit
+    x, y, z = regions.mean[small, 0], regions.mean[small, 1], regions.mean[small, 2]
+    patch, num = region, 0
+    while patch >= 0:
+        i, end = starts[patch], starts[patch + 1]
         while i < end:
             box, stop = boxes[i // CHUNK], min(i // CHUNK * CHUNK + CHUNK, end)
             dx = max(box[0, 0] - x, x - box[1, 0], 0.0)
             dy = max(box[0, 1] - y, y - box[1, 1], 0.0)
             dz = max(box[0, 2] - z, z - box[1, 2], 0.0)
-            if dx * dx + dy * dy + dz * dz >= limit * limit:
+            if dx * dx + dy * dy + dz * dz >= limit_sq:
                 i = stop
             while i < stop:
                 dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-                if dx * dx + dy * dy + dz * dz < limit * limit:
-                    rows[num] = i
-                    num += 1
+                rows[num] = i
+                num += dx * dx + dy * dy + dz * dz < limit_sq
                 i += 1
-        part = regions.after[part]
-    return rows[:num]
+        patch = regions.after[patch]
+    return num
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def rows_of(region, starts, regions):
-    """Return all rows of a region, (n,) int64."""
-    rows, part, num = np.empty(regions.rows[region], np.int64), region, 0
-    while part >= 0:
-        for i in range(starts[part], starts[part + 1]):
-            rows[num] = i
-            num += 1
-        part = regions.after[part]
-    return rows
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def heights(points, normal, quartic, floor):
+@kernel(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
+def heights(points, low, high, normal, quartic, floor):
     """
-    Fit height fields to points (4, n) over a plane; quartic: whether degree 4 is tried.
+    Fit height fields to columns low to high - 1 of points (4, n) over a plane.
+
+    quartic says whether degree 4 is tried.
 
     Returns cost, cost of a plane, rms from a plane m, turn rad, and bend m of the quadric.
     """
-    number = points.shape[1]
+    stay_apart()
+    number = high - low
     tries = 3 if quartic and number > POINTS_PER_TERM * TERMS[2] else 2
     errors = np.empty(tries)
-    turn = height_errors(points, normal, errors)
+    turn = height_errors(points, low, high, normal, errors)
     best = plane = number * math.log(errors[0] + floor) + TERMS[0] * math.log(number)
     for d in range(1, tries):
         if number > POINTS_PER_TERM * TERMS[d]:
@@ -315,44 +315,52 @@ def heights(points, normal, quartic, floor):
     return best, plane, math.sqrt(errors[0] + floor), turn, bend
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def describe_regions(names, points, weights, starts, floor, regions, limits, normals, found):
+@kernel(error_model='numpy')
+def describe_regions(names, state, regions, limits, normals, found):
     """
     Compute normals of regions, and how curved they are.
 
     names    (J,) int64, regions
-    points, weights, starts, floor  see join_smooth
+    state    points, weights and starts, see above, boxes and floor of join_smooth
     limits   gain, turn and bend from which a region is curved; quartics are fitted only if the
              gain of a quadric alone is less, but its turn and bend are not
     normals  (J, 3) float64, out
     found    (J, 4) float64, out: gain of the best height field over a plane; turn, rad, and bend,
              m, of the quadric; rms from a plane, m
     """
+    points, weights, _, _, floor = state
+    rows, own = np.empty(len(points), np.int64), np.empty((4, len(points)))
+    zero = np.int64(0)
     for k in range(len(names)):
-        normals[k] = unit(regions.normal[names[k]])
-        rows = rows_of(names[k], starts, regions)
-        rows = rows[:: 1 + len(rows) // MOST_ROWS]
-        own = np.empty((4, len(rows)))
-        gather(rows, points, weights, own)
-        best, plane, sigma, turn, bend = heights(own, normals[k], False, floor)
-        if turn > limits[1] and bend > limits[2] and plane - best <= limits[0]:
-            best, plane, sigma, turn, bend = heights(own, normals[k], True, floor)
-        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = plane - best, turn, bend, sigma
+        for j in range(3):
+            normals[k, j] = regions.normal[names[k], j]
+        normalise(normals[k])
+        number = rows_near(names[k], names[k], state, regions, rows)
+        end = gather(rows, number, 1 + number // MOST_ROWS, points, weights, own, zero)
+        for quartic in range(2):
+            best, plane, sigma, turn, bend = heights(
+                own, zero, end, normals[k], quartic > 0, floor
+            )
+            found[k, 0], found[k, 1], found[k, 2], found[k, 3] = plane - best, turn, bend, sigma
+            if not (turn > limits[1] and bend > limits[2] and plane - best <= limits[0]):
+                break
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def unit(vector):
-    """Return the unit vector; 0 for 0."""
-    return vector / max(length_of(vector), 1e-12)
+@part(error_model='numpy')
+def normalise(vector):
+    """Scale a vector (3,) to unit length, in place; 0 stays 0."""
+    length = max(math.sqrt(dot(vector, vector)), 1e-12)
+    for j in range(3):
+        vector[j] /= length
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def length_of(vector):
     """Return the length of a vector (3,)."""
     return math.sqrt(dot(vector, vector))
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def dot(a, b):
     """Return the scalar product of vectors (3,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

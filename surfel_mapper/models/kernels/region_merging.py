@@ -10,11 +10,14 @@ matter. A point is compared with a cluster only inside its widened bounding box.
 Source: Gao and Dong 2025; the test for arcs is our own.
 """
 
-from numba import njit
+import math
+
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel, part
 
-@njit(cache=True, nogil=True, error_model='numpy')
+
+@part(error_model='numpy')
 def gap(delta, distance, value_i, frame_i, value_j, frame_j):
     """
     Return a lower bound of the distance of two clusters: that of their boxes of three sigma.
@@ -24,14 +27,15 @@ def gap(delta, distance, value_i, frame_i, value_j, frame_j):
     frame_*   (3, 3) float64, rows along eigenvalues descending
     """
     result = distance
-    for value, frame in ((value_i, frame_i), (value_j, frame_j)):
+    for side in range(2):
+        value, frame = (value_j, frame_j) if side else (value_i, frame_i)
         for k in range(3):
             along = frame[k, 0] * delta[0] + frame[k, 1] * delta[1] + frame[k, 2] * delta[2]
-            result -= 3.0 * np.sqrt(value[2 - k]) * abs(along) / distance
+            result -= 3.0 * math.sqrt(value[2 - k]) * abs(along) / distance
     return result
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def same_surface(normal_i, normal_j, delta, scale, rules):
     """
     Return whether two pieces lie on one plane or on one arc.
@@ -50,7 +54,7 @@ def same_surface(normal_i, normal_j, delta, scale, rules):
     return same_surface_products(cosine, n_i, n_j, scale, rules)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def same_surface_products(cosine, n_i, n_j, scale, rules):
     """Evaluate same_surface from n_i . n_j, n_i . delta and n_j . delta."""
     if abs(cosine) > rules[0] and 0.5 * (abs(n_i) + abs(n_j)) < rules[1] * scale:
@@ -58,7 +62,7 @@ def same_surface_products(cosine, n_i, n_j, scale, rules):
     return cosine > rules[2] and 0.5 * abs(n_i + n_j) < rules[3] * scale
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def find_root(parent, i):
     """Return the root of a union-find tree, with path halving."""
     while parent[i] != i:
@@ -67,27 +71,22 @@ def find_root(parent, i):
     return i
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def merge_regions(points, starts, means, values, frames, scales, rules, parent):
+@kernel(error_model='numpy')
+def find_pairs(means, values, frames, scales, rules, pairs, lengths):
     """
-    Find the connected components of flat clusters.
+    List pairs of clusters that may be pieces of one surface; return how many there are.
 
-    points  (N, 3) float64; cluster k has the rows starts[k, 0] to starts[k, 1] - 1
-    starts  (K, 2) int64
-    means   (K, 3), values (K, 3), frames (K, 3, 3): of bisect_cloud
-    scales  (K,) float64, see same_surface
-    rules   (cos_plane, offset, cos_arc, arc_offset, gap, near), lengths in m; see same_surface; a
-            pair is linked if its boxes are nearer than gap and its points than near
-    parent  (K,) int64, out: lowest cluster of the component
+    means    (K, 3), values (K, 3), frames (K, 3, 3): of bisect_cloud
+    scales   (K,) float64, see same_surface
+    rules    (cos_plane, offset, cos_arc, arc_offset, gap, near), lengths in m; see same_surface;
+             boxes of a pair are nearer than gap
+    pairs    (M, 2) int64, out: pairs beyond M are counted only
+    lengths  (M,) float64, out: distances of their means, m
     """
-    number = len(means)
-    first, second = np.empty(1024, np.int64), np.empty(1024, np.int64)
-    lengths = np.empty(1024)
     found = 0
     delta = np.empty(3)
     least_plane, least_arc = rules[0] - 1e-12, rules[2] - 1e-12
-    for i in range(number):
-        parent[i] = i
+    for i in range(len(means)):
         nx, ny, nz = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
         for j in range(i):
             cosine = nx * frames[j, 2, 0] + ny * frames[j, 2, 1] + nz * frames[j, 2, 2]
@@ -97,7 +96,7 @@ def merge_regions(points, starts, means, values, frames, scales, rules, parent):
             for k in range(3):
                 delta[k] = means[i, k] - means[j, k]
                 length += delta[k] * delta[k]
-            length = np.sqrt(length)
+            length = math.sqrt(length)
             scale = 0.5 * (scales[i] + scales[j])
             if not same_surface(frames[i, 2], frames[j, 2], delta, scale, rules):
                 continue
@@ -105,28 +104,36 @@ def merge_regions(points, starts, means, values, frames, scales, rules, parent):
                 gap(delta, length, values[i], frames[i], values[j], frames[j]) < rules[4]
             ):
                 continue
-            if found == len(first):
-                first, second = np.append(first, first), np.append(second, second)
-                lengths = np.append(lengths, lengths)
-            first[found], second[found], lengths[found] = i, j, length
+            if found < len(pairs):
+                pairs[found, 0], pairs[found, 1], lengths[found] = i, j, length
             found += 1
-    boxes = np.empty((number, 2, 3))
-    for k in range(number):
-        for j in range(3):
-            boxes[k, 0, j], boxes[k, 1, j] = np.inf, -np.inf
-            for i in range(starts[k, 0], starts[k, 1]):
-                boxes[k, 0, j] = min(boxes[k, 0, j], points[i, j])
-                boxes[k, 1, j] = max(boxes[k, 1, j], points[i, j])
-    for place in np.argsort(lengths[:found], kind='mergesort'):
-        i, j = first[place], second[place]
+    return found
+
+
+@kernel(error_model='numpy')
+def merge_pairs(points, starts, boxes, pairs, near, parent):
+    """
+    Find the connected components of clusters whose points are near.
+
+    points  (N, 3) float64; cluster k has the rows starts[k, 0] to starts[k, 1] - 1
+    starts  (K, 2) int64
+    boxes   (K, 2, 3) float64, least and greatest coordinates of each
+    pairs   (P, 2) int64, clusters to compare, the nearest first
+    near    m
+    parent  (K,) int64, out: lowest cluster of the component
+    """
+    for k in range(len(parent)):
+        parent[k] = k
+    for p in range(len(pairs)):
+        i, j = pairs[p, 0], pairs[p, 1]
         one, other = find_root(parent, i), find_root(parent, j)
-        if one != other and touch(points, starts[i], starts[j], boxes[i], boxes[j], rules[5]):
+        if one != other and touch(points, starts[i], starts[j], boxes[i], boxes[j], near):
             parent[max(one, other)] = min(one, other)
-    for k in range(number):
+    for k in range(len(parent)):
         parent[k] = find_root(parent, k)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def touch(points, rows_i, rows_j, box_i, box_j, near):
     """Return whether two ranges of rows hold points nearer to each other than a distance."""
     for j in range(3):

@@ -10,16 +10,16 @@ Source: Duff et al. 2017 for the orthonormal basis.
 
 import math
 
-from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.models.kernels.frames import LEAST_WIDTH, plane_of
 
 NONE, YOUNG, FLAT, ROUGH = 0, 1, 2, 3
 """Class of a voxel: empty, too few points, flat surfel, not flat."""
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def classify(chosen, count, normal, covariance, rules, kind, axes):
     """
     Classify voxels, and compute their tangential extent.
@@ -67,7 +67,7 @@ def classify(chosen, count, normal, covariance, rules, kind, axes):
         axes[row, 1, 2] = least * (cosine * vz - sine * uz)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def classify_sparse(rows, neighbours, own, surfels, rules, kind, normal):
     """
     Classify voxels that are not flat by the points of their surroundings.
@@ -86,8 +86,7 @@ def classify_sparse(rows, neighbours, own, surfels, rules, kind, normal):
     kind        (R,) uint8, normal (R, 3) float64, out
     """
     count, position, own_normal, covariance, eigenvalues = surfels
-    sums, scatter = np.empty(10), np.empty((3, 3))
-    value, axes = np.empty(3), np.empty((3, 3))
+    sums, value, axes = np.empty(10), np.empty(3), np.empty((3, 3))
     for row in rows:
         kind[row] = own[row]
         for j in range(3):
@@ -108,7 +107,7 @@ def classify_sparse(rows, neighbours, own, surfels, rules, kind, normal):
                 add_moments(near[h], origin, count, position, covariance, sums)
         if sums[0] < rules[0]:
             continue
-        plane_of(sums, max(sums[0] - 1.0, 1.0), scatter, value, axes)
+        plane_of(sums, max(sums[0] - 1.0, 1.0), value, axes)
         n = axes[0]
         away = (n[0] * sums[1] + n[1] * sums[2] + n[2] * sums[3]) / sums[0]
         if not (value[0] < rules[1] and value[1] > LEAST_WIDTH * value[2]):
@@ -126,7 +125,7 @@ def classify_sparse(rows, neighbours, own, surfels, rules, kind, normal):
             normal[row, j] = -n[j] if votes < 0.0 else n[j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def add_moments(row, origin, count, position, covariance, sums):
     """Add the points of a voxel to moments (10,) about an origin: n, x y z, xx xy xz yy yz zz."""
     n = np.float64(count[row])
@@ -148,7 +147,7 @@ def add_moments(row, origin, count, position, covariance, sums):
     sums[9] += n * z * z + less * c[5]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def across(x, y, z):
     """Return two unit vectors that are orthogonal to a third and to each other."""
     sign = 1.0 if z >= 0.0 else -1.0
@@ -157,14 +156,14 @@ def across(x, y, z):
     return 1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def variance(c, x, y, z):
     """Return the variance along a direction; c: xx xy xz yy yz zz."""
     along = x * x * c[0] + y * y * c[3] + z * z * c[5]
     return along + 2.0 * (x * y * c[1] + x * z * c[2] + y * z * c[4])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def mark_material(rows, before, count, position, normal, kind, reported, rules, material):
     """
     Mark the rows whose change since the last report is material, and update the report.

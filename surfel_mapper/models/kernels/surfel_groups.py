@@ -7,16 +7,16 @@ A component is named by the row of its voxel of least key, so that names need no
 depend on the order in which voxels appeared.
 """
 
-from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel
 from surfel_mapper.models.kernels.region_merging import find_root
 
 LEAST_SHARE = 0.4
 """Least length of the mean of unit normals within 60 deg of it, with some outliers."""
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def rows_of_groups(group, flags, extra, rows):
     """
     List the rows whose group is flagged; return how many there are.
@@ -34,7 +34,7 @@ def rows_of_groups(group, flags, extra, rows):
     return num
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def connected_components(rows, links, neighbours, places, parent):
     """
     Find the connected components of linked voxels.
@@ -63,7 +63,7 @@ def connected_components(rows, links, neighbours, places, parent):
         places[rows[i]] = -1
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def name_components(rows, parent, key, component):
     """
     Name every component by its voxel of least key.
@@ -72,7 +72,9 @@ def name_components(rows, parent, key, component):
     key           (R,) int64
     component     (R,) int32, out for these rows
     """
-    least = np.arange(len(rows))
+    least = np.empty(len(rows), np.int64)
+    for i in range(len(rows)):
+        least[i] = i
     for i in range(len(rows)):
         root = parent[i]
         if key[rows[i]] < key[rows[least[root]]]:
@@ -81,7 +83,7 @@ def name_components(rows, parent, key, component):
         component[rows[i]] = rows[least[parent[i]]]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def sort_by_group(rows, group, places, ordered, starts):
     """
     Sort rows by group, in the order in which groups and rows first appear.
@@ -105,9 +107,10 @@ def sort_by_group(rows, group, places, ordered, starts):
         of_row[i] = places[name]
         starts[of_row[i] + 1] += 1
     starts[0] = 0
+    filled = np.empty(num, np.int64)
     for k in range(num):
+        filled[k] = starts[k]
         starts[k + 1] += starts[k]
-    filled = starts[:num].copy()
     for i in range(len(rows)):
         places[group[rows[i]]] = -1
         ordered[filled[of_row[i]]] = rows[i]
@@ -115,7 +118,7 @@ def sort_by_group(rows, group, places, ordered, starts):
     return num
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def mean_normals(rows, starts, flat, normal, means):
     """
     Compute the mean unit normals of groups, from their flat voxels only.
@@ -151,7 +154,7 @@ def mean_normals(rows, starts, flat, normal, means):
                 break
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def find_doubtful(rows, starts, means, normal, position, rules, found):
     """
     Find groups that may be folded or overlap themselves.
@@ -171,7 +174,7 @@ def find_doubtful(rows, starts, means, normal, position, rules, found):
         found[k] = least < rules[0] or high - low > rules[1]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def sample_voxels(rows, position, axes, low, voxel_size, points):
     """
     Write nine points for each voxel, three by three across its surfel, clipped to the voxel.
@@ -193,7 +196,7 @@ def sample_voxels(rows, position, axes, low, voxel_size, points):
                 at += 1
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def merge_voxels(rows, starts, count, position, covariance, total, mean, merged):
     """
     Merge the moments of voxels, by the exact formula for two sets of points.
@@ -236,7 +239,7 @@ def merge_voxels(rows, starts, count, position, covariance, total, mean, merged)
         merged[k, 4], merged[k, 5] = scale * (yz - sy * mz), scale * (zz - sz * mz)
 
 
-@njit(cache=True, nogil=True)
+@kernel(error_model='numpy')
 def find_pieces(owner, block, key, piece):
     """
     Find the voxel of least key of each group in each block.
@@ -251,8 +254,10 @@ def find_pieces(owner, block, key, piece):
     number = 0
     for group in owner:
         number = max(number, group + 1)
-    head, recent = np.full(number, -1, np.int32), np.full(number, -1, np.int32)
+    head, recent = np.empty(number, np.int32), np.empty(number, np.int32)
     after, least = np.empty(len(owner), np.int32), np.empty(len(owner), np.int32)
+    head[:] = -1
+    recent[:] = -1
     num = 0
     for row in range(len(owner)):
         piece[row] = -1
@@ -277,7 +282,7 @@ def find_pieces(owner, block, key, piece):
             piece[row] = least[piece[row]]
 
 
-@njit(cache=True, nogil=True)
+@kernel(error_model='numpy')
 def common_labels(labels, starts, found):
     """
     Find the groups whose members all have the same label.

@@ -9,9 +9,9 @@ depends on its two voxels alone, so the result does not depend on the order of c
 ``neighbours`` has the rows of all neighbours, so only new voxels need the hash table.
 """
 
-from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.models.kernels.region_merging import same_surface_products
 from surfel_mapper.models.kernels.surfel_classes import FLAT, variance
 
@@ -19,7 +19,7 @@ ROUNDS = 3
 """Patches grow by so many voxels over sparse and rough ones."""
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def are_linked(i, j, state, rules):
     """
     Return whether two neighbours are pieces of one surface; see same_surface.
@@ -43,7 +43,7 @@ def are_linked(i, j, state, rules):
     return same_surface_products(cosine, n_i, n_j, 1.0, rules)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def set_link(i, j, h, is_joined, links, marks, marked, num):
     """Set or clear one link, mark both rows if it changed, return how many are marked."""
     bit = np.uint64(1) << np.uint64(h)
@@ -53,7 +53,7 @@ def set_link(i, j, h, is_joined, links, marks, marked, num):
     return mark(i, marks, marked, mark(j, marks, marked, num))
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def mark(row, marks, marked, num):
     """Append a row to a list unless it is there already; return the length of the list."""
     if not marks[row]:
@@ -63,7 +63,7 @@ def mark(row, marks, marked, num):
     return num
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def unlink(gone, neighbours, links, marks, marked):
     """
     Remove voxels from the lists of their neighbours, with all links.
@@ -91,7 +91,7 @@ def unlink(gone, neighbours, links, marks, marked):
     return num
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def link_neighbours(came, found, neighbours):
     """
     Enter voxels into the lists of their neighbours.
@@ -109,7 +109,7 @@ def link_neighbours(came, found, neighbours):
                 neighbours[other, (h + half) % (2 * half)] = came[i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def update_links(chosen, is_chosen, neighbours, state, rules, links, marks, marked, num):
     """
     Recompute all links from and to some voxels.
@@ -144,7 +144,7 @@ def update_links(chosen, is_chosen, neighbours, state, rules, links, marks, mark
     return num
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def spread(rows, neighbours, steps, marks, marked):
     """
     List rows and those within some steps of them; return how many there are.
@@ -172,7 +172,7 @@ def spread(rows, neighbours, steps, marks, marked):
     return num
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def find_hosts(chosen, neighbours, state, covariance, rules, host, level):
     """
     Find for voxels that are not flat a flat one on whose plane they lie.

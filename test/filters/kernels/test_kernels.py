@@ -24,11 +24,11 @@ from surfel_mapper.filters.kernels.limits import (
 from surfel_mapper.filters.kernels.sampling import choose
 from surfel_mapper.filters.kernels.shapes import group_moments, neighbour_moments
 from surfel_mapper.filters.kernels.smallest import keep_least, VECTORS
+from surfel_mapper.filters.kernels.voxel_grid import group_points, ROWS
 from surfel_mapper.filters.shapes import PAIRS
 from surfel_mapper.kernels.grouping import CHUNK
 from surfel_mapper.kernels.lanes import FLOATS
 from surfel_mapper.kernels.selection import compact
-from surfel_mapper.kernels.voxel_grid import group_points, ROWS
 from test.kernels.modes import both, compiled, printed_alike
 
 SHORT_CHAINS = """

@@ -9,11 +9,13 @@ import math
 import numpy as np
 import pytest
 
+from surfel_mapper.models.charts import chart_side
 from surfel_mapper.models.kernels.charts import (
-    bisect_chart,
     bisect_folded,
     find_small_curved,
-    percentile,
+    FOLD_PERCENTILE,
+    is_folded,
+    MOST_FOLDED,
 )
 from test.kernels.modes import both
 
@@ -63,44 +65,46 @@ def test_slightly_bent_or_inseparable_normals_stay_whole(call, normals):
     assert bisected(call, normals, np.array([0.0, 0.0, 1.0])) is None
 
 
-def halved(call, normals, points):
+def halved(normals, points):
     """Return one half of a part, of columns of 1 m in which 4 m are high; None for a whole one."""
-    side = np.empty(len(normals), bool)
-    return side if call(bisect_chart, normals, points, LIMIT, 4.0, 1.0, side) else None
+    return chart_side(normals, points, LIMIT, 1.0)
 
 
-@both
-def test_chart_is_bisected_if_folded_or_overlapping(call):
+def test_chart_is_bisected_if_folded_or_overlapping():
     level = np.stack([*np.mgrid[0:6, 0:4].reshape(2, -1) + 0.5, np.zeros(24)], axis=1)
     up = np.tile([0.0, 0.0, 1.0], (48, 1))
     ramps = np.concatenate([level, np.add(level, [0.0, 0.0, 5.0])])
-    assert halved(call, up, np.concatenate([level, np.add(level, [0.0, 0.0, 3.9])])) is None
-    assert halved(call, up, np.concatenate([level, np.add(level, [6.0, 0.0, 5.0])])) is None
-    assert halved(call, up, ramps).tolist() == [False] * 24 + [True] * 24
+    assert halved(up, np.concatenate([level, np.add(level, [0.0, 0.0, 3.9])])) is None
+    assert halved(up, np.concatenate([level, np.add(level, [6.0, 0.0, 5.0])])) is None
+    assert halved(up, ramps).tolist() == [False] * 24 + [True] * 24
 
     bent = fan(-85.0, 85.0, 48)
-    side = halved(call, bent, np.concatenate([level, np.add(level, [6.0, 0.0, 0.0])]))
+    side = halved(bent, np.concatenate([level, np.add(level, [6.0, 0.0, 0.0])]))
     assert len(set(side[:24])) == len(set(side[24:])) == 1
     assert side[0] != side[-1]
 
 
-@both
-def test_normals_equal_up_to_sign_are_no_fold(call):
+def test_normals_equal_up_to_sign_are_no_fold():
     normals = np.tile([0.0, 0.0, 1.0], (24, 1))
     normals[::3] *= -1.0
     level = np.stack([*np.mgrid[0:6, 0:4].reshape(2, -1) + 0.5, np.zeros(24)], axis=1)
-    assert halved(call, normals, level) is None
-    assert halved(call, normals, level + np.arange(24.0)[:, None] * [0.0, 0.0, 1.0]) is None
+    assert halved(normals, level) is None
+    assert halved(normals, level + np.arange(24.0)[:, None] * [0.0, 0.0, 1.0]) is None
     stacked = np.concatenate([level, np.add(level, [0.0, 0.0, 5.0])])
-    side = halved(call, np.tile(normals, (2, 1)), stacked)
+    side = halved(np.tile(normals, (2, 1)), stacked)
     assert set(np.flatnonzero(side)) in ({*range(24)}, {*range(24, 48)})
 
 
-@pytest.mark.parametrize('number', [1, 2, 3, 50, 51, 52, 200])
-def test_percentile_equals_numpy(number):
-    values = np.random.default_rng(number).normal(size=number)
-    for share in (0.0, 2.0, 50.0, 100.0):
-        assert percentile(values, share) == pytest.approx(np.percentile(values, share))
+@both
+@pytest.mark.parametrize('number', [2, 3, 50, 51, 52, 200, 1200])
+def test_a_fold_is_a_percentile_below_the_limit_or_too_many_normals(call, number):
+    rng, up = np.random.default_rng(number), np.array([0.0, 0.0, 1.0])
+    for odd in range(min(number, 30)):
+        normals = np.concatenate([fan(-59.0, 59.0, number - odd), fan(61.0, 65.0, odd)])
+        normals = normals[rng.permutation(number)]
+        cosines = normals @ up
+        low = np.percentile(cosines, 100.0 - FOLD_PERCENTILE) < LIMIT
+        assert call(is_folded, normals, up, LIMIT) == (low or odd > MOST_FOLDED)
 
 
 @both

@@ -9,20 +9,22 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.models.growth import estimate_noise, line_above_zero
+from surfel_mapper.models.cloud_noise import (
+    block_noise,
+    estimate_noise,
+    line_above_zero,
+    neighbourhoods,
+)
+from surfel_mapper.models.growth import free_surfels
 from surfel_mapper.models.kernels import growth
 from surfel_mapper.models.kernels.growth import (
     assign_points,
-    classify_free,
     find_facets,
     grow_patches,
-    sample_distances,
     SLOTS,
 )
 from surfel_mapper.models.kernels.voxel_points import (
-    block_noise,
     find_core,
-    merge_owners,
     owner_means,
 )
 from surfel_mapper.models.thinning import thin
@@ -105,18 +107,6 @@ def test_means_by_voxel_and_owner_equal_numpy(call):
     assert counts[:num].sum() == len(points)
     assert first[-1] == num
 
-    owners //= 2  # two owners become one
-    num = call(merge_owners, *table)
-    pairs[:, 1] //= 2
-    unique, number = np.unique(pairs, axis=0, return_counts=True)
-    found = np.repeat(np.arange(len(first) - 1), np.diff(first))
-    order = np.lexsort((owners[:num], found))
-    np.testing.assert_array_equal(np.stack([found, owners[:num]], axis=1)[order], unique)
-    np.testing.assert_array_equal(counts[:num][order], number)
-    for row, (v, k) in zip(order, unique, strict=True):
-        own = voxels.points[(pairs == (v, k)).all(axis=1)]
-        np.testing.assert_allclose(means[row], own.mean(axis=0), rtol=1e-12)
-
 
 @both
 def test_sparse_voxels_are_no_core(call):
@@ -129,9 +119,8 @@ def test_sparse_voxels_are_no_core(call):
     assert core.tolist() == [True, False, False, False, True, True]
 
 
-@both
 @pytest.mark.parametrize(('radius', 'outliers'), [(0.6, 0), (1e3, 0), (1e3, 900)])
-def test_noise_of_blocks_is_that_of_the_points_without_outliers(call, radius, outliers):
+def test_noise_of_blocks_is_that_of_the_points_without_outliers(radius, outliers):
     rng = np.random.default_rng(6)
     xy = rng.uniform(-0.2, 0.2, (9000, 2))
     z = np.sqrt(radius**2 - (xy**2).sum(axis=1)) - radius
@@ -139,13 +128,11 @@ def test_noise_of_blocks_is_that_of_the_points_without_outliers(call, radius, ou
     points[:outliers, 2] = rng.uniform(-0.1, 0.1, outliers)
     _, voxels = by_voxel(points, 0.05)
     full = np.flatnonzero(np.diff(voxels.starts) > 30)[:40]
-    sigma = np.empty(len(full))
-    state, above = (voxels.points, voxels.starts, voxels.adjacent), np.array([0.0, 0.0, 9.0])
-    call(block_noise, *state, full, False, 120, above, sigma)
+    blocks, above = neighbourhoods(voxels, full), np.array([0.0, 0.0, 9.0])
+    sigma = block_noise(voxels, blocks, above, 120)
     assert np.median(sigma) == pytest.approx(0.004, rel=0.15)
     aside = np.array([9.0, 0.0, 9.0 * math.sqrt(1.0 / 3.0)])  # 60 degrees from the normal
-    across = sigma.copy()
-    call(block_noise, *state, full, False, 120, aside, sigma)
+    across, sigma = sigma, block_noise(voxels, blocks, aside, 120)
     if radius > 1.0:  # noise is along the ray
         assert np.median(sigma) == pytest.approx(2.0 * np.median(across), rel=0.02)
 
@@ -210,27 +197,20 @@ def test_points_of_a_corner_go_to_the_face_that_they_lie_on(call):
     assert (away[np.arange(len(owner)), owner] <= away.min(axis=1) + 1e-12).all()
     assert (owner == face).mean() > 0.99  # points on edges are on both faces
 
-    who, distance = np.empty(len(face), np.int32), np.empty(len(face))
-    num = call(sample_distances, *state, label, tangent, 1, who, distance)
-    assert num == np.diff(voxels.starts)[label >= 0].sum()
-    np.testing.assert_allclose(distance[:num], 0.0, atol=1e-12)
-
 
 @both
 def test_facets_of_a_corner_are_its_faces(call):
     points, face = corner(step=0.03, sigma=1e-3)
     _, voxels = by_voxel(points)
-    face, number = face[voxels.rows], len(voxels.starts) - 1
+    face = face[voxels.rows]
     owner = np.full(len(face), -1, np.int32)
-    count, flat = np.empty(number, np.int64), np.empty(number, bool)
-    mean, normal = np.zeros((number, 3)), np.zeros((number, 3))
-    state = voxels.points, voxels.starts
-    call(classify_free, *state, owner, 0.02, count, flat, mean, normal)
-    np.testing.assert_array_equal(count, np.diff(voxels.starts))
-    assert flat.any()
-    planes = np.empty((10, 4))
-    free, rules = (count, flat, mean, normal), (0.005, 3, 30, math.cos(math.radians(25)), 0.1)
-    num = call(find_facets, *state, voxels.adjacent, free, rules, owner, planes, 0)
+    free = free_surfels(voxels, owner, SIZE, 0.02)
+    np.testing.assert_array_equal(free[0], np.diff(voxels.starts))
+    order = np.flatnonzero(free[1])
+    assert len(order)
+    planes, state = np.empty((10, 4)), (voxels.points, voxels.starts, voxels.adjacent)
+    rules = 0.005, 3, 30, math.cos(math.radians(25)), 0.1
+    num = call(find_facets, *state, free, order, rules, owner, planes, 0)
     assert num == 3
     for k in range(3):
         own = face[owner == k]
@@ -247,16 +227,15 @@ def test_a_long_region_that_is_no_facet_is_grown_once(monkeypatch, width_m, leas
     _, voxels = by_voxel(points)
     number, owner = len(voxels.starts) - 1, np.full(len(points), -1, np.int32)
     assert number == 150
-    count, flat = np.empty(number, np.int64), np.empty(number, bool)
-    free = count, flat, np.zeros((number, 3)), np.zeros((number, 3))
-    growth.classify_free(voxels.points, voxels.starts, owner, 0.02, *free)
-    assert flat.all()
+    free = free_surfels(voxels, owner, SIZE, 0.02)
+    assert free[1].all()
     calls, grow_facet = [], growth.grow_facet
     monkeypatch.setattr(
         growth, 'grow_facet', lambda *args: calls.append(grow_facet(*args)) or calls[-1]
     )
     state = voxels.points, voxels.starts, voxels.adjacent
     rules = (0.005, 3, least_points, 0.9, 0.08)
-    assert interpreted(find_facets, *state, free, rules, owner, np.empty((10, 4)), 0) == 0
+    order = np.arange(number)
+    assert interpreted(find_facets, *state, free, order, rules, owner, np.empty((10, 4)), 0) == 0
     assert calls == [number]
     assert (owner == -1).all()

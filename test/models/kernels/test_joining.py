@@ -9,11 +9,10 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.models.growth import owner_table, sorted_table
+from surfel_mapper.models.frames import plane_frames
+from surfel_mapper.models.growth import owner_table, renamed, sorted_table
 from surfel_mapper.models.kernels.joining import (
     height_errors,
-    plane_frames,
-    rename_owners,
     sort_owners,
     touching_patches,
 )
@@ -75,23 +74,19 @@ def test_touching_patches_equal_brute_force(call):
     )
 
 
-@both
-def test_free_owners_become_their_groups(call):
+def test_free_owners_become_their_groups():
     voxels, owner, _ = scattered()
     group = np.arange(len(voxels.starts) - 1, dtype=np.int32)
     index = np.array([2, 0, 1, 0], np.int32)
     voxel = np.repeat(group, np.diff(voxels.starts))
     expected = np.where(owner >= 0, index[owner], -1 - voxel)
-    call(rename_owners, voxels.starts, group, index, owner)
-    np.testing.assert_array_equal(owner, expected)
+    np.testing.assert_array_equal(renamed(voxels.starts, group, index, owner), expected)
 
 
-@both
-def test_frames_equal_numpy(call):
+def test_frames_equal_numpy():
     rng = np.random.default_rng(2)
     points, weights = rng.normal(size=(40, 3)) * [3.0, 2.0, 0.1], rng.uniform(1.0, 3.0, 40)
-    means, normals, values = np.empty((3, 2, 3))
-    call(plane_frames, points, weights, np.array([0, 40, 40]), means, normals, values)
+    means, normals, values = plane_frames(points, weights, np.array([0, 40, 40]))
     covariance = np.cov(points.T, aweights=weights, bias=True)
     np.testing.assert_allclose(means[0], np.average(points, axis=0, weights=weights))
     np.testing.assert_allclose(values[0], np.linalg.eigvalsh(covariance))
@@ -108,7 +103,7 @@ def test_height_fields_equal_least_squares(call):
     points, weights = np.column_stack([x, y, z]), rng.uniform(0.5, 2.0, 200)
     errors, rows = np.empty(3), np.arange(0, 200, 2)
     given = np.column_stack([points, weights])[rows].T.copy()
-    call(height_errors, given, np.array([0.0, 0.0, 1.0]), errors)
+    call(height_errors, given, 0, 100, np.array([0.0, 0.0, 1.0]), errors)
     x, y, z, weight = x[rows], y[rows], z[rows], weights[rows] / weights[rows].sum()
     for error, degree in zip(errors, (1, 2, 4), strict=True):
         exponents = [(i - j, j) for i in range(degree + 1) for j in range(i + 1)]
@@ -126,7 +121,8 @@ def test_turn_of_a_cylinder_is_the_angle_between_its_ends(call, turn_deg):
     )
     points = np.stack([np.sin(angle), along, np.cos(angle)], axis=-1).reshape(-1, 3)
     errors, normal = np.empty(3), np.array([0.0, 0.0, 1.0])
-    turn = call(height_errors, np.vstack([points.T, np.ones(len(points))]), normal, errors)
+    columns = np.vstack([points.T, np.ones(len(points))])
+    turn = call(height_errors, columns, 0, len(points), normal, errors)
     assert math.degrees(turn) == pytest.approx(turn_deg, rel=0.05)
     assert errors[1] < 0.01 * errors[0]
     assert errors[2] < 0.02 * errors[1]

@@ -11,10 +11,15 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.models.kernels.patches import bend_height, describe_patches, fit_quadric
 from surfel_mapper.models.kernels.region_merging import touch
 from surfel_mapper.models.multi_model import Surface
-from surfel_mapper.models.patches import fit_patches, PatchPoints
+from surfel_mapper.models.patches import (
+    bend_height,
+    described,
+    fit_patches,
+    PatchPoints,
+    weighted_fit,
+)
 from test.kernels.modes import both
 
 
@@ -24,52 +29,34 @@ def bowl(radius_m, half_m=0.5, number=4000):
     return np.column_stack([xy, 0.5 / radius_m * (xy**2).sum(axis=1)])
 
 
-@both
-def test_quadric_equals_weighted_least_squares(call):
+def test_quadric_equals_weighted_least_squares():
     rng = np.random.default_rng(2)
     cells = np.column_stack([rng.normal(size=(50, 3)), rng.uniform(0.5, 2.0, 50)])
     x, y, z, weight = cells.T
     basis = np.stack([np.ones(50), x, y, x * x, x * y, y * y], axis=1)
     for terms in (3, 6):
-        found = np.zeros(6)
-        error = call(fit_quadric, cells, terms, found)
+        found = weighted_fit(basis[:, :terms], z, weight)
         root = np.sqrt(weight)[:, None]
         expected = np.linalg.lstsq(root * basis[:, :terms], root[:, 0] * z, rcond=None)[0]
-        np.testing.assert_allclose(found[:terms], expected, atol=1e-9)
-        residual = z - basis[:, :terms] @ expected
-        assert error == pytest.approx(weight @ residual**2)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-@both
-def test_bend_of_a_paraboloid_is_its_rise_and_that_of_a_plane_is_zero(call):
+def test_bend_of_a_paraboloid_is_its_rise_and_that_of_a_plane_is_zero():
     points = bowl(1.0)
-    bend = call(bend_height, points, 0, len(points), np.zeros(3), np.eye(3), 0.05)
+    bend = bend_height(points, 0.05)
     rise = np.percentile(points[:, 2], [5.0, 95.0])
     assert bend == pytest.approx(rise[1] - rise[0], rel=0.05)
     level = points * [1.0, 1.0, 0.0]
-    assert call(bend_height, level, 0, len(level), np.zeros(3), np.eye(3), 0.05) == 0.0
-    assert call(bend_height, level, 0, 3, np.zeros(3), np.eye(3), 0.5) == -1.0
+    assert bend_height(level, 0.05) == 0.0
+    assert bend_height(level[:3], 0.5) == -1.0
 
 
-@both
-def test_kind_and_moments_of_patches(call):
+def test_kind_and_moments_of_patches():
     flat = bowl(1.0) * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
     points, starts = np.concatenate([flat, bowl(1.0)]), np.array([0, 4000, 8000])
-    means, covariances, frames = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty((2, 3, 3))
-    curved, normals = np.empty(2, bool), np.tile([0.0, 0.0, 1.0], (2, 1))
-    rules = (np.full(2, 0.04), 0.05, True, True)
-    call(
-        describe_patches,
-        points,
-        starts,
-        normals,
-        np.array([0.0, 0.0, 9.0]),
-        rules,
-        means,
-        covariances,
-        frames,
-        curved,
-    )
+    groups = PatchPoints(points, starts, np.tile([0.0, 0.0, 1.0], (2, 1)), np.full(2, 0.04))
+    rules = groups.thickness, 0.05, True, True
+    means, covariances, frames, curved = described(groups, np.array([0.0, 0.0, 9.0]), rules)
     assert curved.tolist() == [False, True]
     for k in range(2):
         own = points[starts[k] : starts[k + 1]]

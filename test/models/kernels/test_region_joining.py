@@ -9,6 +9,7 @@ import pytest
 
 from surfel_mapper.models.growth import owner_table, pieces_of
 from surfel_mapper.models.joining import (
+    chunk_boxes,
     described,
     join_patches,
     layers,
@@ -18,7 +19,6 @@ from surfel_mapper.models.joining import (
 )
 from surfel_mapper.models.kernels import region_joining
 from surfel_mapper.models.kernels.region_joining import (
-    chunk_boxes,
     describe_regions,
     join_layers,
     join_pair,
@@ -123,15 +123,15 @@ def test_rows_near_a_small_region_are_all_within_reach(call):
     call(join_pair, 7, 6, regions)  # two tiles of the floor, far from the wall
     call(join_pair, 8, 6, regions)
     regions.extent[9] = 0.3
-    boxes = call(chunk_boxes, given.means)
-    state = given.means, given.weights, given.starts, boxes, 0.0
-    found = call(rows_near, 6, 9, state, regions)
+    state = given.means, given.weights, given.starts, chunk_boxes(given.means), 0.0
+    rows = np.empty(len(given.means), np.int64)
+    found = rows[: call(rows_near, 6, 9, state, regions, rows)]
     floor = np.arange(given.starts[6], given.starts[9])
     away = np.linalg.norm(given.means[floor] - regions.mean[9], axis=1)
     near = floor[away < REACH * 0.3]
     assert 0 < len(near) < 0.5 * len(floor)
     assert sorted(found.tolist()) == near.tolist()
-    assert len(call(rows_near, 9, 9, state, regions)) == given.starts[10] - given.starts[9]
+    assert call(rows_near, 9, 9, state, regions, rows) == given.starts[10] - given.starts[9]
 
 
 @both
@@ -140,10 +140,11 @@ def test_a_cylinder_turns_and_bends_by_its_arc(call):
     regions = single_regions(given, VIEW, (0.01, 0.0), SIZE_M)
     edges, adjacent = touching_regions(given.touching(), regions.root)
     state, floor = (given.means, given.weights, given.starts), (0.02 * SIZE_M) ** 2
+    state = *state, chunk_boxes(given.means)
     call(join_smooth, edges, adjacent, *state, floor, regions)
     names = np.unique(regions.root)
     normals, found = np.empty((len(names), 3)), np.empty((len(names), 4))
-    call(describe_regions, names, *state, floor, regions, (0.0, 0.0, 0.0), normals, found)
+    call(describe_regions, names, (*state, floor), regions, (0.0, 0.0, 0.0), normals, found)
     assert len(names) == 3
     round_one = np.searchsorted(names, regions.root[0])
     # 72 deg of radius 1 m; the turn of a parabola of equal arc is a little larger
@@ -186,6 +187,7 @@ def test_pairs_of_a_large_region_are_compared_a_few_times_each(monkeypatch):
     calls, push = [], region_joining.push.py_func
     monkeypatch.setattr(region_joining, 'push', lambda *args: calls.append(1) or push(*args))
     state, floor = (given.means, given.weights, given.starts), (0.02 * SIZE_M) ** 2
+    state = *state, chunk_boxes(given.means)
     interpreted(join_smooth, edges, adjacent, *state, floor, regions)
     assert (regions.root == regions.root[0]).all()
     assert regions.patches[regions.root[0]] == side * side
