@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.compiling import kernel, part, stay_apart
+from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.models.kernels.joining import gather, height_errors, TERMS
 
 JOIN_COSINE = math.cos(math.radians(50.0))
@@ -301,7 +301,6 @@ def heights(points, low, high, normal, quartic, floor):
 
     Returns cost, cost of a plane, rms from a plane m, turn rad, and bend m of the quadric.
     """
-    stay_apart()
     number = high - low
     tries = 3 if quartic and number > POINTS_PER_TERM * TERMS[2] else 2
     errors = np.empty(tries)
