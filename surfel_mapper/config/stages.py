@@ -69,8 +69,8 @@ class MapConfig(Stage):
     )
     threads: int = setting(
         0,
-        'Threads that share the work of a scan; the map does not depend on it. 0: one in a node, '
-        'two in a replay by one process if there are two cores.',
+        'With two or more, another thread prepares the next scan; the map does not depend on it. '
+        '0: one in a node, two in a replay by one process if there are two cores.',
         low=0,
         high=64,
     )
