@@ -111,7 +111,7 @@ IMPORTERS = {
     'mapping/surfel_map.py': 'a module of this package',
     'ros/bond.py': 'one fixed package',
     'ros/layer_outputs.py': 'types that layers name',
-    'ros/player.py': 'types of a bag, of packages that are looked up before',
+    'ros/message_types.py': 'types of a bag, of packages that are looked up before',
 }
 """Modules that import by a text, and where the text comes from."""
 

@@ -207,7 +207,7 @@ def replay_one(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     """Map a recording in this process."""
     chosen = replay_options(args)
     request = request_of(args, args.bags[0])
-    config = configured(args)
+    config = with_filters(args)
     others = {'--poses-out': args.poses_out, '--rrd': args.rrd}
     check_distinct(request.path, args.output, chosen.formats, others)
     return replay(request, output=args.output, config=config, options=chosen, **options)

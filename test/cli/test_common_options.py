@@ -21,6 +21,7 @@ from surfel_mapper.files import ply
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.offline.replay import ReplayOptions
+from test import extras
 from test.bags.recorded import drive, write_rosbag2
 
 pytestmark = pytest.mark.usefixtures('undrawn')
@@ -49,9 +50,9 @@ def inputs(tmp_path_factory):
 def command(verb, inputs):
     """Return a command that lacks its output."""
     if verb.endswith('--workers'):
-        pytest.importorskip('distributed', reason='Dask is not installed (extra cluster)')
+        extras.load('distributed')
     if verb == 'merge':
-        pytest.importorskip('pyarrow', reason='merging needs pyarrow (extra formats)')
+        extras.load('pyarrow')
     return {
         'replay': ['replay', str(inputs / 'drive')],
         'replay --workers': ['replay', str(inputs / 'drive'), '--workers', '1'],
@@ -95,7 +96,7 @@ def test_a_new_directory_an_empty_one_and_overwriting_are_accepted(inputs, tmp_p
 
 @pytest.mark.parametrize('option', ['--poses-out', '--rrd'])
 def test_a_file_of_a_replay_is_not_replaced_unasked(inputs, tmp_path, capsys, option):
-    pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
+    extras.load('rerun')
     file, output = tmp_path / 'file', str(tmp_path / 'out')
     file.write_text('mine')
     words = ['replay', str(inputs / 'drive'), '-o', output, option, str(file)]
@@ -142,7 +143,9 @@ def test_a_call_from_python_replaces_nothing_unasked(inputs, tmp_path):
     assert (tmp_path / 'map.ply').read_bytes().startswith(b'ply')
 
 
-@pytest.mark.parametrize(('verb', 'formats'), [('replay', 'ply, pcd'), ('extract', 'json, obj')])
+@pytest.mark.parametrize(
+    ('verb', 'formats'), [('replay', 'ply, pcd'), ('extract', 'json, parquet')]
+)
 def test_formats_are_a_list_with_commas(inputs, tmp_path, capsys, verb, formats):
     with pytest.raises(SystemExit):
         main([*command(verb, inputs), '-o', str(tmp_path / 'out'), '--formats', 'parqet'])

@@ -10,7 +10,6 @@ import numba
 import numpy as np
 import pytest
 
-from surfel_mapper.cli import extract
 from surfel_mapper.cli.main import main
 from surfel_mapper.files import ply
 from surfel_mapper.files.map_state import save_map
@@ -64,22 +63,6 @@ def test_a_map_becomes_models_of_its_surfels(tmp_path, capsys):
 
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason='kernels are interpreted in this run')
-def test_compiling_is_announced_once_on_stderr(tmp_path, capsys, monkeypatch):
-    write_cloud(tmp_path / 'none.ply', np.empty((0, 3), np.float32))
-    arguments = ['extract', str(tmp_path / 'none.ply'), '--output', str(tmp_path / 'out')]
-    arguments.append('--overwrite')
-    assert main(arguments) == 0  # whatever is compiled for it
-    capsys.readouterr()
-    assert main(arguments) == 0
-    assert capsys.readouterr().err == ''
-
-    read = extract.read
-    new = numba.njit(lambda value: value)
-    monkeypatch.setattr(extract, 'read', lambda args: read(args)[: new(4)])
-    assert main(arguments) == 0
-    assert capsys.readouterr().err.count('compiling kernels') == 1
-
-
 def test_an_empty_cloud_becomes_empty_models(tmp_path, capsys):
     write_cloud(tmp_path / 'none.ply', np.empty((0, 3), np.float32))
     out = str(tmp_path / 'out')

@@ -9,6 +9,7 @@ import pytest
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.files import ply
+from test import extras
 from test.bags.recorded import drive, write_rosbag2
 
 pytestmark = pytest.mark.usefixtures('undrawn')
@@ -92,7 +93,7 @@ def test_a_refusal_has_the_words_of_one_in_a_file(bag, tmp_path, capsys, name, t
 
 @pytest.mark.parametrize('verb', ['replay', 'filter', 'view'])
 def test_an_unknown_name_is_refused_with_the_nearest(bag, tmp_path, capsys, verb):
-    pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
+    extras.load('rerun')
     (tmp_path / 'chain.yaml').write_text('- remove_nan\n')
     words = {
         'replay': [str(bag), '--output', str(tmp_path / 'out')],

@@ -303,7 +303,7 @@ def test_a_missing_tf2_msgs_ends_the_node_with_the_install_command(domain, capfd
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('when', ['compiling', 'ready:'])
+@pytest.mark.parametrize('when', ['loading kernels', 'ready:'])
 def test_a_signal_ends_the_node_cleanly_at_any_time(start, number, when):
     node = start('node', *ARGUMENTS)
     node.wait_for_output(when)
