@@ -9,8 +9,6 @@ interpolate) use only + - * / and sqrt, which IEEE 754 rounds in one way, on Pyt
 fixed order: no BLAS, no fused multiply-add, no sine whose last bit depends on the math library.
 rotation_angle, se3_exp and se3_log need such functions and may differ in that bit.
 
-One module: short functions on the same two representations, which callers use together.
-
 Sources: Shepperd 1978 for the quaternion of a matrix; Eberly 2011 (A Fast and Accurate Algorithm
 for Computing SLERP) for the series of slerp without trigonometry; Barfoot 2017 (State Estimation
 for Robotics) for the exponential map.

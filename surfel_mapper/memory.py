@@ -12,8 +12,6 @@ MALLOC_TRIM_THRESHOLD_ change that before a process starts; this module changes 
 objects, which every full collection would visit while scans are mapped, 70 ms at a time.
 
 ``limit_address_space`` makes an allocation beyond the memory of the machine a MemoryError.
-
-Stands alone: a process of any part calls it at its start.
 """
 
 from __future__ import annotations

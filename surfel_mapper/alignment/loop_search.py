@@ -10,8 +10,6 @@ by their poses; the cells of one are then registered to the surfels of the other
 candidates that fit become loops. The graph of odometry and loops is solved robustly
 (alignment/loops.py); at the poses found more keyframes are near each other, and so on.
 A loop that no second one near it confirms is refused, however well it fits.
-
-The module is long because local maps, candidates and verification share the state of one search.
 """
 
 from __future__ import annotations

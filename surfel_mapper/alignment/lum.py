@@ -9,8 +9,6 @@ at any yaw and after full turns, weighs exact pairs instead of dropping them, le
 both directions act on both scans, and works in float64 with a sparse solver, so that graphs 1 km
 from the origin or of a thousand scans are solved equally well.
 
-One module: one class, with the interface of PCL.
-
 Source: Lu and Milios 1997.
 """
 

@@ -12,8 +12,6 @@ This needs a motion that is known before, from the scans before, and that cannot
 by braking; if a collision ended it, the registration finds that the scan fits better at rest.
 Vehicles that move along from the first scan on are not distinguished from the world; see
 pipeline/surroundings.py.
-
-It stands alone because registration only needs its result.
 """
 
 from __future__ import annotations

@@ -12,8 +12,6 @@ The eigenvalues of the normal equations, rotations scaled by the mean lever, tel
 motion that the scan does not determine (a tunnel, a plain). In these the prediction is kept, after
 Zhang, Kaess and Singh 2016. The share of the information is compared, not its amount, which would
 need a threshold for every sensor.
-
-One module: the levels, the headings and the steps of one search.
 """
 
 from __future__ import annotations

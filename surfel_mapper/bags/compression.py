@@ -3,7 +3,7 @@
 """
 Unpacking of messages and files that the recorder packed with zstd.
 
-The module for zstd comes with rosbags. On its own because the tests pack bags with it too.
+The module for zstd comes with rosbags.
 """
 
 from __future__ import annotations

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Types of arguments, groups of arguments and exit codes that several verbs share.
-
-On its own because no verb imports another.
-"""
+"""Types of arguments, groups of arguments and exit codes that several verbs share."""
 
 from __future__ import annotations
 

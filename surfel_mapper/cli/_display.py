@@ -4,7 +4,7 @@
 ``--open``: the result in a browser.
 
 A verb is done before its result is opened. On a machine without a display or a browser a message
-names the reason, and the exit code stays. On its own because no verb imports another.
+names the reason, and the exit code stays.
 """
 
 from __future__ import annotations

@@ -4,7 +4,6 @@
 Text on the terminal, without the control characters of names in it.
 
 Names of topics, columns, frames and files come from outside, and may have ends of lines in them.
-On its own because no verb imports another.
 """
 
 from __future__ import annotations

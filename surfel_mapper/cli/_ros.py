@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Message for users who run a verb that needs ROS 2 without having it.
-
-On its own because ``node`` and ``play`` share it, and no verb imports another.
-"""
+"""Message for users who run a verb that needs ROS 2 without having it."""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-``--quiet`` and ``--verbose``: how much a verb prints on stderr.
-
-On its own because no verb imports another.
-"""
+"""``--quiet`` and ``--verbose``: how much a verb prints on stderr."""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 """
 ``surfel-mapper node``: the live map, as ``ros2 run surfel_mapper node``.
 
-SIGINT and SIGTERM both end it with exit code 0, at any time after its start. On its own as every
-verb is.
+SIGINT and SIGTERM both end it with exit code 0, at any time after its start.
 """
 
 from __future__ import annotations

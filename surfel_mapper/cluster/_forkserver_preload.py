@@ -3,8 +3,6 @@
 """
 Imports of the fork server: the modules that tasks need, once for all workers of this machine.
 
-On its own because the fork server imports it by name.
-
 It starts no thread, because threads do not survive a fork. The process that asked for workers ends
 them at Ctrl-C, so all others ignore it.
 """

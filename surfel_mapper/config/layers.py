@@ -10,8 +10,6 @@ voxels unused, and a lidar scan at 0.2 m takes 1.6 times as long.
 Defaults of the models are those of Gao and Dong 2025 except where real sensors and axis-aligned
 buildings break its rules; profile paper restores those. Lengths are in voxels, the unit of the
 method, so that one number suits a table and a hall.
-
-One module: a list of settings, with no other code than their checks.
 """
 
 from __future__ import annotations

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Files of ROS parameters: find those of this package's node among the nodes of a robot.
-
-Stands alone: it knows the keys of ROS and no setting.
-"""
+"""Files of ROS parameters: find those of this package's node among the nodes of a robot."""
 
 from __future__ import annotations
 

@@ -5,8 +5,6 @@ Settings of the pipeline's stages: input, deskewing, frames, poses, map, window 
 
 Every map has these stages; settings of optional layers are in layers.py, those of registration
 and alignment in registration.py.
-
-One module: a list of settings, with no other code than their checks.
 """
 
 from __future__ import annotations

@@ -3,10 +3,10 @@
 """
 LAS and LAZ files of points and surfels, by laspy.
 
-That is an extra: the formats have 30 kinds of records. On its own because it alone imports laspy.
-lazrs, its decoder of LAZ, ends the process if it cannot get memory, so all sizes by which lazrs
-allocates are compared with the file first; and it decodes by one thread, which allocates by fewer.
-Coordinates are scaled integers, often of a map projection, so they are returned as float64.
+That is an extra: the formats have 30 kinds of records. lazrs, its decoder of LAZ, ends the process
+if it cannot get memory, so all sizes by which lazrs allocates are compared with the file first;
+and it decodes by one thread, which allocates by fewer. Coordinates are scaled integers, often of a
+map projection, so they are returned as float64.
 """
 
 from __future__ import annotations

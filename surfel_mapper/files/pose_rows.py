@@ -7,8 +7,6 @@ Rotations of few digits are replaced by the nearest orthonormal ones by the iter
 Schulz, X (3 - X^T X) / 2, which needs no decomposition of a matrix: each step squares the error,
 so three take 2e-3, the largest one that is accepted, below the resolution of float64.
 
-On its own because trajectories and data sets have poses of both kinds.
-
 Sources: Bjorck and Bowie 1971 for the iteration; Higham 1986 for its limit, the polar factor,
 which is the nearest rotation in the Frobenius norm.
 """

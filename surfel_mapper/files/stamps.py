@@ -4,7 +4,7 @@
 Stamps as decimal text, read to whole nanoseconds without a float.
 
 The resolution of a float64 is only 240 ns for seconds since 1970. Decimal is exact and takes 1 us
-a stamp. On its own because tables of poses, of data sets and names of files have stamps.
+a stamp.
 """
 
 from __future__ import annotations

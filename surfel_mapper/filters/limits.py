@@ -9,8 +9,6 @@ Angles are not computed: their cosines, or the side of an edge on which a point 
 on the axis about which an angle is measured has no such angle: neither test keeps it.
 
 If several sensors feed one map, a filter with a ``sensor`` applies only to scans of that frame.
-
-One module, because the tests of a coordinate are shared.
 """
 
 from __future__ import annotations

@@ -7,8 +7,6 @@ A function of eight arrays takes 0.3 s to compile, of which 0.1 s is the wrapper
 Python and 0.04 s the one for calls from C. A ``kernel`` has the former only. A ``part`` is
 compiled inside the kernels that call it; on its own it would be optimised and translated once
 more, which took a quarter of the time to the first scan.
-
-Stands alone: kernels of any folder may use it.
 """
 
 from functools import partial

@@ -26,9 +26,6 @@ with the nearest of 16 points.
 Interpreted, the functions work on arrays; compiled, the sums are a type of their own. Compilers do
 not find these instructions in loops, so they are spelled in the language of LLVM here, as are
 those of prefetch.py.
-
-Stands alone: one of the three places that emit instructions of LLVM. One module:
-every function has a version in Python, a type and its instructions.
 """
 
 from llvmlite import ir

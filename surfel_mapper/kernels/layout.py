@@ -11,8 +11,6 @@ would cost thirteen); half of the rows of 13 or 14 words would lie in three.
 Sums of positions and of views need at most 47 bits. They are kept in the upper 48 bits of a word,
 and the lower 16 bits hold pieces of two other numbers; mapping/kernels/rows.py reads and writes
 them.
-
-Stands alone because files and messages read it too, which need no kernel.
 """
 
 BITS = 16

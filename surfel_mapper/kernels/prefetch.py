@@ -15,8 +15,6 @@ outside of an array: translating it takes longer than a miss.
 
 Kernels that work in chunks read and write arrays in pieces too short for the hardware prefetcher.
 Prefetches of the next piece must be spread over a loop: all at once gain a third, or nothing.
-
-Stands alone: one of the three places that emit instructions of LLVM.
 """
 
 from llvmlite import ir

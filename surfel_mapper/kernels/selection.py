@@ -6,8 +6,6 @@ Copy selected points: by a mask, or by ranges of rows.
 With a mask every value is written and the write position advances only after a kept one, which
 avoids a branch that a random mask would mispredict. Masks of filters are rarely random: blocks of
 points that all stay are copied with vector instructions, those that all go are skipped.
-
-Stands alone: filters and models share it.
 """
 
 from numba import njit

@@ -5,7 +5,7 @@ The camera or lidar of each scan, and its measurements: points and free rays.
 
 The model of a lidar is fitted to the first scan of its frame and checked on every scan. If a scan
 does not fit, the model is fitted again, at growing intervals while no model fits. In between the
-frame has no model, and layers work without one. One module: every check may end in another fit.
+frame has no model, and layers work without one.
 """
 
 from __future__ import annotations

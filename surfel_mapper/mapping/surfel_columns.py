@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Convert surfels to the columns of a cloud, as in ~/normals, PCD files and bags of normals.
-
-Stands alone because importing Surfels loads the compiler, which reading a PCD file does not need.
-"""
+"""Convert surfels to the columns of a cloud, as in ~/normals, PCD files and bags of normals."""
 
 from __future__ import annotations
 

@@ -7,8 +7,7 @@ Points come in and are reduced to integer moments; surfels with normals go out, 
 moments of the voxels asked for; files hold either. The moments themselves, their exact addition
 and removal, and the limits of the map are in moment_map.py.
 
-(One module because it is one class, the main one; most of it is the description of
-its methods. The work is done in moment_map, reducer, surfels and moments.)
+The work is done in moment_map, reducer, surfels and moments.
 """
 
 from __future__ import annotations

@@ -9,8 +9,6 @@ ones are evicted, so that a voxel observed by both is not removed and created ag
 
 Distances are measured between scans of one frame (Travel); alignment and loops measure theirs so
 too.
-
-(One module because it is one class and its scans; the rest is the description of its methods.)
 """
 
 from __future__ import annotations

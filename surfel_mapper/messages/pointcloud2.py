@@ -11,8 +11,6 @@ Coordinates are gathered into one array in Fortran order, as the kernels of the 
 one pass over the bytes. Three strided copies would read each line of the cache three times.
 
 ``parse_cloud`` reads a serialised message in place: its data is a view of the bytes.
-
-One module: reading and writing share the fields and their types.
 """
 
 from __future__ import annotations

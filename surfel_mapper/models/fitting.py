@@ -9,8 +9,6 @@ are merged to surfaces, which become planes or height fields; the others are Gau
 
 A map of surfels is fitted as a cloud of nine points across each surfel, which carry its slope.
 
-One module: the stages from cloud to models read from top to bottom.
-
 Source: Gao and Dong 2025 (A Real-Time Multi-Model Parametric Representation of Point Clouds).
 """
 

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Means, covariances and axes of groups of points, all groups together.
-
-On its own because noise, growth, joining and patches share it.
-"""
+"""Means, covariances and axes of groups of points, all groups together."""
 
 from __future__ import annotations
 

@@ -12,8 +12,6 @@ lies on.
 The tolerance of a patch follows from the distances of its own points, so it needs no model of the
 sensor; thresholds of the bisection use the noise that is estimated from blocks of voxels.
 
-One module: growth, facets and noise share the table of points by voxel.
-
 Source: Besl and Jain 1988 (region growing from seeds); the rest is our own.
 """
 

@@ -14,8 +14,6 @@ them, cuts these into charts (charts.py), grows and joins all charts as those of
 (surfel_joining.py), matches ids (id_matching.py), and refits patches with material changes
 (live_patches.py). Flat voxels without a patch and rough voxels are one Gaussian each.
 
-One module: an update is one sequence of steps on the same arrays.
-
 Source: Gao and Dong 2025 for the tests and the models; surfels as clusters are our own.
 """
 

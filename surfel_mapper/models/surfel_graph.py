@@ -9,8 +9,6 @@ are recomputed whenever these change, so they do not depend on the map's history
 is worth reporting is a separate question: see ``is_material``.
 
 A voxel may move to another row when a map is cleared and restored; it keeps its label.
-
-(Longer than other modules: all arrays of the graph change together.)
 """
 
 from __future__ import annotations

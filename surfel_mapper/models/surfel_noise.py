@@ -7,8 +7,6 @@ A voxel on a plane is as thick as the noise; edges, corners and vegetation only 
 estimate is a low quantile of the thickness. A voxel clips noise of more than a tenth of its edge,
 so larger voxels, which the map sums exactly, are taken until they do not. The constants are those
 of the estimate from points (growth.py).
-
-Stands alone: it needs a map, and nothing of the models.
 """
 
 from __future__ import annotations

@@ -6,8 +6,6 @@ A bag through the pipeline: its clouds and poses into a Mapper, in the order of 
 That order is the one in which the node receives them, so that both make the same map; no message
 is looked up ahead, although a bag would allow it. ``BagRecording`` chooses topics and poses,
 ``feed`` is the loop over messages.
-
-One module although it is long: choosing and feeding rely on the same rules about topics.
 """
 
 from __future__ import annotations

@@ -8,8 +8,6 @@ College, NCLT and Boreas. Poses are returned as poses of the lidar, if the folde
 calibration they need; without, the scans are registered. Of a KITTI drive, a part of the scans may
 have been copied: their names are the numbers of their rows.
 
-One module: a list of layouts, a function each.
-
 Sources: development kits and papers of the data sets. Poses of Newer College, NCLT and Boreas are
 not read, because the folders do not contain the calibration of the lidar.
 """

@@ -5,7 +5,7 @@ Scans of an Ouster lidar in a capture of its packets, with its metadata beside i
 
 The profiles of packets differ between firmwares, and ouster-sdk knows all of them. Two of its
 interfaces are read: that of 0.12, the last release that does not pin an old rosbags, which the
-extra installs, and that of 1.0, see INSTALL. On its own because it alone imports ouster-sdk.
+extra installs, and that of 1.0, see INSTALL.
 """
 
 from __future__ import annotations

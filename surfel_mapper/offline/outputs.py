@@ -4,8 +4,6 @@
 The files that a replay writes, each whole or not at all; summary.json last.
 
 So if summary.json is new, all other files are too.
-
-One module: the checks before a replay and the writing after it share the names of the files.
 """
 
 from __future__ import annotations

@@ -7,8 +7,6 @@ Outputs are checked before the first scan. The files are written when the whole 
 mapped, the map before everything that may fail after it; a viewer that fails ends alone. A replay
 that maps nothing is an error, because an empty map looks like a result. Heavy modules are imported
 inside functions, so that ``surfel_mapper.replay`` loads neither rosbags nor matplotlib early.
-
-One module: a replay reads from top to bottom as check, start, map, write.
 """
 
 from __future__ import annotations

@@ -4,8 +4,7 @@
 Inserter: the way of one scan through the pipeline, once its pose is there.
 
 Prepare, reduce, insert, layers, derive: ``insert`` is that sequence, and every stage is a module
-beside this one or a part below. The module is long because every stage and every keeper of scans
-(window, layers, loops) meets here.
+beside this one or a part below.
 """
 
 from __future__ import annotations

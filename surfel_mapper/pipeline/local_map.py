@@ -5,8 +5,7 @@ LocalMap: the scans of the last metres, in the frame of the poses, for registrat
 
 If loops are to be found, scans must not be registered to a place that was seen before the last
 metres: the drift since then would tear it apart or jump. The map of the last metres is in
-``frames.fixed``, which does not jump either when the map is corrected. It is on its own because
-preparation reads this map and the inserter fills it.
+``frames.fixed``, which does not jump either when the map is corrected.
 """
 
 from __future__ import annotations

@@ -7,9 +7,6 @@ Node and replay drive this one class and only carry messages in and results out,
 map is the same to the bit. Time is the stamps of the data alone, never the clock: a scan waits
 for its pose until newer data is more than ``pose.max_wait_s`` ahead of it, which a bag replayed
 at any speed does alike.
-
-The module is long because it describes the whole interface; the stages are in scan_queue and
-inserter, and in the modules that these call.
 """
 
 from __future__ import annotations

@@ -7,8 +7,6 @@ They fit the map well, at a pose that hardly moves, while the world between them
 after scan has voxels that the map does not know, more than the motion explains. Boxed in by nine
 trucks (test/pipeline/scenarios.py) 8 % of the voxels of a scan are new, at 0.1 m a scan; in the
 same street 0.1 % are new at rest, 2 % at rest with three trucks that pass, 9 % at 0.9 m a scan.
-
-It stands alone because it judges the result of tracking and has no part in it.
 """
 
 from __future__ import annotations

@@ -15,8 +15,6 @@ scan should wait; after any other PoseError none can, so it should be dropped.
 
 Frames and stamps come from messages, so the numbers of edges and transforms and the depth of the
 tree are limited, and a lookup costs the same however many other frames there are.
-
-The module is long because growth, limits and lookups share the rules of the tree.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ The node's end of a bond with Nav2's lifecycle manager, which watches active nod
 The manager expects a heartbeat on ``bond`` under the name of the node soon after activation
 (``bond_timeout``), and brings the robot to a stop if it ceases. This end only sends, and ignores
 the heartbeats of the manager. So it needs only the message class, from the package ``bond`` that
-Nav2 depends on. On its own because no other module sends heartbeats.
+Nav2 depends on.
 
 Source: bond_core, bond/msg/Status.msg and the state machine of bondcpp.
 """

@@ -4,8 +4,7 @@
 The logger of a node, whose messages are one line each.
 
 Frames, file names and the texts of errors come from outside; a line break in one would forge a
-line of the log. On its own because rclpy tells the calls of a logger apart by the file and line
-they are in, and takes files out of that which are registered here as its own are.
+line of the log.
 """
 
 from __future__ import annotations

@@ -4,8 +4,7 @@
 The publishers of a topic, and those that a subscription cannot hear because of its QoS.
 
 A topic may have publishers of another type, which the graph lists too: they send nothing to a
-subscription, so their quality of service does not matter. (On its own because the executor of the
-inputs and the diagnostics both use it.)
+subscription, so their quality of service does not matter.
 """
 
 from __future__ import annotations

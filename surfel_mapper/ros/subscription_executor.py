@@ -15,8 +15,6 @@ not, since a reliable subscription receives nothing from that one. Messages abov
 reliable subscription: Fast DDS sends them in fragments, and of the best-effort ones most are
 lost. The middleware reports publishers that come and go; the subscription is then created again,
 and the earlier one kept until the new one is connected.
-
-(Longer than others: taking messages and changing subscriptions have to happen in one thread.)
 """
 
 from __future__ import annotations

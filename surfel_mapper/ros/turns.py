@@ -4,8 +4,7 @@
 The loop of the threads of the node: an error in one turn does not end the thread.
 
 Callbacks are guarded one by one, where their names are known. The loop guards the steps between
-them: waiting, taking a request, and reports of errors for which there is no memory. On its own
-because three threads use it, one of which needs no ROS.
+them: waiting, taking a request, and reports of errors for which there is no memory.
 """
 
 from __future__ import annotations

@@ -22,9 +22,6 @@ removed block is reused; free rows are zero except for their head.
 ``changed_since`` for the rows, or ``moved_since`` for those whose triangles moved by more than
 VISIBLE_VOXELS since, or changed in number. Blocks changed after the last ``clear_updated`` are
 flagged as updated and are not evicted.
-
-One module: the arrays, their content outside of a map (Blocks) and the map over them share the
-layout above.
 """
 
 from __future__ import annotations

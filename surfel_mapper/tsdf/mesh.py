@@ -10,8 +10,6 @@ edge are welded, within a block and between blocks.
 
 An update has two halves: ``portions`` copies the changed blocks that can have a surface, some at a
 time, in the thread that owns the map, and ``apply`` makes their triangles, in any thread.
-
-One module: all of it is about the triangles of blocks, and how they are joined.
 """
 
 from __future__ import annotations

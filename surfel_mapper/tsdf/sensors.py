@@ -8,8 +8,6 @@ without half-pixel offsets, both when a range image is made and when it is read.
 
 Lidar: x ahead, y left, z up; rows from the highest beam to the lowest, columns clockwise seen from
 above. With a field of view of 360 deg the last column is the neighbour of the first.
-
-One module: both models share their checks, and the kernels take either (kernels/projection.py).
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ Eye: the full detail of a map follows the place that the window of rerun looks a
 
 Rerun keeps the eye of a 3D view in its blueprint, with each motion of the mouse, and a client can
 read the blueprint of a window (0.41; the client is experimental there). A page in a browser has no
-such service, so its detail stays around ``--at``. It stands alone because it needs a window.
+such service, so its detail stays around ``--at``.
 """
 
 from __future__ import annotations

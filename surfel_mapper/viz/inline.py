@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A map inline in a notebook: the 3D view of the report in a frame, without a server.
-
-It stands alone because it is public, and needs neither a mapper nor a report.
-"""
+"""A map inline in a notebook: the 3D view of the report in a frame, without a server."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ RecordingFile: an .rrd file that rerun writes, whole or not at all.
 
 rerun writes to a pipe, and a thread copies the bytes to a temporary file that takes its name at
 the end. Without it a full disk ended the recording in the middle, and rerun (0.41) waited for its
-writer for ever, in flush and at the end of the process. Stands alone: rerun is not needed.
+writer for ever, in flush and at the end of the process.
 """
 
 from __future__ import annotations

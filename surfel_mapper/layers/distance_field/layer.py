@@ -6,8 +6,6 @@ The truncated signed distance field as a layer: fused from the scans, published 
 A scan is fused at once or, with ``layers.tsdf.when_final``, when it leaves the window and its pose
 is final: fusion cannot be undone. The sensor is the camera that a scan names, else the lidar
 fitted to the first points of its frame; see tsdf/fitting.py.
-
-One module: the methods of one layer, most of them a few lines that call other modules.
 """
 
 from __future__ import annotations

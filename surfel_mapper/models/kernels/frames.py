@@ -3,8 +3,6 @@
 """
 Moments of points, and the frames of clusters, facets and surfels from their eigenvectors.
 
-On its own because bisection, patches, growth and the surfels of a map share it.
-
 Source: Golub and Van Loan, Matrix Computations, section 8.5 (Jacobi's method).
 """
 

@@ -12,8 +12,6 @@ of the free points that are left.
 Points, starts and adjacent (the neighbours) are those of voxel_points.py. A plane is four
 numbers: unit normal and offset, with distance normal . p + offset.
 
-One module: both kinds of growth share the test of a point against a patch.
-
 Source: Besl and Jain 1988 (region growing from seeds).
 """
 

@@ -6,8 +6,6 @@ Join patches to regions, the pair first that gains most; see models/joining.py.
 A region is a chain of patches, named by the first. The means of the points of patch k are rows
 starts[k] to starts[k + 1] - 1 of points (P, 3) and weights (P,). Interpreted, a fit of 200,000
 points compares 10,000 pairs in 0.7 s, of which the height fields take a tenth.
-
-One module: joining and description of regions share the fits of height fields.
 """
 
 from heapq import heappop, heappush

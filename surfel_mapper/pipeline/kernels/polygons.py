@@ -5,7 +5,7 @@ Points in polygons, by counting the edges that a ray crosses.
 
 Array operations visit all points once per edge: a polygon of 10,000 corners and a map of 400,000
 surfels took 40 s. The kernel visits each point once, tests the bounding box first, and keeps the
-edges in the cache. It stands alone as the only kernel of the pipeline.
+edges in the cache.
 
 Source: Shimrat 1962, Algorithm 112, Position of point relative to polygon.
 """

@@ -16,8 +16,6 @@ a window instead of an envelope of parabolas: reaches are short, and plain loops
 instructions).
 
 Distances are integers and exact: the result does not depend on the order of changes.
-
-One module: all share the marks of voxels and the look-up of blocks.
 """
 
 from numba import njit

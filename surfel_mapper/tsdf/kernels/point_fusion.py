@@ -16,8 +16,6 @@ would never fill. Free rays do not touch voxels that were observed near a surfac
 so that thin objects survive the rays that pass beside them.
 
 All lengths are in voxels except where m is stated; a block has 2^bits voxels a side.
-
-One module: marking, summing and fusing walk the same rays.
 """
 
 from numba import njit

@@ -5,8 +5,6 @@ Paint ellipses over an image.
 
 matplotlib takes 20 microseconds for an ellipse, so drawing a map of a million surfels would take
 longer than mapping; this takes 0.3 for an ellipse of a few pixels.
-
-On its own because it is the only compiled code of the pictures.
 """
 
 import math

@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Comparison of places with a range image: seen through, seen, or unknown.
-
-On its own because it is the only compiled code of this layer.
-"""
+"""Comparison of places with a range image: seen through, seen, or unknown."""
 
 from numba import njit
 import numpy as np
