@@ -12,10 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-import time
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cluster.workers import never, open_workers
+from surfel_mapper.compilation import clock
 from surfel_mapper.config import AUTO
 from surfel_mapper.errors import BagError, ConfigError, MapError
 from surfel_mapper.files.atomic import check_free, finite_or_none
@@ -83,7 +83,7 @@ def replay_bags(
         If workers cannot be reached or are lost, or Dask is not installed.
 
     """
-    began = time.perf_counter()
+    began = clock()
     options = ReplayOptions() if options is None else options
     check(config, options, output)
     found = surveyed(requests, config)
@@ -97,18 +97,18 @@ def replay_bags(
         done_s += seconds
         progress(round(done_s), round(total_s))
 
-    times = {'survey': time.perf_counter()}
+    times = {'survey': clock()}
     with open_workers(workers, scheduler) as pool:
-        times['start'] = time.perf_counter()
+        times['start'] = clock()
         jobs, frame = [(each.request, config) for each in found], None
         if is_registered:
             frame = registered(found, config, output, options.align, pool, on_done, stopped)
             jobs = [(each.request, each.config) for each in frame.placed]
-            times['register'] = time.perf_counter()
+            times['register'] = clock()
         mapped = mapped_together(jobs, recorded_s, pool, on_done, stopped)
-        times['map'] = time.perf_counter()
+        times['map'] = clock()
         num_workers = pool.num_workers
-    times['stop'] = time.perf_counter()
+    times['stop'] = clock()
     summary = {
         'bag': str(requests[0].path) if len(requests) == 1 else f'{len(requests)} bags',
         'bags': [str(request.path) for request in requests],

@@ -16,12 +16,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.compilation import clock
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import AXIS_BITS, KEY_BITS
@@ -110,12 +110,12 @@ def fit(
         )
     if view.shape != (3,) or not np.isfinite(view).all():
         raise ModelError(f'viewpoint: {viewpoint!r}, expected three finite numbers')
-    laps = [perf_counter()]
+    laps = [clock()]
     thinned = thin(points.reshape(-1, 3), config.voxel_size_m)
-    laps.append(perf_counter())
+    laps.append(clock())
     grows = not is_paper(config) and config.kinds == 'all' and len(thinned.means) > 0
     model = (fit_points if grows else fit_means)(thinned, config, view, laps)
-    laps.append(perf_counter())
+    laps.append(clock())
     names = ('thin', 'cluster', 'merge', 'fit') if len(laps) == 5 else STAGES
     times = [1e3 * (end - start) for start, end in pairwise(laps)]
     return replace(model, milliseconds=dict(zip(names, times, strict=True)))
@@ -126,9 +126,9 @@ def fit_means(
 ) -> MultiModel:
     """Fit models to one point a voxel, as in the paper."""
     clusters = segment_cloud(thinned.means, config, view)
-    laps.append(perf_counter())
+    laps.append(clock())
     surfaces = merge_clusters(clusters, config, view) if config.kinds == 'all' else []
-    laps.append(perf_counter())
+    laps.append(clock())
     patches = fitted_patches(clusters, surfaces, config, view)
     model, labels = assembled(clusters, patches, config)
     return replace(model, labels=thinned.point_labels(labels))
@@ -143,14 +143,14 @@ def fit_points(
     if config.noise_m == config.noise_per_range_sq == 0.0:
         noise = estimate_noise(voxels, thinned.means, core, config.voxel_size_m, view)
         config = replace(config, noise_m=min(noise[0], 1.0), noise_per_range_sq=min(noise[1], 1.0))
-    laps.append(perf_counter())
+    laps.append(clock())
     rows = np.flatnonzero(core)
     clusters = segment_cloud(thinned.means[rows], config, view)
-    laps.append(perf_counter())
+    laps.append(clock())
     surfaces = merge_clusters(clusters, config, view)
-    laps.append(perf_counter())
+    laps.append(clock())
     patches = fitted_patches(clusters, surfaces, config, view)
-    laps.append(perf_counter())
+    laps.append(clock())
     label, group = np.full((2, len(core)), -1, np.int32)
     at = rows[clusters.order]
     group[at] = np.repeat(np.arange(len(clusters), dtype=np.int32), clusters.num_points)
@@ -169,7 +169,7 @@ def fit_points(
         view,
     )
     joined = grow_sparse(thinned, voxels, found, config, view)
-    laps.append(perf_counter())
+    laps.append(clock())
     fitted = owner_patches(joined, config, view)
     lost = np.array([patch is None for patch in fitted], np.bool_)
     if lost.any() and joined is not found:
