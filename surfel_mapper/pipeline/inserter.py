@@ -186,8 +186,8 @@ class Inserter:
     def warm_up_stages(self, config: Config) -> list[CompileStage]:
         """Return the stages that compile kernels; see Mapper.warm_up_stages."""
         return [
-            *self.preparation.warm_up_stages(config),
             *reduction_stages(config),
+            *self.preparation.warm_up_stages(config),
             *self.layers.warm_up_stages(),
         ]
 
