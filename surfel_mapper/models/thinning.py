@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from surfel_mapper.filters.grids import ScanVoxels
 from surfel_mapper.models.growth import VoxelPoints
+from surfel_mapper.models.kernels.voxel_means import average_voxels, finite_ends, voxel_keys
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -69,38 +70,33 @@ class Thinned:
 
 def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:
     """Return the means of the points (N, 3) in each voxel."""
-    xyz = np.array(points.T, np.float64, order='C')  # rows of one axis: four times as fast
-    finite = np.flatnonzero(np.isfinite(xyz[0]) & np.isfinite(xyz[1]) & np.isfinite(xyz[2]))
-    if not len(finite):
+    points, ends = np.require(points, None, ['C', 'W']), np.empty((2, 3))
+    number = finite_ends(points, ends)
+    if not number:
         none = np.empty(0, np.int64)
         rows, bits = none.astype(np.int32), np.zeros(3, np.int64)
         return Thinned(np.empty((0, 3)), points, rows, np.zeros(1, np.int64), none, bits)
-    xyz = xyz if len(finite) == len(points) else xyz[:, finite]
-    grid = ScanVoxels.over(xyz.T, np.full(3, voxel_size_m), 'origin')
-    order, starts, keys = sorted_by_key(voxel_keys(xyz, grid))
-    number = np.diff(starts)
-    voxel = np.repeat(np.arange(len(number)), number)
-    means = np.stack([np.bincount(voxel, x[order]) for x in xyz], axis=1) / number[:, None]
-    return Thinned(means, points, finite[order].astype(np.int32), starts, keys, grid.bits)
+    grid = ScanVoxels.between(ends[0], ends[1], np.full(3, voxel_size_m), 'origin')
+    ordered, to_key, long_keys = sorted_keys(points, grid, number)
+    rows, starts = np.empty(number, np.int32), np.empty(number + 1, np.int64)
+    keys, means = np.empty(number, np.int64), np.empty((number, 3))
+    num = average_voxels(points, ordered, to_key, rows, starts, keys, means)
+    keys = keys[:num].copy() if long_keys is None else long_keys[keys[:num]]
+    return Thinned(means[:num].copy(), points, rows, starts[: num + 1].copy(), keys, grid.bits)
 
 
-def voxel_keys(xyz: Array, grid: ScanVoxels) -> Indices:
-    """Return the keys (N,) of the voxels of points (3, N)."""
-    keys, to_axis = np.zeros(xyz.shape[1], np.int64), 0
-    for axis, x in enumerate(xyz):
-        index = np.floor(x / grid.size[axis] - grid.shift[axis]) - grid.base[axis]
-        keys |= index.astype(np.int64) << to_axis
-        to_axis += int(grid.bits[axis])
-    return keys
+def sorted_keys(
+    points: npt.NDArray[Any], grid: ScanVoxels, number: int
+) -> tuple[Indices, int, Indices | None]:
+    """
+    Return key and row of each finite point as one number, sorted, and the bits of a row.
 
-
-def sorted_by_key(keys: Indices) -> tuple[Indices, Indices, Indices]:
-    """Return rows (P,) sorted by key, stably, first rows of different keys, and P, and these."""
-    to_key = len(keys).bit_length()
-    if int(keys.max()).bit_length() + to_key <= 63:  # one sort of numbers is three times as fast
-        order = np.sort(keys << to_key | np.arange(len(keys))) & ((1 << to_key) - 1)
-    else:
-        order = np.argsort(keys, kind='stable')
-    keys = keys[order]
-    first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-    return order, np.append(first, len(keys)), keys[first]
+    Keys that leave no room for rows are replaced by their ranks; they are returned too, ascending.
+    """
+    keys, rows = np.empty(number, np.int64), np.empty(number, np.int64)
+    voxel_keys(points, (np.stack([grid.size, grid.shift, grid.base]), grid.bits), keys, rows)
+    to_key, long_keys = len(points).bit_length(), None
+    if int(grid.bits.sum()) + to_key > 63:
+        long_keys, ranks = np.unique(keys, return_inverse=True)
+        keys = ranks.astype(np.int64)
+    return np.sort(keys << to_key | rows), to_key, long_keys

@@ -53,6 +53,7 @@ REFERENCES = {
     'models/kernels/surfel_classes.py': 'models/kernels/test_surfels.py',
     'models/kernels/surfel_groups.py': 'models/kernels/test_surfels.py',
     'models/kernels/surfel_links.py': 'models/kernels/test_surfels.py',
+    'models/kernels/voxel_means.py': 'models/test_thinning.py',
     'models/kernels/voxel_points.py': 'models/kernels/test_growth.py',
     'pipeline/kernels/polygons.py': 'pipeline/test_regions.py',
     'sensors/kernels/depth.py': 'sensors/test_depth.py',
