@@ -95,7 +95,8 @@ def sorted_keys(
     """
     keys, rows = np.empty(number, np.int64), np.empty(number, np.int64)
     voxel_keys(points, (np.stack([grid.size, grid.shift, grid.base]), grid.bits), keys, rows)
-    to_key, long_keys = len(points).bit_length(), None
+    to_key = len(points).bit_length()
+    long_keys: Indices | None = None
     if int(grid.bits.sum()) + to_key > 63:
         long_keys, ranks = np.unique(keys, return_inverse=True)
         keys = ranks.astype(np.int64)
