@@ -93,7 +93,8 @@ def sorted_keys(
 
     Keys that leave no room for rows are replaced by their ranks; they are returned too, ascending.
     """
-    keys, rows = np.empty(number, np.int64), np.empty(number, np.int64)
+    keys: Indices = np.empty(number, np.int64)
+    rows: Indices = np.empty(number, np.int64)
     voxel_keys(points, (np.stack([grid.size, grid.shift, grid.base]), grid.bits), keys, rows)
     to_key = len(points).bit_length()
     long_keys: Indices | None = None
