@@ -16,6 +16,7 @@ import pytest
 
 from surfel_mapper import show, SurfelMap
 from surfel_mapper.viz.turning_view import MAX_SHOWN, SURFEL
+from test import extras
 from test.viz.test_report import plane
 from test.viz.test_report_browser import BROWSER, browser, num_coloured, picture_until, WAIT_S
 
@@ -79,6 +80,7 @@ def test_other_things_are_refused():
         show(np.zeros((3, 3)))
 
 
+@extras.needs('playwright')
 @pytest.mark.skipif(BROWSER is None, reason='no browser on the PATH')
 def test_the_frame_is_drawn(browser, tmp_path):
     content = f'<!doctype html><html><body>{show(plane(30))._repr_html_()}</body></html>'

@@ -45,9 +45,8 @@ WAIT_S = 180.0
 def browser():
     # root, as in containers, cannot have the sandbox
     root = ('--no-sandbox',) if os.geteuid() == 0 else ()
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as started:
+    playwright = extras.load('playwright.sync_api')
+    with playwright.sync_playwright() as started:
         chromium = started.chromium.launch(
             executable_path=BROWSER, args=[*SOFTWARE_GL, *root], timeout=1000 * WAIT_S
         )
