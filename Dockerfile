@@ -12,7 +12,7 @@ SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 # numba, rosbags and mcap have no apt packages on Ubuntu 24.04, and packages of the system stay as they are.
 # hadolint ignore=DL3008
 RUN apt-get update && apt-get install -y --no-install-recommends \
-        python3-matplotlib python3-numpy python3-pil python3-scipy python3-tqdm python3-venv \
+        python3-argcomplete python3-matplotlib python3-numpy python3-pil python3-scipy python3-tqdm python3-venv \
         python3-yaml ros-jazzy-launch-ros ros-jazzy-nav-msgs ros-jazzy-tf2-msgs \
         ros-jazzy-visualization-msgs \
     && rm -rf /var/lib/apt/lists/* \
@@ -21,10 +21,11 @@ RUN apt-get update && apt-get install -y --no-install-recommends \
         'numba>=0.61' 'rosbags>=0.11.7,<0.12' 'mcap>=1.1'
 COPY . /ros2_ws/src/surfel_mapper
 WORKDIR /ros2_ws
+RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select surfel_mapper
 ENV PATH=/opt/surfel_mapper_venv/bin:$PATH NUMBA_CACHE_DIR=/var/cache/surfel_mapper
-# Kernels are compiled here, for the processor that builds; another one compiles its own.
-RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select surfel_mapper \
-    && source install/setup.bash && python3 -m surfel_mapper.cli.main compile
+# Kernels are compiled for the processor that builds the image; another kind compiles its own.
+RUN source /opt/ros/jazzy/setup.bash && source install/setup.bash \
+    && python3 -m surfel_mapper.cli.main compile
 WORKDIR /data
 ENTRYPOINT ["/bin/bash", "-c", \
     "source /opt/ros/jazzy/setup.bash && source /ros2_ws/install/setup.bash && exec \"$@\"", "--"]

@@ -108,7 +108,6 @@ TEST = [
     'pytest-xdist>=3.7',  # several processes: those of ROS wait, those of the others calculate
     'plyfile>=1.0.1',  # an independent reader of what we write
     'pypcd4>=1.1',  # likewise
-    'mcap>=1.1',  # an independent writer of what we read
 ]
 
 # All that the tests need, with optional packages that take 1.1 GB more: `make test-extras`.
