@@ -20,7 +20,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import ConfigError, FileFormatError, MapError, refusing
+from surfel_mapper.errors import (
+    ConfigError,
+    FileFormatError,
+    MapError,
+    NotInMapError,
+    refusing,
+)
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels.layout import MAX_MAP_COUNT
@@ -146,13 +152,32 @@ def load_map(
         )
         for scan in scans:
             held.insert(scan.moments)
-        surfel_map.copy().subtract(held)  # checks that every scan can be evicted
+        check_held(surfel_map.moments(), held.moments())
     digest = surfel_map.digest()
     if digest != attributes.get('digest'):
         raise FileFormatError(
             f'{path}: damaged: digest {digest}, expected {attributes.get("digest")}'
         )
     return surfel_map, scans
+
+
+def check_held(whole: ScanMoments, held: ScanMoments) -> None:
+    """
+    Raise NotInMapError unless a map holds all points of its window, so that they can be evicted.
+
+    Both are sorted by voxel, as ``SurfelMap.moments`` returns them.
+    """
+    rows = np.minimum(np.searchsorted(whole.key, held.key), max(len(whole) - 1, 0))
+    is_held = np.zeros(len(held), np.bool_)
+    if len(whole):
+        num_others = whole.count[rows] - held.count
+        is_equal = (whole.total[rows] == held.total).all(axis=1)
+        is_equal &= (whole.product[rows] == held.product).all(axis=1)
+        is_equal &= (whole.view[rows] == held.view).all(axis=1)
+        is_held = (whole.key[rows] == held.key) & ((num_others > 0) | (num_others == 0) & is_equal)
+    if not is_held.all():
+        voxel = held.voxel_index[np.argmin(is_held)].tolist()
+        raise NotInMapError(f'voxel {voxel} does not hold the points of its window')
 
 
 def load_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap, list[WindowedScan]]:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import WindowConfig
-from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.map_state import load_map, load_moments, save_map
+from surfel_mapper.errors import FileFormatError, NotInMapError
+from surfel_mapper.files.map_state import check_held, load_map, load_moments, save_map
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
@@ -198,3 +198,23 @@ def test_contents_that_no_map_can_have_are_refused(tmp_path, damage):
 
     with pytest.raises(FileFormatError, match='damaged'):
         load_map(tmp_path / 'map.npz')
+
+
+@pytest.mark.parametrize(
+    'points',
+    [[0.1, 0.2, 0.3, 0.4], [0.1, 0.2, 0.31], [0.1, 0.2, 0.9]],
+    ids=['more points', 'another sum', 'another voxel'],
+)
+def test_a_window_of_points_that_the_map_does_not_hold_is_refused(points):
+    surfel_map, held, other = (SurfelMap(0.5) for _ in range(3))
+    surfel_map.add(np.outer([0.1, 0.2, 0.3], np.ones(3)))
+    for number in range(4):
+        held.clear()
+        held.add(np.outer([0.1, 0.2, 0.3][:number], np.ones(3)).reshape(-1, 3))
+        check_held(surfel_map.moments(), held.moments())
+
+    other.add(np.outer(points, np.ones(3)))
+    with pytest.raises(NotInMapError, match='does not hold the points of its window'):
+        check_held(surfel_map.moments(), other.moments())
+    with pytest.raises(NotInMapError):
+        check_held(SurfelMap(0.5).moments(), other.moments())
