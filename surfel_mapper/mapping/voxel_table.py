@@ -42,9 +42,6 @@ from surfel_mapper.mapping.storage import HashTable, Slab
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries, enough for 6e9 voxels."""
 
-Sums = tuple[npt.NDArray[np.int64], ...]
-"""Keys (K,), count (K,), total (K, 3), product (K, 6), view (K, 3)."""
-
 Change = tuple[int, npt.NDArray[np.int32]]
 """A version, and the rows that it changed."""
 
@@ -103,13 +100,14 @@ class VoxelTable:
             If there is no memory for the voxels. The table is unchanged.
 
         """
-        rows, sums = np.empty(len(moments), np.int32), wide_sums(moments)
+        rows = np.empty(len(moments), np.int32)
         num_added, self._version = 0, version
         try:
-            while (num_added := self._add(sums, num_added, rows)) < len(moments):
+            while (num_added := self._add(moments, num_added, rows)) < len(moments):
                 self._make_room()
         except BaseException:
-            self._subtract(tuple(values[:num_added] for values in sums), rows[:num_added], 1)
+            added = slice(0, num_added)
+            self._subtract(moments.select(added), rows[added], 1)
             raise
         if self._channels:
             self._channels.array[rows.astype(np.intp)] += moments.channels
@@ -142,7 +140,7 @@ class VoxelTable:
         else:
             rows = np.array(moments.rows, np.int32)  # hints, confirmed by the kernel
         self._version = version
-        missing, fallen = self._subtract(wide_sums(moments), rows, max(min_points, 1))
+        missing, fallen = self._subtract(moments, rows, max(min_points, 1))
         if missing < 0 and self._channels:
             self._channels.array[rows.astype(np.intp)] -= moments.channels
         return missing, rows, fallen
@@ -224,23 +222,23 @@ class VoxelTable:
         num = rows_held(self.rows.array, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
-    def _add(self, sums: Sums, start: int, found: npt.NDArray[np.int32]) -> int:
+    def _add(self, moments: ScanMoments, start: int, found: npt.NDArray[np.int32]) -> int:
         """Add moments from a voxel on, as far as there is room; see add_moments."""
         stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
         done: int = add_moments(
-            *(sums, self.rows.array, stamps, table),
+            *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
             *(self._state, stamp_of(self._version), start, found),
         )
         return done
 
     def _subtract(
-        self, sums: Sums, found: npt.NDArray[np.int32], min_points: int
+        self, moments: ScanMoments, found: npt.NDArray[np.int32], min_points: int
     ) -> tuple[int, npt.NDArray[np.int32]]:
         """Subtract moments without channels; see remove_moments."""
         fallen: npt.NDArray[np.int32] = np.empty((len(found), 3), np.int32)
         stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
         missing, num_fallen = remove_moments(
-            *(sums, self.rows.array, stamps, table),
+            *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
             *(self._state, stamp_of(self._version), found, min_points, fallen),
         )
         return missing, fallen[:num_fallen]
@@ -305,18 +303,6 @@ class ChangeLog:
             return None
         changes = [*takewhile(lambda change: change[0] > version, reversed(self._entries))]
         return table.changed_at(changes, min_points)
-
-
-def wide_sums(moments: ScanMoments) -> Sums:
-    """
-    Return the moments of a scan as int64, with sums of views.
-
-    Kernels of one type compile half as much as those of both; the copy takes 2 % of a scan.
-    """
-    key, count, total, product, view = (
-        np.require(values, np.int64, ['C', 'W']) for values in moments.arrays
-    )
-    return key, count, total, product, view if moments.view_is_sum else view * count[:, None]
 
 
 def stamp_of(version: int) -> int:

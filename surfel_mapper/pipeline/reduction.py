@@ -223,8 +223,13 @@ def compile_adding(config: Config) -> SurfelMap:
     """Compile reducing and adding points; return the map of one."""
     surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
     columns = {name: np.zeros(1) for name in CHANNELS}
-    surfel_map.insert(surfel_map.reduce(np.zeros((1, 3)), columns=columns))
+    surfel_map.insert(surfel_map.reduce(np.zeros((1, 3), expected_type(config)), columns=columns))
     return surfel_map
+
+
+def expected_type(config: Config) -> npt.DTypeLike:
+    """Return the type of the points of most sensors: deskewing moves them in double precision."""
+    return np.float64 if config.deskew.enabled else np.float32
 
 
 def compile_deriving(config: Config) -> None:
@@ -240,6 +245,6 @@ def compile_removing(config: Config) -> None:
     """Compile removing points, and the digest."""
     surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
     columns = {name: np.zeros(1) for name in CHANNELS}
-    moments = surfel_map.add(np.zeros((1, 3)), columns=columns)
+    moments = surfel_map.add(np.zeros((1, 3), expected_type(config)), columns=columns)
     surfel_map.digest()
     surfel_map.remove(moments)

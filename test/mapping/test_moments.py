@@ -319,5 +319,6 @@ def test_packed_keys_sort_as_voxel_indices_and_unpack_again(indices):
 
 
 def test_arrays_that_fit_the_kernels_are_not_copied():
-    points = np.zeros((5, 3), order='F')
-    assert np.shares_memory(as_points(points), points)
+    for dtype in (np.float32, np.float64):
+        points = np.zeros((5, 3), dtype, order='F')
+        assert np.shares_memory(as_points(points), points)

@@ -15,6 +15,7 @@ import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part, U
 from surfel_mapper.kernels.layout import KEY, PRODUCT
+from surfel_mapper.kernels.prefetch import LINE_BYTES, prefetch_to_write
 from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.kernels.symmetric3 import decompose_one
 from surfel_mapper.mapping.kernels.rows import (
@@ -34,6 +35,9 @@ AHEAD = 16
 
 EARLY = CHUNK
 """Number of rows between the early prefetch of a row and its use."""
+
+LINE = LINE_BYTES // 8
+"""Numbers of 64 bits in a cache line."""
 
 EXACT_BITS = 54
 """A second moment of n points of b bits is below n 4^(b - 1), so float64 holds it exactly for
@@ -66,9 +70,11 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     values, normals, shape = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((2, CHUNK))
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     unit = voxel_size / (1 << bits)
+    vectors = outputs[0].ravel(), outputs[1].ravel(), outputs[4].ravel()
+    written = *vectors, outputs[2], outputs[3], outputs[5], outputs[6].ravel()
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
-        most = gather(rows, chosen, start, num, keys, moments)
+        most = gather(rows, chosen, start, num, keys, moments, written)
         center(moments, num, mean, scatter)
         if most >= many:
             center_exactly(rows, chosen, start, num, scatter)
@@ -76,18 +82,43 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
             xx, xy, xz = scatter[0, i], scatter[1, i], scatter[2, i]
             yy, yz, zz = scatter[3, i], scatter[4, i], scatter[5, i]
             (e0, e1, e2), (nx, ny, nz) = decompose_one(xx, xy, xz, yy, yz, zz)
-            trace = (e0 + e1) + e2
-            inverse = 1.0 / trace if trace > 0.0 else math.inf  # 0 times inf is nan, as documented
-            planarity = 2.0 * (e1 - e0) * inverse
-            side = side_of(nx, ny, nz, moments[V, i], moments[V + 1, i], moments[V + 2, i])
-            side = math.nan if math.isnan(planarity) else side
-            normals[0, i], normals[1, i], normals[2, i] = nx * side, ny * side, nz * side
-            shape[0, i], shape[1, i] = planarity, e0 * inverse
+            values[0, i], values[1, i], values[2, i] = e0, e1, e2
+            normals[0, i], normals[1, i], normals[2, i] = nx, ny, nz
+        for i in range(num):
+            e0, e1, e2 = values[0, i], values[1, i], values[2, i]
+            inverse = 1.0 / ((e0 + e1) + e2)
+            shape[0, i], shape[1, i] = 2.0 * (e1 - e0) * inverse, e0 * inverse
             scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
             values[0, i], values[1, i], values[2, i] = e0 * scale, e1 * scale, e2 * scale
+        for i in range(num):
+            nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
+            side = side_of(nx, ny, nz, moments[V, i], moments[V + 1, i], moments[V + 2, i])
+            side = math.nan if math.isnan(shape[0, i]) else side
+            normals[0, i], normals[1, i], normals[2, i] = nx * side, ny * side, nz * side
         write_surfels(
             start, num, keys, moments, mean, normals, values, shape, voxel_size, bits, outputs
         )
+
+
+@part()
+def prefetch_outputs(written, row):
+    """
+    Prefetch the memory of LINE surfels from a row on, to be written.
+
+    written  position, normal and eigenvalues, each (3 K,) float64; planarity and curvature (K,)
+             float64; num_points (K,) int64; voxel_index (3 K,) int32
+    """
+    position, normal, eigenvalues, planarity, curvature, num_points, voxel_index = written
+    for line in range(3):
+        at = min(3 * row + LINE * line, len(position) - 1)
+        prefetch_to_write(position, at)
+        prefetch_to_write(normal, at)
+        prefetch_to_write(eigenvalues, at)
+    prefetch_to_write(planarity, row)
+    prefetch_to_write(curvature, row)
+    prefetch_to_write(num_points, row)
+    prefetch_to_write(voxel_index, 3 * row)
+    prefetch_to_write(voxel_index, min(3 * row + 2 * LINE, len(voxel_index) - 1))
 
 
 @part()
@@ -159,7 +190,7 @@ def derive_covariances(rows, chosen, voxel_size, bits, covariance):
     unit = voxel_size / (1 << bits)
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
-        most = gather(rows, chosen, start, num, keys, moments)
+        most = gather(rows, chosen, start, num, keys, moments, None)
         center(moments, num, mean, scatter)
         if most >= many:
             center_exactly(rows, chosen, start, num, scatter)
@@ -170,16 +201,19 @@ def derive_covariances(rows, chosen, voxel_size, bits, covariance):
 
 
 @part()
-def gather(rows, chosen, start, num, keys, moments):
+def gather(rows, chosen, start, num, keys, moments, written):
     """
     Gather the moments of num voxels from start on; return the largest count.
 
     keys     (CHUNK,) int64, out
     moments  (MOMENTS, CHUNK) float64, out
+    written  arrays that are written next, see prefetch_outputs; None for others
     """
     flat, last = rows.ravel(), len(chosen) - 1
     most = np.int64(0)
     for i in range(num):
+        if written is not None and i % LINE == 0:
+            prefetch_outputs(written, start + i)
         prefetch_row_early(flat, np.int64(chosen[min(start + i + EARLY, last)]))
         prefetch_row(flat, np.int64(chosen[min(start + i + AHEAD, last)]))
         at = first_word(chosen[start + i])

@@ -130,15 +130,16 @@ def find_rows(keys, rows, table, state, found):
 
 
 @kernel()
-def add_moments(moments, rows, stamps, table, state, stamp, start, found):
+def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, found):
     """
     Add the moments of the voxels of a scan from start on; return the first that was not added.
 
-    moments  int64: keys (K,), count (K,), total (K, 3), product (K, 6), view (K, 3), sums all
-    stamps   (R,) uint32, out: the last change of each row
-    stamp    uint32, of this change; see kernels/layout.py
-    start    int64, the first voxel to add
-    found    (K,) int32, out: row of each voxel
+    moments      keys (K,) int64, count (K,), total (K, 3), product (K, 6), view (K, 3)
+    view_weight  0: the view is multiplied by the count; 1: it is a sum already
+    stamps       (R,) uint32, out: the last change of each row
+    stamp        uint32, of this change; see kernels/layout.py
+    start        int64, the first voxel to add
+    found        (K,) int32, out: row of each voxel
 
     Returns K if all were added. Otherwise slab, segments or directory have no room for a voxel:
     make room and continue from there.
@@ -169,8 +170,8 @@ def add_moments(moments, rows, stamps, table, state, stamp, start, found):
             insert_entry(hashed, row, directory, buckets, held, depth)
             num_new += 1
             clear_row(flat, first_word(row), key)
-        num_points += count[voxel]
-        change_row(words, flat, first_word(row), voxel, 1)
+        num_points += np.int64(count[voxel])
+        change_row(words, view_weight, flat, first_word(row), voxel, 1)
         found[voxel] = row
     state[POINTS] += num_points
     state[VOXELS] += num_new
@@ -211,11 +212,13 @@ def free_row(flat, at, following, later):
 
 
 @kernel()
-def remove_moments(moments, rows, stamps, table, state, stamp, found, min_points, fallen):
+def remove_moments(
+    moments, view_weight, rows, stamps, table, state, stamp, found, min_points, fallen
+):
     """
     Subtract moments, or nothing if a voxel does not hold its own; free the rows that get empty.
 
-    moments     as of add_moments
+    moments, view_weight  as of add_moments
     stamps      (R,) uint32, out: the last change of each row
     stamp       uint32, of this change; see kernels/layout.py
     found       (K,) int32, in: row of each voxel, or a hint of it; out: the row
@@ -242,14 +245,14 @@ def remove_moments(moments, rows, stamps, table, state, stamp, found, min_points
         if place + U(EARLY) < num:
             prefetch_row_early(flat, np.int64(found[place + U(EARLY)]))
             prefetch_row(flat, np.int64(found[place + U(AHEAD)]))
-        key, n = keys[place], count[place]
+        key, n = keys[place], np.int64(count[place])
         row = np.int64(found[place])
         if not (0 <= row < len(rows) and is_voxel(flat, first_word(row), key)):
             row = find_row(key, rows, table, depth)
             found[place] = row
         at = first_word(max(row, 0))
         held = count_of(flat, at) if row >= 0 else np.int64(-1)
-        if held < n or (held == n and not holds_exactly(words, flat, at, place)):
+        if held < n or (held == n and not holds_exactly(words, view_weight, flat, at, place)):
             missing = np.int64(place)
             break
         if held >= min_points > held - n:
@@ -264,13 +267,13 @@ def remove_moments(moments, rows, stamps, table, state, stamp, found, min_points
             emptied[U(num_emptied)], hashes[U(num_emptied)] = place, hash_key(key)
             num_emptied += 1
         else:
-            change_row(words, flat, at, place, -1)
+            change_row(words, view_weight, flat, at, place, -1)
         num_points += n
     if missing >= 0:
         for i in range(num_emptied - 1, -1, -1):
             links = flat[first_word(found[U(emptied[i])]) + U(FREE)]
             state[FREE_ROW] = (links & LOW) - 1
-        put_back(keys, words, flat, found, missing)
+        put_back(keys, words, view_weight, flat, found, missing)
         return missing, 0
     state[POINTS] -= num_points
     state[VOXELS] -= num_emptied
@@ -294,13 +297,13 @@ def is_voxel(flat, at, key):
 
 
 @part()
-def put_back(keys, words, flat, found, stop):
+def put_back(keys, words, view_weight, flat, found, stop):
     """Add the moments of the first voxels to their rows again, also to emptied ones."""
     for place in range(U(stop)):
         at = first_word(found[place])
         if count_of(flat, at) == 0:
             clear_row(flat, at, keys[place])
-        change_row(words, flat, at, place, 1)
+        change_row(words, view_weight, flat, at, place, 1)
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -319,26 +322,29 @@ def words_of(moments):
 
 
 @njit(cache=True, nogil=True, inline='always')
-def change_row(words, flat, at, place, sign):
+def change_row(words, view_weight, flat, at, place, sign):
     """Add the moments of a voxel, as words_of returns them, to its row; subtract with sign -1."""
     count, total, product, view = words
+    n = np.int64(count[place])
+    weight = sign * (n if view_weight == 0 else np.int64(1))
     x, y, z = U(3) * place, U(3) * place + U(1), U(3) * place + U(2)
-    sums = sign * total[x], sign * total[y], sign * total[z]
-    views = sign * view[x], sign * view[y], sign * view[z]
-    add_to_row(flat, at, sign * count[place], sums, views)
+    sums = sign * np.int64(total[x]), sign * np.int64(total[y]), sign * np.int64(total[z])
+    views = weight * np.int64(view[x]), weight * np.int64(view[y]), weight * np.int64(view[z])
+    add_to_row(flat, at, sign * n, sums, views)
     for pair in range(U(6)):
         flat[at + U(PRODUCT) + pair] += sign * product[U(6) * place + pair]
 
 
 @part()
-def holds_exactly(words, flat, at, place):
+def holds_exactly(words, view_weight, flat, at, place):
     """Return whether the sums of a row are the moments of a voxel, as words_of returns them."""
-    _, total, product, view = words
+    count, total, product, view = words
+    weight = np.int64(count[place]) if view_weight == 0 else np.int64(1)
     x, y, z = view_of(flat, at)
     first = U(3) * place
-    equal = x == view[first]
-    equal &= y == view[first + U(1)]
-    equal &= z == view[first + U(2)]
+    equal = x == weight * view[first]
+    equal &= y == weight * view[first + U(1)]
+    equal &= z == weight * view[first + U(2)]
     for axis in range(3):
         equal &= sum_of(flat, at, axis) == total[first + U(axis)]
     for pair in range(U(6)):

@@ -47,7 +47,7 @@ class Memory:
         changed = np.full(len(moments[0]), -1, np.int32)
         done = self.call(
             add_moments,
-            *(moments, self.rows, self.stamps, self.table, self.state),
+            *(moments, 1, self.rows, self.stamps, self.table, self.state),
             *(2 * version, start, changed),
         )
         return done, changed[start:done].tolist()
@@ -63,7 +63,7 @@ class Memory:
         found = self.find(moments[0]) if hints is None else hints
         missing, num = self.call(
             remove_moments,
-            *(moments, self.rows, self.stamps, self.table, self.state),
+            *(moments, 1, self.rows, self.stamps, self.table, self.state),
             *(2 * version, found, min_points, fallen),
         )
         if missing < 0:
