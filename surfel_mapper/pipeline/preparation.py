@@ -30,6 +30,7 @@ from surfel_mapper.mapping.channels import checked_channels, missing_columns
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.local_map import LocalMap
 from surfel_mapper.pipeline.prepared import FilteredScan, Prepared
+from surfel_mapper.pipeline.reduction import expected_type
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
@@ -134,8 +135,8 @@ class Preparation:
         """Return the stages that compile the kernels of preparation, as far as it uses any."""
         stages = []
         if self.chain.filters:
-            dtype = np.float64 if config.deskew.enabled else np.float32
-            stages.append(CompileStage('filters', partial(self.chain.warm_up, dtype)))
+            warm_up = partial(self.chain.warm_up, expected_type(config))
+            stages.append(CompileStage('filters', warm_up))
         if config.deskew.enabled:
             stages.append(CompileStage('deskewing', warm_up_deskewing))
         if self._poses.registered is not None:

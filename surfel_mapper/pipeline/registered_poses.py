@@ -32,6 +32,7 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.map_part import ApartMap, LEAST_SCANS, MapPart, MOST_SCANS, Sighting
 from surfel_mapper.pipeline.prepared import Prepared
+from surfel_mapper.pipeline.reduction import expected_type
 from surfel_mapper.pipeline.surroundings import SurroundingMotion
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
@@ -138,6 +139,7 @@ class RegisteredPoses:
     def warm_up(self) -> None:
         """Compile the kernels."""
         points = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 3))
+        points = points.astype(expected_type(self._config))
         surfel_map = SurfelMap(self._config.map.voxel_size_m)
         surfel_map.add(points)
         cells = self._registration.cells(points)

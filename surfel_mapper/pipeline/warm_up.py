@@ -22,6 +22,7 @@ from surfel_mapper.messages.pointcloud2 import warm_up as warm_up_decoding
 from surfel_mapper.messages.scan_normals import scan_with_normals
 from surfel_mapper.messages.surfel_markers import disc_colors, surfel_markers
 from surfel_mapper.pipeline.mapper import Mapper
+from surfel_mapper.pipeline.reduction import expected_type
 from surfel_mapper.scan import Scan
 
 
@@ -39,7 +40,7 @@ def node_stages(mapper: Mapper) -> list[CompileStage]:
 def compile_messages(config: Config) -> None:
     """Compile the kernels of outgoing messages, and load their libraries by running them once."""
     surfel_map = SurfelMap(config.map.voxel_size_m)
-    points = np.ones((1, 3), np.float64 if config.deskew.enabled else np.float32)
+    points = np.ones((1, 3), expected_type(config))
     moments = surfel_map.add(points)
     surfels = surfel_map.surfels()
     scan_with_normals(Scan(points=points, stamp_ns=0, frame_id=''), np.eye(4), surfel_map, 1)
