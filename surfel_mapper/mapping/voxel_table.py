@@ -106,8 +106,9 @@ class VoxelTable:
             while (num_added := self._add(moments, num_added, rows)) < len(moments):
                 self._make_room()
         except BaseException:
-            added = slice(0, num_added)
-            self._subtract(moments.select(added), rows[added], 1)
+            for start in range(0, num_added, 1024):  # in parts: there may be no memory for more
+                part = slice(start, min(start + 1024, num_added))
+                self._subtract(moments.select(part), rows[part], 1)
             raise
         if self._channels:
             self._channels.array[rows.astype(np.intp)] += moments.channels

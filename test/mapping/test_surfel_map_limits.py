@@ -164,7 +164,7 @@ few, many = reduced(1000, 5.0), reduced(400_000, 400.0)
 surfel_map.insert(few)
 alone.insert(many)  # compiles the growing
 before, num_points = surfel_map.digest(), surfel_map.num_points
-for left in (0, 5_000_000, 20_000_000):
+for left in (0, 5_000_000, 24_000_000):
     used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + left, resource.RLIM_INFINITY))
     try:
