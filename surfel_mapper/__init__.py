@@ -83,6 +83,14 @@ def __getattr__(name: str) -> Any:
     return value
 
 
+def _map_formats() -> Any:
+    """Load the file formats of maps, for SurfelMap.save and SurfelMap.load."""
+    return import_module(f'{__name__}.files.maps')
+
+
+import_module(f'{__name__}.map_formats').register(_map_formats)
+
+
 def __dir__() -> list[str]:
     """Return the public names, loaded or not."""
     return sorted({*globals(), *__all__})

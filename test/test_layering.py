@@ -3,8 +3,9 @@
 """
 A module imports its own folder and lower levels, and each foreign package has one home.
 
-Reads the imports from the source, including those inside functions, so that nothing has to be
-installed and no lazy import is missed. Each test lists everything that is wrong, not the first.
+Reads the imports from the source, including those inside functions and those by name
+(``import_module``), so that nothing has to be installed and no lazy import is missed.
+Each test lists everything that is wrong, not the first.
 """
 
 from __future__ import annotations
@@ -13,17 +14,16 @@ import ast
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+import re
 import sys
 from typing import NamedTuple
-
-import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'surfel_mapper'
 
 LEVELS = (
     {'compilation', 'errors', 'memory'},
-    {'arguments', 'budget', 'kernels'},
+    {'arguments', 'budget', 'kernels', 'map_formats'},
     {'config', 'counters', 'geometry', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},
@@ -124,7 +124,7 @@ def parsed(path: Path) -> Source:
     """Parse a file, once for all tests."""
     text = path.read_text(encoding='utf-8')
     tree = ast.parse(text)
-    names, settings = [], []
+    names, settings = imports_by_name(tree), []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
@@ -136,6 +136,32 @@ def parsed(path: Path) -> Source:
     classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
     docstring = ast.get_docstring(tree) or ''
     return Source(names, classes, docstring, text.count('\n'), settings)
+
+
+def imports_by_name(tree: ast.Module) -> list[str]:
+    """
+    Return the modules of this package that a file imports by name.
+
+    A name that is completed at run time stands for its folder, ``surfel_mapper.filters.*``. A
+    variable stands for all names of modules in the file.
+    """
+    arguments = [
+        node.args[0]
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and getattr(node.func, 'attr', getattr(node.func, 'id', ''))
+        in ('import_module', '__import__', 'find_spec', 'run_module')
+    ]
+    texts = [node for argument in arguments for node in ast.walk(argument)]
+    if any(isinstance(argument, ast.Name) for argument in arguments):
+        texts = list(ast.walk(tree))
+    names = [
+        node.value.partition(':')[0]
+        for node in texts
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    words = [name for name in names if re.fullmatch(r'surfel_mapper(\.\w+)+\.?', name)]
+    return [f'{name}*' if name.endswith('.') else name for name in words]
 
 
 def is_layer_setting(node: ast.Attribute) -> bool:
@@ -199,16 +225,47 @@ def test_only_layers_and_their_parts_read_the_settings_of_layers():
 
 
 def test_no_modules_import_each_other_in_a_circle():
-    dotted = {dotted_name(name): path for name, path in MODULES.items()}
+    assert circle({dotted_name(name): imports(path) for name, path in MODULES.items()}) == []
+
+
+def circle(imported: dict[str, list[str]]) -> list[str]:
+    """
+    Return the modules of a circle, given the names that each module imports.
+
+    A name that is completed at run time adds nothing: a registry loads its own folder by it.
+    """
     graph = {}
-    for name, path in dotted.items():
-        named = imports(path)
-        modules = {each if each in dotted else each.rpartition('.')[0] for each in named}
-        graph[name] = (modules & dotted.keys()) - {name}
+    for name, named in imported.items():
+        whole = [other for other in named if not other.endswith('*')]
+        modules = {other if other in imported else other.rpartition('.')[0] for other in whole}
+        graph[name] = (modules & imported.keys()) - {name}
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
-        pytest.fail(' -> '.join(error.args[1]))
+        return list(error.args[1])
+    return []
+
+
+BY_NAME = (
+    ("import_module('surfel_mapper.files.maps')", ['surfel_mapper.files.maps']),
+    ("def f():\n    return __import__('surfel_mapper.files')", ['surfel_mapper.files']),
+    ("importlib.import_module(f'surfel_mapper.filters.{name}')", ['surfel_mapper.filters.*']),
+    ("HOME = 'surfel_mapper.files.maps:save'\nimport_module(HOME)", ['surfel_mapper.files.maps']),
+    ("import_module('bond.msg')", []),
+)
+
+
+def test_imports_by_name_are_read():
+    assert [text for text, names in BY_NAME if imports_by_name(ast.parse(text)) != names] == []
+
+
+def test_an_import_by_name_closes_a_circle_and_goes_up():
+    text = "def _files():\n    return import_module('surfel_mapper.files.maps')"
+    upward = imports_by_name(ast.parse(text))
+    lower, higher = 'surfel_mapper.mapping.surfel_map', 'surfel_mapper.files.maps'
+
+    assert set(circle({lower: upward, higher: [f'{lower}.SurfelMap']})) == {lower, higher}
+    assert len(faults('mapping/surfel_map.py', upward)) == 1
 
 
 def dotted_name(module: str) -> str:
@@ -271,9 +328,6 @@ def test_no_two_classes_share_a_name():
             if not name.startswith('_'):
                 homes.setdefault(name, []).append(module)
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
-
-
-"""Lines of a module outside of which its docstring says why it stands alone, or is one."""
 
 
 def test_every_folder_has_a_docstring():

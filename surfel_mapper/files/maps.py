@@ -3,8 +3,8 @@
 """
 SurfelMap.save and SurfelMap.load: the format of a map by the suffix of its file.
 
-From a directory the exact map is loaded that was written last, as the verbs do. The module stands
-alone because it joins the formats, which do not import each other.
+From a directory the exact map is loaded that was written last, as the verbs do. The package
+registers this module (map_formats.py).
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ import functools
 from importlib import import_module
 from importlib.metadata import entry_points
 import logging
+from pathlib import Path
 import pkgutil
 import re
 from typing import overload, TypeVar
@@ -90,8 +91,7 @@ def _register(cls: F, *, name: str, libpointmatcher: str) -> F:
 @functools.cache
 def load_built_in() -> None:
     """Register the filters of this folder."""
-    package = import_module('surfel_mapper.filters')
-    for module in pkgutil.iter_modules(package.__path__):
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
         import_module(f'surfel_mapper.filters.{module.name}')
 
 

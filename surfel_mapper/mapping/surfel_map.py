@@ -4,7 +4,7 @@
 SurfelMap: a hashed voxel map of exact, reversible surfels.
 
 Points come in and are reduced to integer moments; surfels with normals go out, derived from the
-moments of the voxels asked for; files hold either. The moments themselves, their exact addition
+moments of the voxels asked for. The moments themselves, their exact addition
 and removal, and the limits of the map are in moment_map.py.
 
 The work is done in moment_map, reducer, surfels and moments.
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from importlib import import_module
 import logging
 import math
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper import map_formats
 from surfel_mapper.arguments import as_array, as_numbers, as_path, as_whole
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels import layout
@@ -44,16 +44,6 @@ Box = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 
 
 _log = logging.getLogger(__name__)
-
-
-def _files() -> Any:
-    """
-    Return the module that saves and loads maps.
-
-    Files are above this level of the package; it is named here, as the package names the homes of
-    its public names, so that the class has the methods that users look for.
-    """
-    return import_module('surfel_mapper.files.maps')
 
 
 def _rebuilt(
@@ -370,7 +360,7 @@ class SurfelMap(MomentMap):
             If the file cannot be read, is damaged or not exact.
 
         """
-        found: SurfelMap = _files().load_surfel_map(as_path(path))
+        found: SurfelMap = map_formats.registered().load_surfel_map(as_path(path))
         return found
 
     def save(self, path: str | Path) -> str:
@@ -389,7 +379,8 @@ class SurfelMap(MomentMap):
             If the suffix is another, or the file cannot be written.
 
         """
-        return str(_files().save_surfel_map(as_path(path), self))
+        digest: str = map_formats.registered().save_surfel_map(as_path(path), self)
+        return digest
 
     def __reduce__(self) -> Any:
         """Pickle the exact state; ``copy`` and ``deepcopy`` use it too."""
