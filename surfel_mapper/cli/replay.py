@@ -229,7 +229,7 @@ def replay_options(args: argparse.Namespace) -> ReplayOptions:
 
 def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     """Map recordings into one map, with the workers that were asked for."""
-    from surfel_mapper.offline.replay import ALL_SCANS
+    from surfel_mapper.offline.replay import all_scans
 
     given = [name for name in ONE_PROCESS if getattr(args, name)]
     if given:
@@ -237,7 +237,7 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
             f'--{given[0]}: not with several bags, --workers or --scheduler, where no process '
             'maps all scans in order'
         )
-    config = with_filters(args).replace(ALL_SCANS)
+    config = with_filters(args).replace(all_scans())
     output = output_directory(args.bags[0], args.output)
     from surfel_mapper.cluster.replay import replay_bags
 

@@ -28,7 +28,7 @@ from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.offline.bag_recording import add_cloud, add_poses, BagRecording
 from surfel_mapper.offline.outputs import ScanTrajectory
 from surfel_mapper.offline.recording import open_recording
-from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.offline.replay import all_scans
 from surfel_mapper.offline.request import Request
 from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s
 from surfel_mapper.pipeline.update import Update
@@ -43,7 +43,7 @@ LEAD_S = 1.0
 """Time before the oldest pose that a worker may need, s."""
 
 SETTINGS: dict[str, Any] = {
-    **ALL_SCANS,
+    **all_scans(),
     'layers.tsdf.enabled': False,
     'layers.models.enabled': False,
 }

@@ -14,7 +14,7 @@ too.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_whole, check_kind
-from surfel_mapper.config import WindowConfig
+from surfel_mapper.config import settings_of, WindowConfig
 from surfel_mapper.mapping.moments import point_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
@@ -85,8 +85,7 @@ class Eviction:
     ----------
     scan : WindowedScan
     limit : str
-        The limit that it exceeded: max_scans, max_age_s, max_distance_m, max_bytes, max_voxels
-        or max_total_bytes.
+        Name in LIMITS of the limit that it exceeded.
     fallen : (E, 3) int32
         Indices of the voxels that fell below min_points, the number of points of a surfel.
 
@@ -154,8 +153,6 @@ class SlidingWindow:
     max_total_bytes : int
         Scans are evicted while the voxels and the kept scans need more bytes; 0 means no such
         limit.
-    keeps_scans : bool
-        Whether scans are kept for the sake of that limit alone.
 
     """
 
@@ -172,7 +169,6 @@ class SlidingWindow:
         self.config = config or WindowConfig()
         self.max_voxels = as_whole('max_voxels', max_voxels)
         self.max_total_bytes = 0
-        self.keeps_scans = False
         self._map = surfel_map
         self._scans: deque[tuple[WindowedScan, float]] = deque()
         self._reset()
@@ -238,7 +234,7 @@ class SlidingWindow:
         evicted = []
         while len(self._scans) > 1 and (limit := self._limit_reached()):
             evicted.append(self._evict(limit, min_points))
-        while len(self._scans) > 1 and self._keeps_nothing:
+        while len(self._scans) > 1 and not self.keeps_scans:
             self._nbytes -= self._scans.popleft()[0].nbytes
             self._num_settled += 1
         return evicted
@@ -356,11 +352,14 @@ class SlidingWindow:
         self._nbytes += scan.nbytes
 
     @property
-    def _keeps_nothing(self) -> bool:
-        """Whether no limit can evict a scan and points are not kept."""
-        config = self.config
-        limits = (config.max_scans, config.max_age_s, config.max_distance_m, config.max_bytes)
-        return not (any(limits) or self.max_voxels or config.keep_points or self.keeps_scans)
+    def keeps_scans(self) -> bool:
+        """Whether scans are kept: some limit can evict them, or their points are wanted."""
+        return self.config.keep_points or any(self._largest(name) for name in LIMITS)
+
+    def _largest(self, name: str) -> float:
+        """Return the value of a limit; 0 means no such limit."""
+        value: float = getattr(self.config if name in SETTINGS else self, name)
+        return value
 
     def _evict(self, limit: str, min_points: int) -> Eviction:
         scan, _ = self._scans[0]
@@ -370,22 +369,33 @@ class SlidingWindow:
         return Eviction(scan=scan, limit=limit, fallen=fallen)
 
     def _limit_reached(self) -> str:
-        """Return the name of a limit that the oldest scan exceeds, or an empty string."""
-        config = self.config
-        (oldest, travelled_m), (newest, _) = self._scans[0], self._scans[-1]
-        age_ns = newest.stamp_ns - oldest.stamp_ns
-        num_voxels = self._map.num_voxels
-        total_bytes = num_voxels * VOXEL_BYTES + self._nbytes
-        limits = {
-            'max_scans': (len(self._scans), config.max_scans),
-            'max_age_s': (age_ns, round(config.max_age_s * 1e9)),
-            'max_distance_m': (self._travel.travelled_m - travelled_m, config.max_distance_m),
-            'max_bytes': (self._nbytes, config.max_bytes),
-            'max_voxels': (num_voxels, self.max_voxels),
-            'max_total_bytes': (total_bytes, self.max_total_bytes),
-        }
-        reached = (name for name, (value, limit) in limits.items() if 0 < limit < value)
-        return next(reached, '')
+        """Return the name of the first limit that is exceeded, or an empty string."""
+        for name, measure in LIMITS.items():
+            largest = self._largest(name)
+            if largest and measure(self) > largest:
+                return name
+        return ''
+
+
+LIMITS: dict[str, Callable[[SlidingWindow], float]] = {
+    'max_scans': lambda window: len(window._scans),
+    'max_age_s': lambda window: (
+        (window._scans[-1][0].stamp_ns - window._scans[0][0].stamp_ns) / 1e9
+    ),
+    'max_distance_m': lambda window: window._travel.travelled_m - window._scans[0][1],
+    'max_bytes': lambda window: window.nbytes,
+    'max_voxels': lambda window: window._map.num_voxels,
+    'max_total_bytes': lambda window: window._map.num_voxels * VOXEL_BYTES + window.nbytes,
+}
+"""
+The limits of a window with two scans or more, and the measure that each limits.
+
+The oldest scan is evicted while a measure is larger than the value of its limit: the setting of
+this name in WindowConfig, or the attribute of SlidingWindow.
+"""
+
+SETTINGS = tuple(declared.key for declared in settings_of(WindowConfig) if declared.key in LIMITS)
+"""The limits that are settings."""
 
 
 def checked_scans(scans: Iterable[WindowedScan]) -> list[WindowedScan]:

@@ -11,7 +11,7 @@ inside functions, so that ``surfel_mapper.replay`` loads neither rosbags nor mat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -33,15 +33,6 @@ if TYPE_CHECKING:
     from surfel_mapper.offline.request import Request
     from surfel_mapper.pipeline import Mapper, Update
     from surfel_mapper.viz.viewer import Viewer
-
-ALL_SCANS: Mapping[str, Any] = {
-    'window.max_scans': 0,
-    'window.max_age_s': 0.0,
-    'window.max_distance_m': 0.0,
-    'window.max_bytes': 0,
-    'map.max_bytes': 0,
-}
-"""Settings with which no scan leaves the map."""
 
 REPLAY_THREADS = 2
 """Threads of a replay if there are the cores: one reduces the next scan."""
@@ -238,7 +229,14 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
         from surfel_mapper.threads import usable_cores
 
         settings = settings.replace({'map.threads': min(usable_cores(), REPLAY_THREADS)})
-    return settings if options.window else settings.replace(ALL_SCANS)
+    return settings if options.window else settings.replace(all_scans())
+
+
+def all_scans() -> dict[str, Any]:
+    """Return the settings with which no scan leaves the map: no limit of the window."""
+    from surfel_mapper.mapping.window import SETTINGS
+
+    return {**{f'window.{name}': 0 for name in SETTINGS}, 'map.max_bytes': 0}
 
 
 @contextmanager

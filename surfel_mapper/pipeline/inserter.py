@@ -130,10 +130,10 @@ class Inserter:
 
     def _set_limits(self, config: Config) -> None:
         """Set the limits of the window."""
-        wanted = config.map.max_bytes
         self.window.config = config.window
-        self.window.max_total_bytes = machine_bytes() // 2 if wanted < 0 else wanted
-        self.window.keeps_scans = wanted > 0
+        self.window.max_total_bytes = max(config.map.max_bytes, 0)
+        if config.map.max_bytes < 0 and self.window.keeps_scans:
+            self.window.max_total_bytes = machine_bytes() // 2
 
     def clear(self) -> None:
         """Empty map, window and layers."""

@@ -26,7 +26,7 @@ from surfel_mapper.mapping.channels import CHANNELS, summed_columns
 from surfel_mapper.mapping.moments import point_keys, ScanMoments
 from surfel_mapper.mapping.reducer import within
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.mapping.window import SETTINGS, WindowedScan
 from surfel_mapper.pipeline.prepared import FilteredScan
 from surfel_mapper.scan import Scan
 from surfel_mapper.threads import pool
@@ -212,9 +212,7 @@ def warm_up_stages(config: Config) -> list[CompileStage]:
         CompileStage('adding scans', partial(compile_adding, config)),
         CompileStage('deriving surfels', partial(compile_deriving, config)),
     ]
-    window = config.window
-    of_window = window.max_scans, window.max_age_s, window.max_distance_m, window.max_bytes
-    if any((*of_window, config.map.max_bytes)):
+    if config.map.max_bytes or any(getattr(config.window, name) for name in SETTINGS):
         stages.append(CompileStage('removing scans', partial(compile_removing, config)))
     return stages
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 from surfel_mapper.cluster.shards import cut
 from surfel_mapper.config import Config
 from surfel_mapper.offline.recording import open_recording
-from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.offline.replay import all_scans
 from surfel_mapper.offline.request import Request
 from surfel_mapper.pipeline import Mapper
 from test.bags.recorded import drive, START_NS, write_rosbag2
@@ -109,7 +109,7 @@ def shards_of(bag, config, shard_s, **part):
 
 def in_one_go(bag, config, **part):
     """Return the mapper that has mapped a whole bag, all scans kept."""
-    with open_recording(request(bag, config, **part), config.replace(ALL_SCANS)) as recording:
+    with open_recording(request(bag, config, **part), config.replace(all_scans())) as recording:
         mapper = Mapper(recording.config)
         for _ in recording.replay(mapper):
             pass

@@ -12,7 +12,7 @@ from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.errors import BagError
 from surfel_mapper.offline.bag_recording import feed
 from surfel_mapper.offline.pose_sources import pose_topics
-from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.offline.replay import all_scans
 from test.bags.recorded import (
     CLOUD,
     drive,
@@ -33,7 +33,7 @@ MOUNTED = {'frames.base_to_sensor': [*MOUNT_M, 0.0, 0.0, 0.0, 1.0]}
 
 def mapped(path, settings, pose_topic=None, cloud_topic='/points'):
     """Replay a bag and return the mapper."""
-    mapper = Mapper(Config.from_mapping({**ALL_SCANS, **settings}))
+    mapper = Mapper(Config.from_mapping({**all_scans(), **settings}))
     with BagReader(path) as reader:
         poses = pose_topics(reader.topics, mapper.config, pose_topic)
         for _ in feed(reader, mapper, cloud_topic, poses):

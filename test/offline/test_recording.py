@@ -17,7 +17,7 @@ from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.trajectory import write_tum
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.offline.recording import open_recording
-from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.offline.replay import all_scans
 from surfel_mapper.offline.request import Request
 from test.bags.recorded import (
     CLOUD,
@@ -42,7 +42,7 @@ MOUNTED = {'frames.base_to_sensor': [*MOUNT_M, *NO_TURN]}
 
 def mapped(path, settings=None, **request):
     """Map a recording and return the mapper."""
-    config = Config.from_mapping({**ALL_SCANS, **(settings or {})})
+    config = Config.from_mapping({**all_scans(), **(settings or {})})
     with open_recording(Request(path=path, **request), config) as recording:
         mapper = Mapper(recording.config)
         for _ in recording.replay(mapper):
@@ -414,7 +414,7 @@ def test_scans_whose_poses_are_not_known_are_refused(tmp_path, number, format_, 
 
 
 def test_stopping_ends_after_the_scan_at_hand(bag):
-    config = Config.from_mapping(ALL_SCANS)
+    config = Config.from_mapping(all_scans())
     with open_recording(Request(path=bag), config) as recording:
         mapper = Mapper(recording.config)
         for _ in recording.replay(mapper, stopped=lambda: mapper.counters.mapped == 2):

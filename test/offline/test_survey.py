@@ -11,7 +11,7 @@ from surfel_mapper import Config, Mapper
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.offline.bag_recording import feed
 from surfel_mapper.offline.pose_sources import pose_topics
-from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.offline.replay import all_scans
 from surfel_mapper.offline.survey import offers, survey
 from test.bags.recorded import (
     CLOUD,
@@ -54,7 +54,7 @@ def test_every_source_is_offered_and_its_settings_map_every_scan(tmp_path):
     assert [offer.settings['pose.source'] for offer in made] == ['tf', 'odometry', 'pose']
     for offer in made:
         assert (offer.covered, offer.total, offer.missing) == (NUM_SCANS, NUM_SCANS, '')
-        mapper = Mapper(Config.from_mapping({**ALL_SCANS, **offer.settings}))
+        mapper = Mapper(Config.from_mapping({**all_scans(), **offer.settings}))
         with BagReader(path) as reader:
             poses = pose_topics(reader.topics, mapper.config, offer.poses)
             assert sum(1 for _ in feed(reader, mapper, offer.clouds, poses)) == NUM_SCANS
