@@ -17,8 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
+import logging
 import math
 import struct
 from typing import Any
@@ -49,6 +50,11 @@ MAX_FIELDS = 1024
 
 FIELD_BYTES = 400
 """Memory of a field: its object, its name and its place in a dictionary."""
+
+MAX_WARNED = 64
+"""Number of warnings about layouts that are kept, to give each once."""
+
+_log = logging.getLogger(__name__)
 
 DATATYPES = {np.dtype(name): datatype for datatype, name in DTYPES.items()}
 
@@ -101,7 +107,8 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
     ------
     CloudFormatError
         If sizes, fields and data do not fit together, x, y or z is missing, or the stamp is
-        invalid.
+        invalid. Packed points are read whatever ``row_step`` says, and bytes after the points are
+        ignored, each with one warning.
 
     """
     if not hasattr(msg, 'header'):
@@ -140,21 +147,42 @@ def bytes_of(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
 def checked_data(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
     """Return the data of a message; raise CloudFormatError if sizes do not agree."""
     data = bytes_of(msg, topic)
-    height, width, point_step = int(msg.height), int(msg.width), int(msg.point_step)
-    row_step = int(msg.row_step)
-    if len(data) != row_step * height:
-        raise CloudFormatError(
-            f'{topic}: {len(data)} bytes of data, expected row_step * height = '
-            f'{row_step} * {height} = {row_step * height}'
-        )
+    width, height, point_step = int(msg.width), int(msg.height), int(msg.point_step)
     if point_step == 0 and width * height > 0:
         raise CloudFormatError(f'{topic}: point_step is 0, expected the bytes of one point')
-    if point_step * width > row_step:
+    stated, row_step = int(msg.row_step), row_bytes(msg, len(data))
+    size = row_step * height
+    if len(data) < size or row_step < width * point_step:
         raise CloudFormatError(
-            f'{topic}: row_step is {row_step}, expected at least point_step * width = '
-            f'{point_step} * {width} = {point_step * width}'
+            f'{topic}: {len(data)} bytes of data, expected row_step * height = {stated} * '
+            f'{height} = {stated * height}, and at least point_step * width * height = '
+            f'{point_step} * {width} * {height} = {point_step * width * height}'
         )
+    if row_step != stated:
+        warn_of_layout(topic, f'row_step is {stated}, read as point_step * width = {row_step}')
+    elif len(data) > size:
+        warn_of_layout(topic, f'the {len(data) - size} bytes of data after its points are ignored')
     return data
+
+
+def row_bytes(msg: Any, num_bytes: int) -> int:
+    """
+    Return the bytes of a row: ``row_step``, or those of its points if the data is packed.
+
+    Drivers write 0, the width, or the size of all data into the row_step of packed points.
+    """
+    row_step, height = int(msg.row_step), int(msg.height)
+    packed_step = int(msg.point_step) * int(msg.width)
+    if packed_step <= row_step and row_step * height <= num_bytes:
+        return row_step
+    is_packed = num_bytes == packed_step * height or (height == 1 and num_bytes > packed_step)
+    return packed_step if is_packed else row_step
+
+
+@lru_cache(maxsize=MAX_WARNED)
+def warn_of_layout(topic: str, problem: str) -> None:
+    """Warn once of a cloud that is read though its sizes disagree."""
+    _log.warning('%s: %s', topic, problem)
 
 
 def checked_fields(msg: Any, topic: str, budget: Budget) -> dict[str, Field]:
@@ -233,9 +261,10 @@ class Points:
         """Return the points of a message whose sizes have been checked."""
         height, width, point_step = int(msg.height), int(msg.width), int(msg.point_step)
         order = '>' if msg.is_bigendian else '<'
-        if height == 1 or msg.row_step == width * point_step:
+        row_step = row_bytes(msg, len(data))
+        if height == 1 or row_step == width * point_step:
             return cls(data, (height * width,), (point_step,), order)
-        return cls(data, (height, width), (int(msg.row_step), point_step), order)
+        return cls(data, (height, width), (row_step, point_step), order)
 
     def view(self, offset: int, dtype: npt.DTypeLike, count: int = 1) -> npt.NDArray[Any]:
         """Return a view of the items at an offset in every point, (..., count) if count > 1."""
@@ -492,7 +521,7 @@ def append_fields(
     height, width, step = int(msg.height), int(msg.width), int(msg.point_step)
     data = np.frombuffer(msg.data, np.uint8)
     points: npt.NDArray[Any] = np.ndarray(
-        (height, width), f'V{step}', data, 0, (int(msg.row_step), step)
+        (height, width), f'V{step}', data, 0, (row_bytes(msg, len(data)), step)
     )
     offset = -(-step // WORD_BYTES) * WORD_BYTES
     added = f'V{words.shape[1] * WORD_BYTES}'

@@ -24,7 +24,14 @@ import pytest
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.mapping.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.messages.pointcloud2 import Field, from_columns, parse_cloud, to_scan
+from surfel_mapper.messages.pointcloud2 import (
+    append_fields,
+    Field,
+    from_columns,
+    parse_cloud,
+    to_scan,
+    warn_of_layout,
+)
 from test.bags.recorded import CLOUD, Entries, ROS1, ROS2
 from test.messages.examples import make_surfels
 
@@ -202,9 +209,9 @@ INVALID = {
     'count beyond': ({'fields': [Field('i', 0, 2, 2**32 - 1)]}, 'ends at byte 4294967295'),
     'two x': ({'fields': [Field('x', 0, 7, 1), Field('x', 4, 7, 1)]}, 'two fields .* differ'),
     'data short': ({'data': bytes(35)}, '35 bytes of data, expected .* 36 \\* 1 = 36'),
-    'data long': ({'data': bytes(37)}, '37 bytes of data'),
+    'padded rows short': ({'height': 3, 'row_step': 40, 'data': bytes(119)}, '119 bytes of data'),
     'no data': ({'data': b''}, '0 bytes of data'),
-    'row_step': ({'row_step': 35, 'data': bytes(35)}, 'row_step is 35, expected .* 12 \\* 3 = 36'),
+    'row_step': ({'row_step': 35, 'data': bytes(35)}, '35 bytes .* 12 \\* 3 \\* 1 = 36'),
     'height': ({'height': 2}, 'expected row_step \\* height = 36 \\* 2 = 72'),
     'no point_step': ({'point_step': 0}, 'point_step is 0'),
     'huge': (
@@ -222,6 +229,37 @@ def test_an_invalid_message_is_refused_by_topic_found_and_expected(name):
     changes, expected = INVALID[name]
     with pytest.raises(CloudFormatError, match=f'/lidar: .*{expected}'):
         to_scan(replace(message(XYZ, 12), **changes), '/lidar')
+
+
+@pytest.mark.parametrize('row_step', [0, 4, 144, 2**32 - 1])
+@pytest.mark.parametrize('height', [1, 3])
+def test_packed_points_are_read_whatever_row_step_says(row_step, height, caplog):
+    msg = message(XYZ, 12, width=12 // height, height=height)
+    warn_of_layout.cache_clear()
+    for _ in range(2):
+        scan = to_scan(replace(msg, row_step=row_step), '/lidar')
+        np.testing.assert_array_equal(scan.points, to_scan(msg).points)
+    is_true = row_step == msg.row_step
+    assert [r.message.partition(',')[0] for r in caplog.records] == (
+        [] if is_true else [f'/lidar: row_step is {row_step}']
+    )
+
+
+@pytest.mark.parametrize(('height', 'row_step'), [(1, 36), (1, 0), (3, 36), (3, 40)])
+def test_bytes_after_the_points_are_ignored_with_a_warning(height, row_step, caplog):
+    msg = message(XYZ, 12, width=3, height=height, padding=max(row_step - 36, 0))
+    warn_of_layout.cache_clear()
+    longer = replace(msg, row_step=row_step, data=bytes(msg.data) + bytes(100))
+    np.testing.assert_array_equal(to_scan(longer).points, to_scan(msg).points)
+    assert len(caplog.records) == 1
+
+
+def test_fields_are_appended_to_packed_points_whatever_row_step_says():
+    msg, words = message(XYZ, 12, width=4, height=2), np.arange(8, dtype=np.uint32)[:, None]
+    expected = append_fields(msg, words, [('n', 6, 1)])
+    np.testing.assert_array_equal(
+        append_fields(replace(msg, row_step=0), words, [('n', 6, 1)]).data, expected.data
+    )
 
 
 def test_data_that_is_not_contiguous_is_refused():
