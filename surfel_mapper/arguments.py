@@ -9,11 +9,15 @@ attributes raise others, or name variables that the caller does not know.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+MAX_SQUARE_ERROR = 1e-2
+"""Tolerance of the squared norm of a quaternion, that of tf2: 0.71 0.71 of launch files passes."""
 
 
 def as_array(name: str, values: npt.ArrayLike) -> npt.NDArray[Any]:
@@ -121,3 +125,8 @@ def check_kind(name: str, value: object, *kinds: type, hint: str = '') -> None:
         raise TypeError(
             f'{name}: a {type(value).__name__}, expected a {names}{": " if hint else ""}{hint}'
         )
+
+
+def is_unit(q_xyzw: Iterable[float], tolerance: float = MAX_SQUARE_ERROR) -> bool:
+    """Return whether the squared norm of a quaternion is 1 within a tolerance."""
+    return abs(sum(value * value for value in q_xyzw) - 1.0) <= tolerance

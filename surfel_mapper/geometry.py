@@ -23,13 +23,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_array
+from surfel_mapper.arguments import as_array, is_unit
 
 Transform = npt.NDArray[np.float64]
 """A (4, 4) float64 matrix; takes points in frame b to frame a if called T_a_b."""
-
-MAX_NORM_ERROR = 1e-3
-"""Tolerance of the norm of a quaternion: larger deviations are not rounding but errors."""
 
 MAX_SKEW = 1e-4
 """Tolerance of the orthonormality of a rotation; matrices of float32 are within 1e-6."""
@@ -60,7 +57,8 @@ def pose_matrix(xyz: Iterable[float], q_xyzw: Iterable[float]) -> Transform:
     Raises
     ------
     ValueError
-        If a number is missing or not finite, or the norm of the quaternion is not 1 +- 1e-3.
+        If a number is missing or not finite, or the square of the norm of the quaternion is not
+        1 +- 1e-2.
 
     """
     try:
@@ -77,7 +75,7 @@ def pose_matrix(xyz: Iterable[float], q_xyzw: Iterable[float]) -> Transform:
     if not all(map(math.isfinite, t + q)):
         raise ValueError(f'pose {t} {q}: expected finite numbers')
     norm = math.sqrt(((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3])
-    if abs(norm - 1.0) > MAX_NORM_ERROR:
+    if not is_unit(q):
         raise ValueError(f'quaternion {q} has norm {norm:.6g}, expected 1 (order x y z w)')
     x, y, z, w = (v / norm for v in q)
     rows = [

@@ -90,11 +90,18 @@ def test_a_quaternion_a_little_off_unit_length_is_normalised():
     )
 
 
+@pytest.mark.parametrize('q', [(0, 0, 0.71, 0.71), (0, 0, -0.7035, -0.7072)])
+def test_a_quaternion_is_taken_as_tf2_takes_it(q):
+    quarter_turn = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    np.testing.assert_allclose(pose_matrix([0, 0, 0], q)[:3, :3], quarter_turn, atol=6e-3)
+
+
 @pytest.mark.parametrize(
     ('xyz', 'q', 'named'),
     [
         ([0, 0, 0], [0, 0, 0, 0], 'norm 0,'),
-        ([0, 0, 0], [0, 0, 0, 0.998], 'norm 0.998'),
+        ([0, 0, 0], [0, 0, 0, 0.994], 'norm 0.994'),
+        ([0, 0, 0], [0, 0, 0, 1.006], 'norm 1.006'),
         ([0, 0, 0], [1, 0, 0, 1], 'norm 1.41421'),
         ([0, math.nan, 0], [0, 0, 0, 1], 'finite'),
         ([0, 0, 0], [0, math.inf, 0, 1], 'finite'),

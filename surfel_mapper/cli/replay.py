@@ -19,6 +19,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from surfel_mapper.arguments import is_unit
 from surfel_mapper.cli._arguments import (
     add_formats,
     add_overwrite,
@@ -163,7 +164,7 @@ def mount(text: str) -> tuple[str, tuple[float, ...]]:
         numbers = tuple(float(number) for number in pose.split(','))
     except ValueError:
         numbers = ()
-    if not topic or len(numbers) != 7 or abs(math.hypot(*numbers[3:]) - 1.0) > 1e-3:
+    if not topic or len(numbers) != 7 or not is_unit(numbers[3:]):
         raise argparse.ArgumentTypeError(
             f'{text!r}, expected TOPIC=X,Y,Z,QX,QY,QZ,QW with a quaternion of norm 1'
         )

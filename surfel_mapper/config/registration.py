@@ -10,9 +10,9 @@ moves all scans of the window until they agree.
 from __future__ import annotations
 
 from dataclasses import dataclass
-import math
 from typing import ClassVar
 
+from surfel_mapper.arguments import is_unit
 from surfel_mapper.config.settings import setting, Stage
 from surfel_mapper.errors import ConfigError
 
@@ -76,9 +76,7 @@ class RegistrationConfig(Stage):
 
     def check(self, stage: str) -> None:
         """Refuse a start that is not a pose."""
-        if self.start and (
-            len(self.start) != 7 or not abs(math.hypot(*self.start[3:]) - 1.0) <= 1e-3
-        ):
+        if self.start and (len(self.start) != 7 or not is_unit(self.start[3:])):
             raise ConfigError(
                 f'{stage}.start: {list(self.start)}, expected x y z and a unit quaternion '
                 'qx qy qz qw, or nothing'

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import math
 from typing import ClassVar
 
+from surfel_mapper.arguments import is_unit
 from surfel_mapper.config.settings import read_number, setting, Stage
 from surfel_mapper.errors import ConfigError
 
@@ -237,7 +238,7 @@ class FramesConfig(Stage):
             )
         for first in range(0, len(values), 7):
             q_xyzw = values[first + 3 : first + 7]
-            if abs(math.hypot(*q_xyzw) - 1.0) > 1e-3:
+            if not is_unit(q_xyzw):
                 raise ConfigError(
                     f'{stage}.base_to_sensor: quaternion {list(q_xyzw)} has norm '
                     f'{math.hypot(*q_xyzw):.6g}, expected 1 (order x y z w)'

@@ -19,9 +19,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import MAX_SQUARE_ERROR
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.text_table import Rows
-from surfel_mapper.geometry import MAX_NORM_ERROR, orthogonality, pose_matrix
+from surfel_mapper.geometry import orthogonality, pose_matrix
 
 logger = logging.getLogger(__name__)
 
@@ -45,14 +46,15 @@ def quaternion_rows(rows: Rows, columns: list[int] | slice) -> Floats:
     Raises
     ------
     FileFormatError
-        With its line, if a row has other than finite numbers, or a norm other than 1 +- 1e-3.
+        With its line, if a row has other than finite numbers, or a squared norm other than
+        1 +- 1e-2.
 
     """
     found = rows.numbers(columns)
     with np.errstate(over='ignore'):
         x, y, z, w = np.square(found[:, 3:].T)
-        norm = np.sqrt(((x + y) + z) + w)  # in the order of pose_matrix, which refuses the same
-    for row in np.flatnonzero(np.abs(norm - 1.0) > MAX_NORM_ERROR)[:1].tolist():
+        square = ((x + y) + z) + w  # in the order of pose_matrix, which refuses the same
+    for row in np.flatnonzero(np.abs(square - 1.0) > MAX_SQUARE_ERROR)[:1].tolist():
         try:
             pose_matrix(found[row, :3], found[row, 3:].tolist())
         except ValueError as error:

@@ -70,7 +70,7 @@ class Trajectory:
         None for KITTI poses without a times.txt: pose i is that of scan i.
     xyz : (S, 3) float64, m
     q_xyzw : (S, 4) float64
-        Of norm 1 within 1e-3.
+        Of squared norm 1 within 1e-2.
 
     """
 

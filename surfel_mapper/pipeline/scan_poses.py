@@ -15,6 +15,7 @@ from functools import partial
 import math
 from typing import Any
 
+from surfel_mapper.arguments import is_unit
 from surfel_mapper.config import Config
 from surfel_mapper.errors import PoseError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
@@ -27,6 +28,10 @@ from surfel_mapper.sensors.deskew import deskewing
 
 MAX_EARLY = 100
 """Number of poses of the fixed frame itself that wait until ``map.origin: auto`` is known."""
+
+
+ROUNDING = 2e-3
+"""Error of the squared norm of a quaternion above which its normalisation is reported."""
 
 
 class ScanPoses:
@@ -57,6 +62,7 @@ class ScanPoses:
         self.origin = origin
         self._early: deque[tuple[str, str, int, Transform, bool]] = deque(maxlen=MAX_EARLY)
         self._mounted: set[str] = set()
+        self._warned_of_norm = False
         self.transforms = TransformBuffer(reset_after_s=config.input.reset_after_s)
         self._set_max_gap(config)
         self.registered: RegisteredPoses | None = None
@@ -82,7 +88,12 @@ class ScanPoses:
         """Add the pose of one frame in another; bad ones and too many are counted and logged."""
         forgotten = self.transforms.num_forgotten
         try:
+            q_xyzw = [*q_xyzw]
             self._add(parent, child, stamp_ns, pose_matrix(xyz, q_xyzw), static)
+            if not self._warned_of_norm and not is_unit(q_xyzw, ROUNDING):
+                self._warned_of_norm = True
+                text = f'pose of {child!r} in {parent!r}: quaternion {q_xyzw} is normalised'
+                self._drops.warn('bad_pose', text)
         except (PoseError, ValueError) as error:
             self._drops.message('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
         if number := self.transforms.num_forgotten - forgotten:

@@ -127,6 +127,20 @@ def test_a_bad_pose_is_counted_and_changes_nothing(xyz, q_xyzw, parent, child):
     assert mapper.map.digest() == digest_of((scan, pose_matrix((2.0, 0, 0), LEVEL)))
 
 
+def test_a_quaternion_of_two_digits_is_normalised_with_one_warning(caplog):
+    mapper = mapper_with(frames__base_to_sensor=())
+    add_pose(mapper, 1.0, 1.0)
+    for _ in range(2):
+        mapper.add_pose('base_link', 'lidar', 0, (0, 0, 1), (0, 0, 0.71, 0.71), static=True)
+    scan = scan_at(1.0)
+    insert(mapper, scan)
+    quarter_turn = pose_matrix((1.0, 0, 1.0), (0, 0, 0.5**0.5, 0.5**0.5))
+    assert mapper.map.digest() == digest_of((scan, quarter_turn))
+    assert [record.message for record in caplog.records] == [
+        "pose of 'lidar' in 'base_link': quaternion [0, 0, 0.71, 0.71] is normalised"
+    ]
+
+
 def test_transforms_that_are_too_many_are_counted(monkeypatch):
     monkeypatch.setattr(buffer_module, 'MAX_TRANSFORMS', 10)
     mapper = mapper_with()
