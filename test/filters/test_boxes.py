@@ -28,14 +28,6 @@ def clusters(centres, number=6, size=0.01, seed=3):
     return (np.asarray(centres) + offsets).reshape(-1, 3)
 
 
-@pytest.mark.parametrize('most', [3, 7, 100, 999, 1000])
-def test_every_box_holds_few_points_and_all_are_in_one(most):
-    rows, number = cut_into_boxes(cloud(), most)
-    counts = np.bincount(rows, minlength=number)
-    assert counts.max() <= most
-    assert counts.min() >= min((most + 1) // 2, 1000)  # half of one that held too many
-
-
 def slow_boxes(points, most):
     """Return the boxes as sets of rows, each cut with a full sort."""
     waiting = [(np.arange(len(points)), points.min(axis=0), points.max(axis=0))]
@@ -64,22 +56,6 @@ def test_boxes_are_those_of_a_slow_twin(most, steps, compiled):
         number = (cut if compiled else cut.py_func)(points, most, order, rows)
     found = {frozenset(np.flatnonzero(rows == box).tolist()) for box in range(number)}
     assert found == slow_boxes(points, most)
-
-
-def test_boxes_do_not_overlap():
-    points = cloud(200)
-    rows, number = cut_into_boxes(points, 10)
-    low = np.array([points[rows == box].min(axis=0) for box in range(number)])
-    high = np.array([points[rows == box].max(axis=0) for box in range(number)])
-    for box in range(number):
-        overlaps = ((low < high[box]) & (high > low[box])).all(axis=1)
-        assert overlaps.sum() == 1
-
-
-@pytest.mark.parametrize('number', [0, 1, 3])
-def test_few_points_are_in_one_box(number):
-    rows, boxes = cut_into_boxes(np.zeros((number, 3)), 3)
-    assert (rows.tolist(), boxes) == ([0] * number, min(number, 1))
 
 
 def test_points_at_one_place_are_cut_as_well():
@@ -139,10 +115,6 @@ def test_densities_are_points_over_the_ball_around_a_box(name):
     points = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])
     found = filter_of(name, samplingMethod=1, keepDensities=1).apply(scan_of(points))
     assert found.columns['densities'].tolist() == [pytest.approx(4 / (4 / 3 * np.pi))]
-
-
-def test_chance_keeps_all_where_the_share_is_1():
-    assert len(filter_of(SAMPLING, ratio=1).apply(scan_of(cloud(100)))) == 100
 
 
 @BOTH

@@ -131,11 +131,6 @@ def test_a_chain_can_be_made_of_filters_and_written_as_a_list():
     assert Chain.from_list([written]).filters == chain.filters
 
 
-def test_the_points_of_a_scan_come_out_of_an_empty_chain_untouched():
-    scan = scan_of(np.array([[np.nan, np.inf, 1.0]], np.float32))
-    assert Chain().run(scan) == (scan, ())
-
-
 def test_a_chain_is_read_from_text():
     chain = Chain.from_yaml("- RemoveNaNDataPointsFilter\n- voxel_grid: {vSizeX: '0.5'}\n")
     assert chain.names == ('1 remove_nan', '2 voxel_grid')

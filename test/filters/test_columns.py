@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,52 +12,9 @@ import pytest
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.base import generator, select, with_columns, with_points
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.filters.columns import LazyColumns
-from surfel_mapper.filters.merging import Kind, kind_of, MergedColumns, PointGroups
+from surfel_mapper.filters.merging import MergedColumns, PointGroups
 from surfel_mapper.scan import PointTimes
 from test.filters.examples import random_scan, scan_of
-
-
-class Counting(Mapping):
-    """Columns that count how often each is asked for."""
-
-    num_rows = 6
-
-    def __init__(self):
-        self.columns = {'a': np.arange(6), 'b': 10.0 * np.arange(6)}
-        self.asked = []
-
-    def __getitem__(self, name):
-        self.asked.append(name)
-        return self.columns[name]
-
-    def __iter__(self):
-        return iter(self.columns)
-
-    def __len__(self):
-        return len(self.columns)
-
-
-def test_selected_rows_of_selected_rows_are_taken_once_when_read():
-    counting = Counting()
-    scan = replace(scan_of(np.arange(18.0).reshape(6, 3)), columns=counting)
-    counting.asked.clear()
-    found = select(select(scan, np.arange(6) > 1), np.array([3, 0]))
-    assert counting.asked == []
-    assert found.columns['b'].tolist() == [50.0, 20.0]
-    assert found.columns['b'] is found.columns['b']
-    assert counting.asked == ['b']
-    np.testing.assert_array_equal(found.points[:, 0], [15.0, 6.0])
-
-
-def test_names_are_known_without_taking_columns():
-    columns = LazyColumns({'a': np.arange(3)}, np.array([1]), 1, {'c': np.ones(1)})
-    assert (list(columns), len(columns)) == (['a', 'c'], 2)
-    assert 'a' in columns
-    assert 'c' in columns
-    assert 'd' not in columns
-    with pytest.raises(KeyError):
-        columns['d']
 
 
 def test_new_columns_stand_in_place_of_old_ones_of_the_same_name():
@@ -126,10 +82,6 @@ def merged(column, **settings):
     return found
 
 
-def test_groups_know_their_first_points_and_sizes():
-    assert (GROUPS.first.tolist(), GROUPS.count.tolist()) == ([1, 0], [2, 3])
-
-
 @pytest.mark.parametrize('dtype', [np.float32, np.float64])
 def test_numbers_are_averaged(dtype):
     assert merged(np.array([1, 2, 3, 5, 8], dtype)).tolist() == [3.5, 4.0]
@@ -190,44 +142,10 @@ def test_unpacked_colours_are_averaged_and_rounded(dtype):
     assert merged(values, name='rgb').tolist() == [[2, 7], [255, 0]]  # 3/2 to even, 764/3, 1/3
 
 
-def test_unpacked_colours_of_floats_are_averaged():
-    values = np.array([[0.5], [0.25], [0.5], [0.5], [0.125]], np.float32)
-    assert merged(values, name='rgb').tolist() == [[0.375], [0.375]]
-
-
-def test_first_values_are_kept_without_averaging():
-    assert merged(np.array([1.0, 2.0, 3.0, 4.0, 5.0]), average=False).tolist() == [2.0, 1.0]
-
-
 def test_no_points_leave_no_rows():
     scan = scan_of(np.zeros((0, 3)), value=np.zeros((0, 4)), times=np.zeros(0, np.int64))
     found = MergedColumns(scan.columns, PointGroups.of(np.zeros(0, np.int64), 0))
     assert (found['value'].shape, found['times'].shape) == ((0, 4), (0,))
-
-
-@pytest.mark.parametrize(
-    ('name', 'dtype', 'kind'),
-    [
-        ('intensity', np.float32, Kind.NUMBER),
-        ('t', np.uint32, Kind.NUMBER),
-        ('t', np.int64, Kind.TIME),
-        ('normals', np.float32, Kind.DIRECTION),
-        ('rgb', np.float32, Kind.COLOUR),
-        ('label', np.float32, Kind.FIRST),
-        ('name', 'U4', Kind.FIRST),
-    ],
-)
-def test_the_kind_of_a_column_follows_its_name_or_its_type(name, dtype, kind):
-    assert kind_of(name, np.zeros(1, dtype)) is kind
-
-
-def test_columns_are_computed_when_read():
-    columns = {'a': np.arange(5.0), 'b': None}  # b could not be averaged
-    found = MergedColumns(columns, GROUPS)
-    assert (list(found), len(found), found.num_rows) == (['a', 'b'], 2, 2)
-    assert 'b' in found
-    assert found['a'].tolist() == [2.0, 2.0]
-    assert found['a'] is found['a']
 
 
 def test_points_can_be_selected_by_mask_or_by_rows():
@@ -240,12 +158,6 @@ def test_points_can_be_selected_by_mask_or_by_rows():
     assert by_mask.points.flags.f_contiguous
     with pytest.raises(ValueError, match=r'mask of shape \(3,\), expected \(4,\)'):
         select(scan, np.ones(3, np.bool_))
-
-
-def test_columns_are_added_to_a_copy():
-    scan = scan_of(np.zeros((1, 3)), a=[1])
-    found = with_columns(scan, b=np.array([2]))
-    assert (list(scan.columns), list(found.columns)) == (['a'], ['a', 'b'])
 
 
 def test_random_numbers_follow_seed_and_stamp_alone():

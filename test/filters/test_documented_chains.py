@@ -17,21 +17,6 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.filters.chain import Chain
 from test.filters.examples import scan_of
 
-CONVERT = """
-- BoundingBoxDataPointsFilter:
-   xMin: -4.0
-   xMax: 4.0
-   yMin: -4.0
-   yMax: 4.0
-   zMin: -4.0
-   zMax: 4.0
-   removeInside: 1
-- SamplingSurfaceNormalDataPointsFilter:
-    knn: 10
-- ObservationDirectionDataPointsFilter
-- OrientNormalsDataPointsFilter
-"""
-
 ICP = """
 readingDataPointsFilters:
   - RandomSamplingDataPointsFilter:
@@ -55,21 +40,6 @@ logger:
   FileLogger
 """
 
-EMPTY_ICP = """
-readingDataPointsFilters:
-  - IdentityDataPointsFilter
-referenceDataPointsFilters:
-  - IdentityDataPointsFilter
-matcher:
-  KDTreeMatcher
-"""
-
-DEVIATION = """
-- AddDescriptorDataPointsFilter:
-        descriptorName: deviation
-        descriptorDimension: 9
-        descriptorValues: [0.0009, 0, 0, 0, 0.0009, 0, 0, 0, 0.0009]
-"""
 
 MAPPER = """
 input:
@@ -112,13 +82,6 @@ mapper:
   sensorMaxRange: 200
 """
 
-INPUT = """
-input:
-  - RandomSamplingDataPointsFilter:
-      prob: 0.3
-      randomSamplingMethod: 1
-      seed: 0
-"""
 
 MAPPER_ROS = """
 input:
@@ -192,19 +155,9 @@ def run(tmp_path, text, *keys):
     return scan
 
 
-def test_the_chain_of_the_conversion_tutorial_cuts_the_box_and_turns_normals(tmp_path):
-    found = run(tmp_path, CONVERT)
-    assert (np.abs(found.points) >= 4.0).any(axis=1).all()
-    assert 0.35 < len(found) / len(room()) < 0.55
-    towards = (found.columns['normals'] * found.columns['observationDirections']).sum(axis=1)
-    assert (towards >= 0.0).all()
-
-
 def test_the_filters_of_the_registration_tutorial_thin_and_add_normals(tmp_path):
     assert abs(len(run(tmp_path, ICP, 'readingDataPointsFilters')) - 1500) < 150
     assert 'normals' in run(tmp_path, ICP, 'referenceDataPointsFilters').columns
-    found = run(tmp_path, EMPTY_ICP, 'readingDataPointsFilters', 'referenceDataPointsFilters')
-    np.testing.assert_array_equal(found.points, room().points)
 
 
 def test_modules_that_are_no_filters_of_points_are_refused_by_name(tmp_path):
@@ -214,21 +167,11 @@ def test_modules_that_are_no_filters_of_points_are_refused_by_name(tmp_path):
         run(tmp_path, ICP)
 
 
-def test_the_deviation_of_points_is_added(tmp_path):
-    found = run(tmp_path, DEVIATION)
-    np.testing.assert_allclose(
-        found.columns['deviation'].reshape(-1, 3, 3),
-        np.tile(0.0009 * np.eye(3), (3000, 1, 1)),
-        rtol=1e-6,
-    )
-
-
 def test_the_filters_of_the_mappers_examples_drop_the_robot_and_thin(tmp_path):
     found = run(tmp_path, MAPPER, 'input', 'post')
     x, y, z = found.points.T
     assert not ((np.abs(y) < 1.0) & (x > -1.5) & (x < 0.5) & (z > -1.0) & (z < 0.5)).any()
     assert set(found.columns) == {'intensity', 'probabilityDynamic', 'normals'}
-    assert len(run(tmp_path, INPUT, 'input')) == pytest.approx(900, abs=130)
 
 
 def test_the_filters_of_the_mapper_for_ros_run_one_after_another(tmp_path):

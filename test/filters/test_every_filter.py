@@ -19,7 +19,7 @@ from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.registry import all_filters, find
 from surfel_mapper.scan import Scan
 from test.filters import libpointmatcher
-from test.filters.examples import random_scan, scan_of
+from test.filters.examples import random_scan
 
 FILTERS = all_filters()
 PARAMETERS = [(cls, declared) for cls in FILTERS for declared in settings_of(cls)]
@@ -161,9 +161,27 @@ def test_points_keep_their_order_and_their_columns(cls):
             np.testing.assert_array_equal(found.columns[name], scan.columns[name][rows])
 
 
-@every
-def test_equal_scans_give_equal_results(cls):
-    assert bits_of(made(cls).apply(random_scan())) == bits_of(made(cls).apply(random_scan()))
+CHANCE = {
+    'fix_step_sampling': {},
+    'gestalt': {'ratio': 0.5, 'radius_m': 1.0},
+    'max_density': {},
+    'max_point_count': {'max_points': 100},
+    'normal_space': {'num_points': 100},
+    'octree_grid': {'max_size_m': 1.0, 'sampling_method': 1},
+    'random_sampling': {'probability': 0.5},
+    'sampling_surface_normal': {},
+    'spectral_decomposition': {'num_neighbours': 20, 'radius_m': 1.0},
+}
+"""Parameters with which chance matters."""
+
+
+@pytest.mark.parametrize('name', CHANCE)
+def test_chance_follows_the_seed(name):
+    scan = random_scan(2000)
+    one, again, two = (
+        bits_of(find(name)(**CHANCE[name], seed=seed).apply(scan)) for seed in (1, 1, 2)
+    )
+    assert one == again != two
 
 
 @every
@@ -225,12 +243,6 @@ def test_an_array_of_points_stands_for_a_scan(cls):
         np.testing.assert_array_equal(Chain([made(cls)]).apply(points.tolist()).points, doubles)
 
 
-@every
-def test_the_output_can_be_filtered_again(cls):
-    again = made(cls).apply(made(cls).apply(random_scan()))
-    assert len(again) <= 500
-
-
 def test_bounds_are_allowed_and_values_beyond_are_refused_by_name():
     faults = []
     for cls, declared in NUMBERS:
@@ -279,25 +291,5 @@ def test_a_chain_of_all_filters_survives_writing_and_reading():
     assert Chain.from_list(chain.to_list()).filters == chain.filters
 
 
-def test_parameters_cannot_be_changed_in_place():
-    faults = []
-    for cls, declared in PARAMETERS:
-        found = made(cls)
-        try:
-            setattr(found, declared.name, declared.default)
-            faults.append(f'{cls.name}.{declared.name}')
-        except AttributeError:
-            continue
-    assert faults == []
-
-
 def test_a_chain_of_all_can_be_warmed_up():
     Chain(made(cls) for cls in FILTERS).warm_up()
-
-
-def test_scans_without_the_columns_needed_are_refused_with_what_they_have():
-    needy = [cls for cls in FILTERS if cls.name in {'shadow', 'max_density', 'orient_normals'}]
-    assert len(needy) == 3
-    for cls in needy:
-        with pytest.raises(FilterError, match=r'needs the column .*; the points have intensity'):
-            cls().apply(scan_of(np.zeros((2, 3)), intensity=[1.0, 2.0]))

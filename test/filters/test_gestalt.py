@@ -125,12 +125,3 @@ def test_features_are_rows_of_32():
 def test_keypoints_whose_neighbours_are_too_few_or_spread_are_dropped(settings, some):
     scan = scan_of(steps(), t=np.arange(3600))
     assert bool(len(filter_of(NAME, **EVERY, **settings).apply(scan))) is some
-
-
-def test_chance_follows_the_seed():
-    one, again, two = (
-        filter_of(NAME, **{**EVERY, 'ratio': 0.5}, seed=seed).apply(scan_of(steps())).points
-        for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(one, again)
-    assert not np.array_equal(one, two)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.filters.grids import leaves, LEVELS, spread
+from surfel_mapper.filters.grids import leaves
 from test.filters.examples import filter_of, random_scan, scan_of
 
 GOLDEN = Path(os.environ.get('SURFEL_MAPPER_TEST_DATA', '')) / 'golden'
@@ -169,28 +169,6 @@ def test_voxels_of_points_in_long_runs_are_those_of_the_slow_twin(dtype):
     np.testing.assert_allclose(found.points, expected, rtol=0.0, atol=tolerance)
 
 
-def test_voxels_anchored_at_the_origin_stay_while_points_come_and_go():
-    scan = random_scan(300)
-    part = scan.select(np.arange(100, 300))
-    centres = {'use_centroid': False}
-    all_, some = (filter_of('voxel_grid', **centres).apply(each) for each in (scan, part))
-    assert set(map(tuple, some.points)) <= set(map(tuple, all_.points))
-    assert (all_.points % 1.0 == 0.5).all()
-
-
-def test_a_voxel_of_each_axis_has_its_own_size():
-    scan = scan_of([[0.1, 0.1, 0.1], [0.9, 0.1, 0.1], [0.1, 3.9, 0.1], [0.1, 0.1, 0.3]])
-    found = filter_of('voxel_grid', size_x_m=1.0, size_y_m=4.0, size_z_m=0.2).apply(scan)
-    np.testing.assert_allclose(found.points, [[1.1 / 3, 4.1 / 3, 0.1], [0.1, 0.1, 0.3]])
-
-
-def test_unpacked_colours_of_a_voxel_are_rounded():
-    red = np.zeros((3, 3), np.uint8)
-    red[:, 0] = [254, 255, 255]
-    found = filter_of('voxel_grid').apply(scan_of(np.full((3, 3), 0.5), rgb=red))
-    assert found.columns['rgb'].tolist() == [[255, 0, 0]]
-
-
 def test_columns_of_the_first_point_are_kept_without_averaging():
     scan = scan_of([[0.1, 0.0, 0.0], [0.3, 0.0, 0.0]], intensity=[1.0, 3.0], label=[4, 5])
     averaged = filter_of('voxel_grid').apply(scan).columns
@@ -221,17 +199,6 @@ def test_an_extent_that_no_key_can_number_is_refused_with_what_to_do(far, size):
     sizes = dict.fromkeys(('size_x_m', 'size_y_m', 'size_z_m'), size)
     with pytest.raises(FilterError, match=r'extends over .* voxels, .*use larger ones'):
         filter_of('voxel_grid', **sizes).apply(scan)
-
-
-@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize('row', [0, 7])
-def test_a_point_that_is_not_finite_is_in_no_voxel(value, row):
-    scan = random_scan(20)
-    points = scan.points.copy()
-    points[row, 1] = value
-    found = filter_of('voxel_grid').apply(points)
-    expected = filter_of('voxel_grid').apply(np.delete(points, row, axis=0))
-    np.testing.assert_array_equal(found.points, expected.points)
 
 
 def test_voxels_of_too_few_points_are_dropped():
@@ -289,12 +256,6 @@ def test_leaves_are_those_of_a_tree(max_points, max_size, flat):
     assert (np.diff(first) > 0).all()  # numbered as they first appear
 
 
-def test_paths_take_a_bit_of_every_axis_in_turn():
-    values = np.array([0, 1, 0b101, 2**LEVELS - 1])
-    expected = [int('0' + '00'.join(f'{v:b}'), 2) for v in values]
-    assert spread(values).tolist() == expected
-
-
 SQUARE = [[0.0, 0, 0], [0.2, 0, 0], [0.1, 0.25, 0], [4.0, 4.0, 0], [0.1, 0.1, 0], [0.0, 4.0, 0]]
 """Four points in the lowest cube of an edge of 1, and two alone."""
 
@@ -341,12 +302,3 @@ def test_points_nearer_than_paths_can_tell_stay_together(method):
     near = np.nextafter(np.float64(1.0), 2.0)
     scan = scan_of([[1.0, 0, 0], [near, 0, 0], [-1.0, 0, 0]])
     assert len(filter_of(OCTREE, samplingMethod=method).apply(scan)) == 2
-
-
-def test_a_leaf_is_no_larger_than_asked():
-    scan = random_scan(3000)
-    found = filter_of('octree_grid', max_size_m=0.5, sampling_method=2).apply(scan)
-    edge = 8.0 / 2 ** np.ceil(np.log2(8.0 / 0.5))
-    # as many as the occupied cubes of that edge, give or take those of the moved grid
-    cubes = {tuple(cell) for cell in np.floor(scan.points / edge)}
-    assert 0.8 < len(found) / len(cubes) < 1.2

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from surfel_mapper.filters.neighbours import neighbour_rows, search_tree, visit_neighbours
+from surfel_mapper.filters.neighbours import search_tree, visit_neighbours
 from surfel_mapper.filters.shapes import as_matrices, eigen, Moments, PAIRS, shares
 from test.filters.examples import filter_of, kept, random_scan, scan_of
 
@@ -56,15 +56,6 @@ def test_points_beyond_the_limit_are_no_neighbours_and_one_at_it_is():
     assert distances[2].tolist() == [0.0, np.inf, np.inf]
 
 
-def test_points_at_a_distance_whose_square_is_infinite_are_no_neighbours():
-    points = cloud(40) * 1e160
-    ids, distances = all_neighbours(points, 3)
-    np.testing.assert_array_equal(ids[:, 0], np.arange(40))
-    assert (ids[:, 1:] == 40).all()
-    assert np.isinf(distances[:, 1:]).all()
-    np.testing.assert_array_equal(neighbour_rows(points, 3), ids)
-
-
 def test_a_crowd_at_one_place_is_answered_without_searching_all_of_it():
     # every beam without return at the origin: a tree with all of them takes minutes
     points = np.concatenate([np.zeros((50_000, 3)), cloud()])
@@ -106,15 +97,6 @@ def test_distances_equal_those_of_scipy_on_rings_crowds_and_stray_points(number,
     assert all(len(set(row[row < len(points)])) == (row < len(points)).sum() for row in ids)
 
 
-@pytest.mark.parametrize('number', [4, 30])
-def test_threads_make_no_difference_to_neighbours(number):
-    points = uneven_cloud()
-    one = all_neighbours(points, number)
-    three = all_neighbours(points, number, threads=3)
-    for alone, shared in zip(one, three, strict=True):
-        np.testing.assert_array_equal(alone, shared)
-
-
 @pytest.mark.parametrize(
     'name', ['statistical_outliers', 'radius_outliers', 'surface_normal', 'saliency']
 )
@@ -125,10 +107,6 @@ def test_threads_make_no_difference_to_filters(name):
     assert set(one.columns) == set(two.columns)
     for column in one.columns:
         np.testing.assert_array_equal(one.columns[column], two.columns[column])
-
-
-def test_without_points_there_is_nothing_to_search():
-    visit_neighbours(pytest.fail, search_tree(np.empty((0, 3))), 3)
 
 
 def test_moments_are_those_of_numpy():
@@ -168,13 +146,6 @@ def test_eigenvalues_and_eigenvectors_rebuild_the_matrix(scale):
     assert (largest > 0.0).all()
 
 
-def test_no_matrices_have_no_eigenvectors():
-    for smallest_only in (False, True):
-        values, vectors = eigen(np.zeros((6, 1)), smallest_only=smallest_only)
-        assert values.tolist() == [[0.0] * 3]
-        assert np.isnan(vectors).all()
-
-
 def test_the_shares_of_plane_line_and_ball():
     values = np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     np.testing.assert_array_equal(shares(values), [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]])
@@ -199,14 +170,6 @@ def test_on_a_plane_every_normal_is_that_of_the_plane():
     np.testing.assert_allclose(found.columns['normals'], np.tile(normal, (500, 1)), atol=1e-7)
     assert np.abs(found.columns['eigValues'][:, 0]).max() < 1e-14
     np.testing.assert_array_equal(found.points, points)
-
-
-def test_on_a_sphere_normals_are_radial():
-    points = np.random.default_rng(5).normal(size=(4000, 3))
-    points *= 5.0 / np.linalg.norm(points, axis=1, keepdims=True)
-    found = filter_of('surface_normal', num_neighbours=12).apply(scan_of(points))
-    cosine = np.abs((found.columns['normals'] * points).sum(axis=1)) / 5.0
-    assert np.median(np.degrees(np.arccos(np.minimum(cosine, 1.0)))) < 1.0
 
 
 def test_further_columns_of_neighbours_are_added_on_request():
@@ -260,14 +223,6 @@ def test_smoothed_normals_are_means_of_their_neighbours_and_of_unit_length():
     assert np.median(off[1]) < 0.6 * np.median(off[0])
 
 
-def test_the_order_of_points_makes_no_difference_to_their_normals():
-    scan = random_scan(300)
-    order = np.random.default_rng(0).permutation(300)
-    one = filter_of('surface_normal').apply(scan).columns['normals'][order]
-    two = filter_of('surface_normal').apply(scan.select(order)).columns['normals']
-    np.testing.assert_allclose(one, two, atol=1e-5)
-
-
 # ---- outliers
 
 
@@ -292,8 +247,3 @@ def test_radius_outliers_have_too_few_others_around():
 def test_a_point_at_the_place_of_another_has_a_neighbour_at_distance_0():
     points = [[1.0, 1.0, 1.0]] * 3 + [[2.0, 2.0, 2.0]]
     assert kept('radius_outliers', points, radius_m=0.0) == [0, 1, 2]
-
-
-@pytest.mark.parametrize('number', [0, 1, 2])
-def test_few_points_are_no_outliers_by_statistics(number):
-    assert kept('statistical_outliers', np.zeros((number, 3))) == list(range(number))

@@ -11,7 +11,7 @@ import pytest
 
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.kernels.sampling import choose, choose_farthest
-from surfel_mapper.filters.sampling import buckets, resistance
+from surfel_mapper.filters.sampling import resistance
 from test.filters.examples import filter_of, kept, random_scan, scan_of
 
 NUMBER = 40_000
@@ -207,27 +207,6 @@ def test_directions_are_drawn_evenly_where_there_are_as_many_everywhere():
     np.testing.assert_allclose(found.T @ found / 20_000, np.eye(3) / 3.0, atol=0.02)
 
 
-@pytest.mark.parametrize('step', [0.04908738521, 0.09817477042, 0.5, 3.14159265359])
-def test_buckets_are_about_equally_large(step):
-    normals = np.random.default_rng(9).normal(size=(400_000, 3))
-    rows = buckets(normals, step)
-    found, counts = np.unique(rows, return_counts=True)
-    area = 4.0 * np.pi * counts / len(normals)
-    assert found.min() == 0
-    if step < 1.0:  # away from the poles, where a band has but few parts
-        large = counts > 50
-        assert abs(np.median(area[large]) / step**2 - 1.0) < 0.1
-    poles = buckets(np.array([[0.0, 0, 1], [0.0, 0, -1], [0.0, 0, 0], [-1.0, -0.0, 0]]), step)
-    assert (poles >= 0).all()
-    assert poles[0] == poles[2] == 0
-
-
-def test_normal_space_depends_on_seed_and_stamp():
-    scan = random_scan(3000)
-    one, two = (filter_of(SPACE, nbSample=100, seed=s).apply(scan).points for s in (1, 2))
-    assert not np.array_equal(one, two)
-
-
 def stability(points, normals):
     """Return the eigenvalues of the information about motions over the largest, ascending."""
     arms = points - points.mean(axis=0)
@@ -303,8 +282,3 @@ def test_farthest_points_equal_the_slow_choice(number, compiled):
 def test_farthest_points_are_places():
     points = np.repeat([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]], 20, axis=0)
     assert kept('farthest_point_sampling', points, num_points=10) == [0, 20, 40]
-
-
-@pytest.mark.parametrize('name', ['RandomSamplingDataPointsFilter'])
-def test_sampling_of_no_points_gives_none(name):
-    assert len(filter_of(name).apply(np.empty((0, 3)))) == 0

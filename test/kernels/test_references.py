@@ -33,10 +33,11 @@ def imported(path: Path) -> frozenset[Path]:
 
 
 def reaches(test: Path, kernels: Path) -> bool:
-    """Whether a test, or a twin beside it, imports kernels or a module that imports them."""
-    near = imported(test)
-    near |= {each for twin in near if ROOT / 'test' in twin.parents for each in imported(twin)}
-    return kernels in near or any(kernels in imported(module) for module in near)
+    """Return whether a test imports kernels, their owner, or a module or twin with the owner."""
+    modules = {test}
+    for _ in range(3):
+        modules |= {imported_module for module in modules for imported_module in imported(module)}
+    return kernels in modules
 
 
 def test_every_module_of_kernels_has_its_reference():
