@@ -121,17 +121,6 @@ def test_a_box_of_a_map_is_coarsened_alone():
     assert coarse == part.coarsen(1)
 
 
-def test_a_copy_is_equal_and_independent():
-    surfel_map = map_of(scans_at(0.0))
-    copy = surfel_map.copy()
-    assert copy == surfel_map
-    assert copy.digest() == surfel_map.digest()
-    copy.add([[1.0, 1.0, 1.0]])
-    assert copy != surfel_map
-    assert surfel_map == map_of(scans_at(0.0))
-    assert surfel_map != 'a map'
-
-
 def test_maps_of_other_voxels_or_levels_are_not_equal():
     assert SurfelMap(0.5) == SurfelMap(0.5)
     assert SurfelMap(0.5) != SurfelMap(0.25)

@@ -16,8 +16,8 @@ import pytest
 
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.mapping.moments import pack_keys, ScanMoments, unpack_keys
-from surfel_mapper.mapping.reducer import as_points, Reducer
+from surfel_mapper.mapping.moments import pack_keys, unpack_keys
+from surfel_mapper.mapping.reducer import Reducer
 from test.reference import as_twin, scan_moments
 
 pytestmark = pytest.mark.filterwarnings('error')
@@ -112,12 +112,6 @@ def test_moments_do_not_change_when_the_reducer_goes_on():
     before = as_twin(moments)
     reducer.reduce(rng.uniform(-5.0, 5.0, (1000, 3)))
     assert as_twin(moments) == before
-
-
-def test_each_voxel_occurs_once():
-    points = np.random.default_rng(4).uniform(-30.0, 30.0, (50_000, 3))
-    moments = Reducer(0.2).reduce(points)
-    assert len(np.unique(moments.key)) == len(moments) == moments.num_voxels
 
 
 @pytest.mark.parametrize('columns', [4, 8])
@@ -298,17 +292,6 @@ def test_an_invalid_pose_or_origin_is_refused():
             reducer.reduce(points, origin=origin)
 
 
-def test_bytes_and_first_rows_are_of_the_arrays():
-    moments = Reducer(0.5).reduce(np.random.default_rng(9).uniform(-9.0, 9.0, (3000, 3)))
-    key, count, total, product, view = moments.arrays
-    assert moments.nbytes == sum(a.nbytes for a in (key, count, total, product, view))
-    assert moments.nbytes == 78 * len(moments)
-    some = moments.select(slice(100))
-    expected = dict(list(as_twin(moments).items())[:100])
-    assert as_twin(some) == expected
-    assert isinstance(some, ScanMoments)
-
-
 @given(st.lists(st.tuples(*[st.integers(-(2**20), 2**20 - 1)] * 3), max_size=20))
 def test_packed_keys_sort_as_voxel_indices_and_unpack_again(indices):
     index = np.array(indices, np.int64).reshape(-1, 3)
@@ -316,9 +299,3 @@ def test_packed_keys_sort_as_voxel_indices_and_unpack_again(indices):
     assert unpack_keys(keys).tolist() == index.tolist()
     assert (keys >= 0).all()
     assert [tuple(row) for row in unpack_keys(np.sort(keys)).tolist()] == sorted(indices)
-
-
-def test_arrays_that_fit_the_kernels_are_not_copied():
-    for dtype in (np.float32, np.float64):
-        points = np.zeros((5, 3), dtype, order='F')
-        assert np.shares_memory(as_points(points), points)

@@ -8,8 +8,6 @@ test_surfel_map_limits.py. Maps are compared with the exact integers of a slow t
 other by digest; there are no tolerances.
 """
 
-import math
-
 import numpy as np
 import pytest
 
@@ -58,16 +56,6 @@ def test_removing_all_scans_leaves_the_empty_map():
     assert len(surfel_map.surfels()) == 0
 
 
-def test_remove_names_the_voxels_that_are_gone():
-    surfel_map = SurfelMap(0.5)
-    points = np.array([[0.1, 0.1, 0.1], [0.6, 0.1, 0.1], [-0.1, 3.0, 0.1]])
-    moments = surfel_map.add(points)
-    surfel_map.add(points[:1])
-    gone = surfel_map.remove(moments)
-    assert sorted(gone.tolist()) == [[-1, 6, 0], [1, 0, 0]]
-    assert gone.dtype == np.int32
-
-
 def test_the_digest_tells_maps_apart():
     points, origin = scans_at(0.0, num=1)[0]
     voxel, unit = np.array([0.5, 0.0, 0.0]), np.array([0.5 / 65536, 0.0, 0.0])
@@ -112,19 +100,6 @@ def test_a_map_merged_with_itself_holds_everything_twice():
     surfel_map = map_of(scans)
     surfel_map.merge(surfel_map)
     assert surfel_map.digest() == map_of(scans * 2).digest()
-
-
-def test_scans_of_a_merged_map_can_be_removed_again():
-    scans = scans_at(0.0)
-    whole, other = map_of(scans[:3]), SurfelMap(0.5)
-    moments = [other.add(points, origin) for points, origin in scans[3:]]
-    whole.merge(other)
-    whole.remove(moments[1])
-    whole.remove(moments[0])
-    assert whole.digest() == map_of([*scans[:3], scans[5]]).digest()
-    whole.remove(other.moments().select(slice(0)))  # nothing
-    whole.remove(moments[2])
-    assert whole.digest() == map_of(scans[:3]).digest()
 
 
 def test_many_voxels_come_and_go_as_in_a_dict():
@@ -173,22 +148,6 @@ def test_rows_of_voxels_that_left_are_used_again():
     assert surfel_map.nbytes < 1.2 * settled
 
 
-def test_changes_are_found_when_the_log_has_forgotten_them():
-    rng = np.random.default_rng(13)
-    surfel_map = SurfelMap(0.5)
-    versions, changed = [], []
-    for _ in range(5):  # 430 000 changes; the log keeps 2^18, or as many as there are voxels
-        versions.append(surfel_map.version)
-        moments = surfel_map.add(rng.uniform(-17.0, 17.0, (100_000, 3)))
-        changed.append(set(moments.key.tolist()))
-    for first, since in enumerate(versions):
-        surfels = surfel_map.surfels_changed(since=since)
-        keys = pack_keys(surfels.voxel_index).tolist()
-        assert len(keys) == len(set(keys))
-        assert set(keys) == set().union(*changed[first:])
-    assert len(surfel_map.surfels_changed(since=-1)) == surfel_map.num_voxels
-
-
 def test_few_points_are_passed_over():
     surfel_map = map_of(scans_at(0.0))
     everything = surfel_map.surfels()
@@ -213,14 +172,6 @@ def test_a_cleared_map_is_as_a_new_one_but_for_its_version():
     surfel_map.add([[1.0, 1.0, 1.0]])
     assert surfel_map.surfels_changed(since=before).voxel_index.tolist() == [[2, 2, 2]]
     assert surfel_map.digest() == map_of([([[1.0, 1.0, 1.0]], None)]).digest()
-
-
-def test_no_points_change_nothing():
-    surfel_map = map_of(scans_at(0.0, num=1))
-    before = surfel_map.digest()
-    for nothing in ([], np.empty((0, 3), np.float32), [[math.nan] * 3]):
-        surfel_map.remove(surfel_map.add(nothing))
-    assert surfel_map.digest() == before
 
 
 def test_returned_surfels_do_not_change_with_the_map():

@@ -20,13 +20,6 @@ from test.reference import as_twin, digest, scan_moments
 pytestmark = pytest.mark.filterwarnings('error')
 
 
-def test_points_not_finite_are_left_out_and_counted():
-    surfel_map = SurfelMap(0.5)
-    moments = surfel_map.add([[1.0, 1, 1], [math.nan, 0, 0], [0, math.inf, 0], [0, 0, -math.inf]])
-    assert (moments.num_points, dict(moments.left_out)) == (1, {'not_finite': 3})
-    assert surfel_map.digest() == map_of([([[1.0, 1, 1]], None)]).digest()
-
-
 @pytest.mark.parametrize('beyond', [2.0**19, -(2.0**19) - 1e-9, 1e9, -1e30, 1e300])
 def test_points_beyond_the_voxel_indices_are_refused(beyond):
     surfel_map = map_of(scans_at(0.0, num=1))
@@ -134,12 +127,6 @@ def test_a_coarser_map_holds_a_quarter_of_that_with_each_level():
     assert_unchanged_by(
         surfel_map, MapLimitError, 'at most 134217728', surfel_map.merge, surfel_map
     )
-
-
-def test_a_map_takes_no_scan_with_too_many_points_in_a_voxel():
-    surfel_map = map_of(scans_at(0.0, num=1))
-    points = np.broadcast_to(np.float32(0.1), (2**23 + 1, 3))
-    assert_unchanged_by(surfel_map, MapLimitError, 'at most 8388608', surfel_map.add, points)
 
 
 NO_MEMORY = """

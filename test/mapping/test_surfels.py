@@ -8,8 +8,6 @@ numpy.linalg.eigh. Tolerances: both solvers are right to some 1e-15 e2, so eigen
 to 1e-12 e2 and normals to 1e-6 rad where the two smallest are apart by 1e-4 e2.
 """
 
-from fractions import Fraction
-
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -100,15 +98,7 @@ def test_any_points_repeated_any_number_of_times_are_as_the_twin_says(places, ti
     assert_as_twin(map_of(np.repeat(on_lattice(*places), times, axis=0), [3.0, 2.0, 1.0]))
 
 
-def test_a_single_point_has_a_place_and_no_shape():
-    row = one_surfel([[0.2, 0.3, 0.4]], origin=[0.0, 0.0, 9.0])
-    assert abs(row['position'] - [0.2, 0.3, 0.4]).max() <= 0.5 * UNIT_M
-    assert row['num_points'] == 1
-    assert row['eigenvalues'].tolist() == [0.0, 0.0, 0.0]
-    assert np.isnan([*row['normal'], row['planarity'], row['curvature']]).all()
-
-
-@given(st.tuples(PLACE, PLACE, PLACE), st.integers(2, 3000))
+@given(st.tuples(PLACE, PLACE, PLACE), st.integers(1, 3000))
 def test_equal_points_have_a_place_and_no_shape(place, times):
     row = one_surfel(np.repeat(on_lattice(place), times, axis=0), origin=[0.0, 0.0, 9.0])
     assert abs(row['position'] - on_lattice(place)).max() <= 1e-15
@@ -219,29 +209,6 @@ def test_the_first_of_equally_large_components_is_positive():
 def test_a_plane_seen_exactly_from_the_side_has_the_sign_of_no_sensor():
     square = np.array([[a, b, 0.5] for a in (0.25, 0.5, 0.75) for b in (0.25, 0.5, 0.75)])
     assert one_surfel(square, origin=[9.0, 0.5, 0.5])['normal'].tolist() == [0.0, 0.0, 1.0]
-
-
-def test_a_voxel_with_many_points_is_as_exact_as_one_with_few():
-    # 2^20 points, all equal but one that is a single lattice unit off
-    places = np.full((2**20, 3), 40000)
-    places[-1] += [1, 0, 0]
-    row = one_surfel(on_lattice(places))
-    n = 2**20
-    exact = (1 - Fraction(1, n)) / (n - 1) * Fraction(UNIT_M) ** 2
-    assert row['eigenvalues'][2] == pytest.approx(float(exact), rel=1e-14)
-    assert row['eigenvalues'][:2].tolist() == [0.0, 0.0]
-
-
-def test_select_takes_rows_of_every_column():
-    points = np.random.default_rng(2).uniform(-3.0, 3.0, (200, 3))
-    surfels = map_of(points).surfels()
-    mask = surfels.num_points > 1
-    for rows in (mask, np.flatnonzero(mask)[::-1]):
-        some = surfels.select(rows)
-        assert len(some) == mask.sum()
-        assert (some.position == surfels.position[rows]).all()
-        assert (some.voxel_index == surfels.voxel_index[rows]).all()
-        assert some.normal.tobytes() == surfels.normal[rows].tobytes()
 
 
 def test_a_surfel_lies_in_its_voxel():

@@ -127,57 +127,6 @@ def test_moments_are_added_and_subtracted_as_integers(call):
 
 
 @both
-def test_adding_stops_without_room_and_resumes(call):
-    twin = some_moments(1, num_points=300, spread_m=2.0)
-    moments = arrays_of(twin)
-    memory = Memory(call, len(twin) - 40)
-    first = dict(list(twin.items())[:10])
-    memory.add(arrays_of(first), 1)
-    expected = {}
-    reference.add_moments(expected, first)
-
-    done, _ = memory.add(moments, 2)
-    assert done == len(twin) - 40
-    memory.rows = np.concatenate([memory.rows, np.full((40, ROW), -5)])
-    memory.stamps = np.concatenate([memory.stamps, np.full(40, 5, np.uint32)])
-    done, changed = memory.add(moments, 2, start=done)
-
-    reference.add_moments(expected, twin)
-    assert done == len(twin)
-    assert len(changed) == 40
-    assert memory.content() == expected
-
-
-@both
-def test_adding_stops_if_a_segment_cannot_split(call):
-    side = range(8)
-    twin = {(i, j, k): [1] * 13 for i in side for j in side for k in side}
-    memory = Memory(call, 1000)
-    done, _ = memory.add(arrays_of(twin), 1)
-    assert done == hashing.FULLEST
-    assert memory.state[hashing.NEXT_ROW] == hashing.FULLEST
-    directory, *rest = memory.table
-    memory.table = (np.repeat(directory, 2), *rest)
-    memory.state[hashing.DEPTH] += 1
-    done, _ = memory.add(arrays_of(twin), 1, start=done)
-    assert done == 512
-    assert memory.content() == twin
-
-
-@both
-def test_rows_of_voxels_that_left_are_the_first_to_be_used(call):
-    memory, first, second = Memory(call, 400), some_moments(2), some_moments(3, num_points=30)
-    memory.add(arrays_of(first), 1)
-    used = memory.state[hashing.NEXT_ROW]
-    memory.remove(arrays_of(first), 2)
-    assert all(unpacked(row)[0] == 0 for row in memory.rows[:used])
-    _, changed = memory.add(arrays_of(second), 3)
-    assert memory.state[hashing.NEXT_ROW] == used
-    assert max(changed) < used
-    assert memory.content() == second
-
-
-@both
 @pytest.mark.parametrize('column', range(13))
 def test_a_failed_removal_names_the_voxel_and_changes_nothing(call, column):
     memory = Memory(call, 200)
@@ -213,26 +162,3 @@ def test_wrong_hints_of_rows_are_replaced_by_a_look_up(call):
     assert memory.remove(arrays_of(twin), 4, hints=hints)[0] == -1
     reference.add_moments(expected, twin, -1)
     assert memory.content() == expected
-
-
-@both
-@pytest.mark.parametrize('min_points', [1, 2, 3, 4, 5])
-def test_voxels_fall_when_they_had_enough_points_and_have_no_more(call, min_points):
-    memory = Memory(call, 20)
-    counts = {(0, 0, n): n for n in range(1, 5)}
-    memory.add(arrays_of({v: [n] + [0] * 12 for v, n in counts.items()}), 1)
-    one_each = arrays_of({v: [1] + [0] * 12 for v in counts})
-    _, fallen = memory.remove(one_each, 2, min_points)
-    assert fallen == ([(0, 0, min_points)] if min_points < 5 else [])
-
-
-@both
-def test_voxels_are_found_at_any_index(call):
-    memory, twin = Memory(call, 1000), some_moments(5, num_points=200)
-    memory.add(arrays_of(twin), 1)
-    keys = arrays_of(twin)[0]
-    absent = pack_keys(np.array([[100, 100, k] for k in range(40)]))
-    found = memory.find(np.concatenate([keys, absent]))
-    assert (memory.rows[found[: len(keys)], KEY] == keys).all()
-    assert (found[len(keys) :] == -1).all()
-    assert len(memory.find(keys[:0])) == 0
