@@ -14,7 +14,7 @@ Source: Fibonacci hashing, Knuth, The Art of Computer Programming, vol. 3, 6.4.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.compiling import inlined, kernel, U
 from surfel_mapper.kernels.prefetch import prefetch
 
 CHUNK = 1024
@@ -43,7 +43,7 @@ def home(key, shift):
     return np.int64((np.uint64(key) * _MIX) >> shift)
 
 
-@part()
+@inlined()
 def find_runs(keys, num, starts):
     """
     Find the runs of consecutive points of one voxel; return their number.
@@ -62,7 +62,7 @@ def find_runs(keys, num, starts):
     return num_runs
 
 
-@part()
+@inlined()
 def number_runs(chunk_keys, starts, num_runs, table, keys, num_rows, run_rows):
     """
     Look up the row of each run's voxel, adding rows for new voxels; return their number.

@@ -27,7 +27,7 @@ Source: Fagin et al. 1979, Extendible hashing; deletion after algorithm R of Knu
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import part, U
+from surfel_mapper.kernels.compiling import inlined, U
 from surfel_mapper.kernels.lanes import highest_match, num_used, place_of_half, WORDS
 from surfel_mapper.kernels.layout import KEY
 
@@ -119,7 +119,7 @@ def is_full(hashed, directory, held, depth):
     return held[U(segment)] >= FULLEST - (segment * 79) % (SEGMENT // 4)
 
 
-@part()
+@inlined()
 def find_row(key, rows, table, depth):
     """
     Return the row of a voxel, or -1 if not found.
@@ -140,7 +140,7 @@ def find_row(key, rows, table, depth):
         bucket = next_bucket(bucket)
 
 
-@part()
+@inlined()
 def insert_row(hashed, row, table, depth):
     """Insert the row of a voxel that is not in the table."""
     directory, buckets, held, _ = table
@@ -163,7 +163,7 @@ def insert_entry(hashed, row, directory, buckets, held, depth):
     buckets[U(bucket + place)] = (hashed << 32) | (row + 1)
 
 
-@part()
+@inlined()
 def remove_row(key, row, table, depth):
     """Remove the row of a voxel from the table."""
     directory, buckets, held, _ = table
@@ -186,7 +186,7 @@ def remove_entry(hashed, row, directory, buckets, held, depth):
         take_back(bucket, buckets)
 
 
-@part()
+@inlined()
 def take_back(bucket, buckets):
     """
     Fill the last place of a bucket that was full, if a later bucket holds an entry for it.
@@ -209,7 +209,7 @@ def take_back(bucket, buckets):
                 break
 
 
-@part()
+@inlined()
 def split_segment(hashed, table, state, entries):
     """
     Split the segment of a hash by the next bit of the hashes; return whether there was room.
@@ -246,7 +246,7 @@ def split_segment(hashed, table, state, entries):
     return True
 
 
-@part()
+@inlined()
 def makes_room(hashed, table, state, entries):
     """Split the segment of a hash until it has room for a row; return False if it cannot split."""
     directory, _, held, _ = table

@@ -16,7 +16,7 @@ the bits above tell whether X is in range. Splitting X in float64 takes 1.6 time
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import part
+from surfel_mapper.kernels.compiling import inlined
 from surfel_mapper.kernels.layout import (
     BITS,
     INDEX_BITS,
@@ -41,7 +41,7 @@ ONE = 1 << (3 * BITS)
 """The highest quarter of a place: a count of one point."""
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def quantise(x, y, z, pose, scale, range_sq, keys, places):
     """
     Quantise the points of a chunk, without branches, so that the compiler vectorises the loop.

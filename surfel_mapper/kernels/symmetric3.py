@@ -26,7 +26,7 @@ import math
 
 from numba import njit
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 
 NOISE = 1e-15
 """Eigenvalues below this share of the trace are rounding errors, and become 0."""
@@ -62,7 +62,7 @@ def decompose(scatter, num, eigenvalues, normals):
             normals[axis, i] = normal[axis]
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def decompose_one(axx, axy, axz, ayy, ayz, azz):
     """
     Return eigenvalues and normal of a matrix, as ``decompose`` does, three float64 each.
@@ -143,7 +143,7 @@ def decompose_one(axx, axy, axz, ayy, ayz, azz):
     return (e0 * back, e1 * back, e2 * back), normal
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def isolated_root(determinant):
     """Return the eigenvalue t of B farthest from the other two, in [-2, 2]."""
     side = 1.0 if determinant >= 0.0 else -1.0

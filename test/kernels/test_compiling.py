@@ -8,14 +8,14 @@ import numba
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 
 needs_compiler = pytest.mark.skipif(
     numba.config.DISABLE_JIT, reason='kernels are interpreted in this run'
 )
 
 
-@part(cache=False)
+@inlined(cache=False)
 def reciprocal(value):
     """Return 1 / value."""
     return 1.0 / value

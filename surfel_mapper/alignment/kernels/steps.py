@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 
 SWEEPS = 30
 """Limit of the sweeps of Jacobi's rotations; six are usual."""
@@ -65,7 +65,7 @@ def solve_step(hessian, gradient, least, step, values, vectors):
     return radius
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def sort_eigenvalues(matrix, values, vectors):
     """Write the diagonal (N,) of a matrix in ascending order; sort the rows of vectors alike."""
     for i in range(len(values)):
@@ -78,7 +78,7 @@ def sort_eigenvalues(matrix, values, vectors):
             k -= 1
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def diagonalise(matrix, vectors):
     """
     Rotate a symmetric matrix until it is diagonal, in place (Jacobi 1846).
@@ -103,7 +103,7 @@ def diagonalise(matrix, vectors):
                     rotate(matrix, vectors, i, j)
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def rotate(matrix, vectors, i, j):
     """Rotate a symmetric matrix (N, N) so that its entry i, j is 0, and the rows of vectors."""
     cotangent = (matrix[j, j] - matrix[i, i]) / (2.0 * matrix[i, j])

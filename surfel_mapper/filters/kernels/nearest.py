@@ -21,7 +21,7 @@ import numpy as np
 
 from surfel_mapper.filters.kernels.search_tree import FIRST, LEAF, PARENT, RIGHT
 from surfel_mapper.filters.kernels.smallest import keep_least, largest, sort, VECTORS
-from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.compiling import inlined, kernel, U
 from surfel_mapper.kernels.lanes import FLOATS, place_of_least
 
 GATHERED = 256
@@ -35,26 +35,26 @@ TINY = 1e-300
 """Added to squared bounds, so that points at distance 0 are below them."""
 
 
-@part()
+@inlined()
 def square(x, y, z):
     """Return the squared length of a vector."""
     return (x * x + y * y) + z * z
 
 
-@part()
+@inlined()
 def widened(bound, moved, limit):
     """Return the square of sqrt(bound) + sqrt(moved), a little more for rounding."""
     reach = (math.sqrt(bound) + math.sqrt(moved)) * WIDER
     return min(reach * reach + TINY, limit)
 
 
-@part()
+@inlined()
 def outside(low, high, value):
     """Return the distance of a value from an interval."""
     return max(max(low - value, value - high), 0.0)
 
 
-@part()
+@inlined()
 def point_gap(boxes, node, x, y, z):
     """Return the squared distance of a point from the box of a node."""
     node = U(node)
@@ -64,7 +64,7 @@ def point_gap(boxes, node, x, y, z):
     return square(dx, dy, dz)
 
 
-@part()
+@inlined()
 def box_gap(boxes, one, other):
     """Return the squared distance between the boxes of two nodes."""
     total, one, other = 0.0, U(one), U(other)
@@ -76,7 +76,7 @@ def box_gap(boxes, one, other):
     return total
 
 
-@part()
+@inlined()
 def reach_of(links, boxes, leaf, k, num_points):
     """
     Return a squared distance within which each point of a leaf has k neighbours.
@@ -99,7 +99,7 @@ def reach_of(links, boxes, leaf, k, num_points):
     return total * WIDER
 
 
-@part()
+@inlined()
 def sibling_of(links, node):
     """Return the parent of a node and the other child of it."""
     parent = np.int64(links[PARENT, node])
@@ -107,7 +107,7 @@ def sibling_of(links, node):
     return parent, (right if right != node else parent + 1)
 
 
-@part()
+@inlined()
 def scan(xs, ys, zs, base, x, y, z, bound, count, squares, found, apart):
     """Append the points of a leaf closer than the bound; return the number of points held."""
     for i in range(U(LEAF)):
@@ -119,7 +119,7 @@ def scan(xs, ys, zs, base, x, y, z, bound, count, squares, found, apart):
     return count
 
 
-@part()
+@inlined()
 def search(xs, ys, zs, links, boxes, node, x, y, z, k, bound, held, apart, stack):
     """
     Search from a leaf upwards; return the number of points held and the bound.
@@ -159,7 +159,7 @@ def search(xs, ys, zs, links, boxes, node, x, y, z, k, bound, held, apart, stack
     return count, bound
 
 
-@part()
+@inlined()
 def gather(links, boxes, leaf, reach, stack, near, bases):
     """
     Gather the leaves whose boxes are closer to that of a leaf than a squared distance.

@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.compiling import inlined, kernel, U
 from surfel_mapper.kernels.lanes import NUMBERS
 
 LEAF = NUMBERS
@@ -73,7 +73,7 @@ def build_nodes(points, order, links, boxes, xyz, node, begin, end, least, tasks
     return num_tasks
 
 
-@part()
+@inlined()
 def bound_points(points, order, first, last, boxes, node):
     """Compute the box of the points from first to last - 1; return its longest axis."""
     low_x = low_y = low_z = math.inf
@@ -91,7 +91,7 @@ def bound_points(points, order, first, last, boxes, node):
     return 0 if dx >= max(dy, dz) else y_or_z
 
 
-@part()
+@inlined()
 def move_below(values, rows, low, high, pivot):
     """
     Move the values below a pivot to the front of low to high - 1; return the end of them.
@@ -107,7 +107,7 @@ def move_below(values, rows, low, high, pivot):
     return end
 
 
-@part()
+@inlined()
 def move_up_to(values, rows, low, high, pivot):
     """Move values as ``move_below`` does, those that are equal to the pivot too."""
     end = low

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from surfel_mapper.filters.kernels.search_tree import move_below, move_up_to
-from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.compiling import inlined, kernel, U
 from surfel_mapper.kernels.lanes import FLOATS, num_below
 
 VECTORS = 32
@@ -67,7 +67,7 @@ def keep_least(squares, found, count, k, high, floats):
     return select(squares, found, count, k)
 
 
-@part()
+@inlined()
 def keep_ranked(squares, found, count, k, floats):
     """
     Move the squares of rank below k, as float32, to the front; return their number.
@@ -102,7 +102,7 @@ def select(squares, found, count, k):
         low = equal
 
 
-@part()
+@inlined()
 def largest(squares, count):
     """
     Return the largest of the first squares.

@@ -15,7 +15,7 @@ the scan. There is no dense grid.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.compiling import inlined, kernel, U
 from surfel_mapper.kernels.grouping import AHEAD, CHUNK, enlarged_table, find_runs, number_runs
 
 ROWS = 4096
@@ -87,7 +87,7 @@ def find_keys(x, y, z, size, shift, base, bits, keys):
         keys[i] = ix | (iy << to_y) | (iz << to_z)
 
 
-@part()
+@inlined()
 def add_points(x, y, z, chunk_keys, run_rows, flat):
     """Add the points of a chunk to the sums of their voxels; branches would be mispredicted."""
     run, previous = U(0), chunk_keys[0]
@@ -103,7 +103,7 @@ def add_points(x, y, z, chunk_keys, run_rows, flat):
         flat[at], flat[at + U(1)], flat[at + U(2)], flat[at + U(3)] = sx, sy, sz, count
 
 
-@part()
+@inlined()
 def add_runs(x, y, z, starts, num_runs, run_rows, flat):
     """Add the runs of a chunk to the sums of their voxels, point by point in order."""
     for run in range(U(num_runs)):
@@ -118,7 +118,7 @@ def add_runs(x, y, z, starts, num_runs, run_rows, flat):
         flat[at], flat[at + U(1)], flat[at + U(2)], flat[at + U(3)] = sx, sy, sz, count
 
 
-@part()
+@inlined()
 def spread_rows(chunk_keys, run_rows, rows):
     """Write the row of each point of a chunk, (P,) int32, from those of the runs."""
     run, previous = U(0), chunk_keys[0]

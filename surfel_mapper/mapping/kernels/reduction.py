@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.compiling import inlined, kernel, U
 from surfel_mapper.kernels.grouping import (
     CHUNK,
     find_key,
@@ -140,7 +140,7 @@ def add_places(places, num, chunk_keys, run_rows, words, later):
             store_sums(words, at, sums)
 
 
-@part()
+@inlined()
 def reason(x, y, z, range_sq):
     """Return the reason why a point is rejected, a row of ``left_out``."""
     px, py, pz = np.float64(x), np.float64(y), np.float64(z)
@@ -171,7 +171,7 @@ def pack_moments(keys, sums, origin, voxel_size, moments):
     return unpack_sums(sums, count, total, product)
 
 
-@part()
+@inlined()
 def unpack_sums(sums, count, total, product):
     """
     Unpack the sums of a scan, about the centres of the voxels; return the largest count.
@@ -203,7 +203,7 @@ def unpack_sums(sums, count, total, product):
     return largest
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def look_back(keys, origin, voxel_size, view):
     """
     Compute the direction from each voxel to the sensor.

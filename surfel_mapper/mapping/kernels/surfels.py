@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.compiling import inlined, kernel, U
 from surfel_mapper.kernels.layout import KEY, PRODUCT
 from surfel_mapper.kernels.prefetch import LINE_BYTES, prefetch_to_write
 from surfel_mapper.kernels.quantisation import unpack
@@ -100,7 +100,7 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
         )
 
 
-@part()
+@inlined()
 def prefetch_outputs(written, row):
     """
     Prefetch the memory of LINE surfels from a row on, to be written.
@@ -121,7 +121,7 @@ def prefetch_outputs(written, row):
     prefetch_to_write(voxel_index, min(3 * row + 2 * LINE, len(voxel_index) - 1))
 
 
-@part()
+@inlined()
 def side_of(nx, ny, nz, vx, vy, vz):
     """
     Return 1 if a normal points towards the sensor, else -1.
@@ -135,7 +135,7 @@ def side_of(nx, ny, nz, vx, vy, vz):
     return -1.0 if (largest if towards == 0.0 else towards) < 0.0 else 1.0
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def write_surfels(
     start, num, keys, moments, mean, normals, values, shape, voxel_size, bits, outputs
 ):
@@ -168,7 +168,7 @@ def write_surfels(
         position[row, 2] = (z + (mean[2, i] + half) * cell) * voxel_size
 
 
-@part()
+@inlined()
 def write_vectors(vectors, first, num, out):
     """Write the vectors of a chunk, (3, CHUNK), to rows of (K, 3) from a first one, uint64, on."""
     for i in range(U(num)):
@@ -200,7 +200,7 @@ def derive_covariances(rows, chosen, voxel_size, bits, covariance):
                 covariance[start + i, pair] = scatter[pair, i] * scale
 
 
-@part()
+@inlined()
 def gather(rows, chosen, start, num, keys, moments, written):
     """
     Gather the moments of num voxels from start on; return the largest count.
@@ -228,7 +228,7 @@ def gather(rows, chosen, start, num, keys, moments, written):
     return most
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def center(moments, num, mean, scatter):
     """
     Compute mean and scatter of the voxels of a chunk, in lattice units.
@@ -256,7 +256,7 @@ def center(moments, num, mean, scatter):
         scatter[5, i] = (moments[P + 5, i] - cz * (sz + dz)) - dz * dz * inverse
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def center_exactly(rows, chosen, start, num, scatter):
     """Compute the scatters as ``center`` does, in int64, which is exact for any count."""
     flat = rows.ravel()

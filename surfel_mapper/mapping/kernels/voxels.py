@@ -19,7 +19,7 @@ sum becomes S + n d, the second moment M + d S^T + S d^T + n d d^T.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part, U
+from surfel_mapper.kernels.compiling import inlined, kernel, U
 from surfel_mapper.kernels.grouping import hash_shift, home
 from surfel_mapper.kernels.hashing import (
     DEPTH,
@@ -296,7 +296,7 @@ def is_voxel(flat, at, key):
     return (flat[at + U(KEY)] == key) & (count_of(flat, at) > 0)
 
 
-@part()
+@inlined()
 def put_back(keys, words, view_weight, flat, found, stop):
     """Add the moments of the first voxels to their rows again, also to emptied ones."""
     for place in range(U(stop)):
@@ -335,7 +335,7 @@ def change_row(words, view_weight, flat, at, place, sign):
         flat[at + U(PRODUCT) + pair] += sign * product[U(6) * place + pair]
 
 
-@part()
+@inlined()
 def holds_exactly(words, view_weight, flat, at, place):
     """Return whether the sums of a row are the moments of a voxel, as words_of returns them."""
     count, total, product, view = words

@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 from surfel_mapper.models.kernels.frames import eigen_frame, orient
 from surfel_mapper.models.kernels.gaussian_mixture import split_mixture
 
@@ -85,7 +85,7 @@ def num_outliers(x, y, z, mean, value, frame):
     return found
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def split_two_means(x, y, z, mean, value, frame, share, scratch):
     """
     Assign each point to the nearer of two means; return how many are assigned to the second.
@@ -121,7 +121,7 @@ def split_two_means(x, y, z, mean, value, frame, share, scratch):
     return assign_sides(x, y, z, plane, mean, share)
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def subsample(x, y, z, mean, stride, sample, total):
     """Copy every stride-th point, relative to the mean, and sum the copies."""
     total[0] = total[1] = total[2] = 0.0
@@ -156,7 +156,7 @@ def sum_side(x, y, z, plane, side, sums):
     sums[0], sums[1], sums[2], sums[3], sums[4] = sx, sy, sz, second, changed
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def bisecting_plane(centre, plane):
     """Compute the bisecting plane of two means: direction to the second one, and offset."""
     plane[3] = 0.0
@@ -179,7 +179,7 @@ def assign_sides(x, y, z, plane, mean, share):
     return np.int64(number)
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def partition(points, order, low, middle, high, share, to_points, to_order):
     """
     Partition a range of rows stably into the two children.
@@ -201,7 +201,7 @@ def partition(points, order, low, middle, high, share, to_points, to_order):
         second += np.uint64(beyond)
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def count_beyond(share):
     """Return how many shares are above a half."""
     number = 0
@@ -302,7 +302,7 @@ def bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, valu
     return num
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def is_flat_cluster(x, y, z, mean, value, frame, viewpoint, rules):
     """
     Return whether a cluster is thin, dense and without outliers, so a piece of a plane.

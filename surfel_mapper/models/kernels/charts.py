@@ -8,7 +8,7 @@ A surface has a few dozen surfels, for which numpy calls take ten times as long.
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 
 MEANS_ITERATIONS = 20
 """Most iterations of 2-means on normals."""
@@ -61,7 +61,7 @@ def find_small_curved(rows, starts, count, normal, limit, found):
         found[k] = least < limit and num_points < LEAST_CURVED_POINTS
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def bisect_normals(normals, side):
     """
     Bisect normals by 2-means; return whether both halves hold some.
@@ -104,7 +104,7 @@ def bisect_normals(normals, side):
     return True
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def dot(a, b):
     """Return the scalar product of the first three elements."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -123,7 +123,7 @@ def bisect_folded(normals, mean, limit, side):
     return is_folded(normals, mean, limit) and bisect_normals(normals, side)
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def is_folded(normals, mean, limit):
     """
     Return whether too many cosines of normals (n, 3) to their mean are below a limit.

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 
 NOISE = 1e-15
 """Eigenvalues below this share of the trace are rounding errors, and become 0."""
@@ -22,7 +22,7 @@ LEAST_WIDTH = 0.04
 """A surfel with a smaller ratio of the tangential variances is a line: no reliable normal."""
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def rotate_axes(matrix, vectors, p, q):
     """Turn two axes so that element p, q of a matrix becomes 0; vectors are turned alike."""
     theta = 0.5 * (matrix[q, q] - matrix[p, p]) / matrix[p, q]
@@ -147,7 +147,7 @@ def group_moments(points, weights, starts, sums):
         sums[k, 7], sums[k, 8], sums[k, 9] = yy, yz, zz
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def orient(vectors, mean, viewpoint):
     """
     Turn eigenvectors into a right-handed frame whose normal faces the viewpoint.

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 
 ITERATIONS = 10
 """Most EM iterations."""
@@ -33,7 +33,7 @@ TERMS = 10
 """1, x, y, z, xx, xy, xz, yy, yz, zz: moments, and coefficients of a quadric."""
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def split_mixture(x, y, z, mean, share):
     """
     Compute for each point the responsibility of the second of two Gaussians.
@@ -107,7 +107,7 @@ def em_step(x, y, z, mean, share, quadric, second):
     return changing
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def sum_moments(x, y, z, mean, share, total, second):
     """Sum the moments (TERMS,) about the mean, of all points and of the second component."""
     for side in range(2):
@@ -118,7 +118,7 @@ def sum_moments(x, y, z, mean, share, total, second):
             add_moments(moments, weight, x[i] - mean[0], y[i] - mean[1], z[i] - mean[2])
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def add_moments(moments, weight, x, y, z):
     """Add a weighted point to moments (TERMS,)."""
     moments[0] += weight

@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 from surfel_mapper.models.kernels.frames import LEAST_WIDTH, plane_of
 
 SLOTS = 4
@@ -44,7 +44,7 @@ of n voxels is grown n times, and 160 m of it in voxels of 4 cm take 2 s.
 """
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def plane_distance(points, i, plane):
     """Return the distance of a point from a plane, m."""
     return abs(
@@ -52,7 +52,7 @@ def plane_distance(points, i, plane):
     )
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def add_point(points, i, origin, sums):
     """Add a point to moments (10,) about an origin: 1, x, y, z, xx, xy, xz, yy, yz, zz."""
     x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
@@ -118,7 +118,7 @@ def grow_patches(
                 tail += 1
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def slot_of(candidates, patch):
     """Return the free slot for a patch; -1 if it is a candidate already or all are taken."""
     for slot in range(SLOTS):
@@ -129,7 +129,7 @@ def slot_of(candidates, patch):
     return -1
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def abs_cosine(normal, plane):
     """Return the cosine of the angle between two planes."""
     return abs(normal[0] * plane[0] + normal[1] * plane[1] + normal[2] * plane[2])
@@ -237,7 +237,7 @@ def find_facets(points, starts, adjacent, free, order, rules, owner, planes, num
     return num_planes
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def set_plane(normal, point, plane):
     """Set a plane through a point."""
     plane[3] = 0.0
@@ -246,7 +246,7 @@ def set_plane(normal, point, plane):
         plane[3] -= normal[j] * point[j]
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def grow_facet(
     points, starts, adjacent, free, rules, owner, seed, adapts, plane, sums, visited, region, mark
 ):

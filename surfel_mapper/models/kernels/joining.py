@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 
 TERMS = np.array([3, 6, 15])
 """Coefficients of a plane, a quadric and a quartic height field."""
@@ -91,7 +91,7 @@ def touching_patches(starts, voxel, adjacent, first, owners, pairs):
     return num
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def gather(rows, number, stride, points, weights, found, low):
     """
     Copy every stride-th of the first ``number`` rows as height_errors takes them; return the end.
@@ -109,7 +109,7 @@ def gather(rows, number, stride, points, weights, found, low):
     return low
 
 
-@part(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
+@inlined(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
 def height_errors(points, low, high, normal, errors):
     """
     Fit height fields of degree 1, 2 and 4 over a plane; return by how much the quadric turns, rad.
@@ -149,7 +149,7 @@ def height_errors(points, low, high, normal, errors):
     return turn
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def local_points(points, low, normal, local):
     """
     Compute points over a plane, in [-1, 1]; return the factor to m.
@@ -193,7 +193,7 @@ def local_points(points, low, normal, local):
     return scale
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def height_sums(local, degree, powers, sums, right):
     """
     Sum monomials of x and y, and these times the height; return the weighted mean square height.
@@ -230,7 +230,7 @@ def height_sums(local, degree, powers, sums, right):
     return squares
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def solve_heights(size, sums, right, reduced, matrix):
     """
     Solve the triangular part of a least squares fit of ``size`` terms.
@@ -254,7 +254,7 @@ def solve_heights(size, sums, right, reduced, matrix):
         reduced[p] /= matrix[p, p]
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def solve_transposed(size, matrix, reduced):
     """Solve for the coefficients, in place; matrix and reduced of solve_heights."""
     for p in range(size - 1, -1, -1):
@@ -263,7 +263,7 @@ def solve_transposed(size, matrix, reduced):
         reduced[p] /= matrix[p, p]
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def turn_of(local, terms):
     """
     Return sqrt(12) times the root mean square angle of a quadric's normals to their mean.

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 
 
 @kernel(error_model='numpy')
@@ -71,7 +71,7 @@ def trace_loops(mask, ways, corners, ends):
     return num_rings
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def trace_loop(ways, start_x, start_y, corners, num):
     """
     Append one loop after the first num corners; return the new number of corners.
@@ -137,7 +137,7 @@ def simplify_loop(ring, tolerance, kept):
             num += 2
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def farthest_corner(ring):
     """Return the index of the corner that is farthest from the first."""
     far, most = 0, -1.0

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 from surfel_mapper.models.kernels.joining import gather, height_errors, TERMS
 
 JOIN_COSINE = math.cos(math.radians(50.0))
@@ -123,7 +123,7 @@ def join_layers(pairs, points, weights, starts, regions):
             join_pair(small, large, regions)
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def join_pair(small, large, regions):
     """Join two regions; the large one keeps its name."""
     patch = small
@@ -196,7 +196,7 @@ def join_smooth(edges, adjacent, points, weights, starts, boxes, floor, regions)
         joined += 1
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def push(heap, a, b, state, scratch, regions):
     """Queue a pair that gains by being joined."""
     gain = gain_of(a, b, state, scratch, regions)
@@ -204,7 +204,7 @@ def push(heap, a, b, state, scratch, regions):
         heappush(heap, (-gain, a, b, regions.patches[a], regions.patches[b]))
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def gain_of(a, b, state, scratch, regions):
     """
     Return by how much a common height field of two regions is better than two; 0 for none.
@@ -343,7 +343,7 @@ def describe_regions(names, state, regions, limits, normals, found):
                 break
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def normalise(vector):
     """Scale a vector (3,) to unit length, in place; 0 stays 0."""
     length = max(math.sqrt(dot(vector, vector)), 1e-12)
@@ -351,13 +351,13 @@ def normalise(vector):
         vector[j] /= length
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def length_of(vector):
     """Return the length of a vector (3,)."""
     return math.sqrt(dot(vector, vector))
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def dot(a, b):
     """Return the scalar product of vectors (3,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

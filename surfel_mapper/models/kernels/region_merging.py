@@ -14,10 +14,10 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def gap(delta, distance, value_i, frame_i, value_j, frame_j):
     """
     Return a lower bound of the distance of two clusters: that of their boxes of three sigma.
@@ -35,7 +35,7 @@ def gap(delta, distance, value_i, frame_i, value_j, frame_j):
     return result
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def same_surface(normal_i, normal_j, delta, scale, rules):
     """
     Return whether two pieces lie on one plane or on one arc.
@@ -54,7 +54,7 @@ def same_surface(normal_i, normal_j, delta, scale, rules):
     return same_surface_products(cosine, n_i, n_j, scale, rules)
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def same_surface_products(cosine, n_i, n_j, scale, rules):
     """Evaluate same_surface from n_i . n_j, n_i . delta and n_j . delta."""
     if abs(cosine) > rules[0] and 0.5 * (abs(n_i) + abs(n_j)) < rules[1] * scale:
@@ -62,7 +62,7 @@ def same_surface_products(cosine, n_i, n_j, scale, rules):
     return cosine > rules[2] and 0.5 * abs(n_i + n_j) < rules[3] * scale
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def find_root(parent, i):
     """Return the root of a union-find tree, with path halving."""
     while parent[i] != i:
@@ -133,7 +133,7 @@ def merge_pairs(points, starts, boxes, pairs, near, parent):
         parent[k] = find_root(parent, k)
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def touch(points, rows_i, rows_j, box_i, box_j, near):
     """Return whether two ranges of rows hold points nearer to each other than a distance."""
     for j in range(3):

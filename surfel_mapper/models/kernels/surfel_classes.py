@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 from surfel_mapper.models.kernels.frames import LEAST_WIDTH, plane_of
 
 NONE, YOUNG, FLAT, ROUGH = 0, 1, 2, 3
@@ -125,7 +125,7 @@ def classify_sparse(rows, neighbours, own, surfels, rules, kind, normal):
             normal[row, j] = -n[j] if votes < 0.0 else n[j]
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def add_moments(row, origin, count, position, covariance, sums):
     """Add the points of a voxel to moments (10,) about an origin: n, x y z, xx xy xz yy yz zz."""
     n = np.float64(count[row])
@@ -147,7 +147,7 @@ def add_moments(row, origin, count, position, covariance, sums):
     sums[9] += n * z * z + less * c[5]
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def across(x, y, z):
     """Return two unit vectors that are orthogonal to a third and to each other."""
     sign = 1.0 if z >= 0.0 else -1.0
@@ -156,7 +156,7 @@ def across(x, y, z):
     return 1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def variance(c, x, y, z):
     """Return the variance along a direction; c: xx xy xz yy yz zz."""
     along = x * x * c[0] + y * y * c[3] + z * z * c[5]

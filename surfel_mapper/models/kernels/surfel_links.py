@@ -11,7 +11,7 @@ depends on its two voxels alone, so the result does not depend on the order of c
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 from surfel_mapper.models.kernels.region_merging import same_surface_products
 from surfel_mapper.models.kernels.surfel_classes import FLAT, variance
 
@@ -19,7 +19,7 @@ ROUNDS = 3
 """Patches grow by so many voxels over sparse and rough ones."""
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def are_linked(i, j, state, rules):
     """
     Return whether two neighbours are pieces of one surface; see same_surface.
@@ -43,7 +43,7 @@ def are_linked(i, j, state, rules):
     return same_surface_products(cosine, n_i, n_j, 1.0, rules)
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def set_link(i, j, h, is_joined, links, marks, marked, num):
     """Set or clear one link, mark both rows if it changed, return how many are marked."""
     bit = np.uint64(1) << np.uint64(h)
@@ -53,7 +53,7 @@ def set_link(i, j, h, is_joined, links, marks, marked, num):
     return mark(i, marks, marked, mark(j, marks, marked, num))
 
 
-@part(error_model='numpy')
+@inlined(error_model='numpy')
 def mark(row, marks, marked, num):
     """Append a row to a list unless it is there already; return the length of the list."""
     if not marks[row]:

@@ -13,7 +13,7 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import inlined, kernel
 from surfel_mapper.kernels.grouping import CHUNK
 
 NEVER = np.iinfo(np.int64).max
@@ -55,14 +55,14 @@ def fill_times(xyz, values, filled):
     return True, num_untimed, low, high
 
 
-@part()
+@inlined()
 def is_valid(x, y, z):
     """Return whether a point is finite and not in the origin."""
     reach = (abs(x) + abs(y)) + abs(z)
     return (reach > 0.0) & (reach < math.inf)
 
 
-@part()
+@inlined()
 def is_finite(value):
     """Return whether a number is finite."""
     return abs(value) < math.inf
@@ -153,7 +153,7 @@ def move_points(points, offsets, knots, poses, turns, min_range_sq, moved):
             begin = stop
 
 
-@part()
+@inlined()
 def move_run(points, offsets, near, start, end, pair, turn, moved):
     """
     Move the points of a run, all between the same two knots.
