@@ -178,10 +178,10 @@ class BoxFilter(ShapeFilter):
         first = PointGroups.of(boxes.rows, len(boxes)).first
         chosen = np.flatnonzero(fit)
         chosen = chosen[np.argsort(first[chosen])]
-        place = np.full(len(boxes), -1)
-        place[chosen] = np.arange(len(chosen))
+        out_row = np.full(len(boxes), -1)
+        out_row[chosen] = np.arange(len(chosen))
         inside = select(scan, fit[boxes.rows])
-        groups = PointGroups.of(place[boxes.rows[fit[boxes.rows]]], len(chosen))
+        groups = PointGroups.of(out_row[boxes.rows[fit[boxes.rows]]], len(chosen))
         columns = MergedColumns(inside.columns, groups, average=self.average_columns)
         means = with_points(inside, boxes.moments.mean[chosen], columns)
         return means, chosen
@@ -300,9 +300,9 @@ def members(boxes: Boxes, most: int) -> Columns:
     count = boxes.moments.count
     order = np.argsort(boxes.rows, kind='stable')
     row = boxes.rows[order]
-    place = np.arange(len(order)) - (np.cumsum(count) - count)[row]
+    column = np.arange(len(order)) - (np.cumsum(count) - count)[row]
     ids = np.full((len(boxes), most), -1, np.int32)
-    ids[row, place] = order
+    ids[row, column] = order
     columns: Columns = {'pointIds': ids, 'numOfNN': count.astype(np.float64)}
     for name, axis in zip(('pointX', 'pointY', 'pointZ'), boxes.points.T, strict=True):
         columns[name] = np.where(ids >= 0, axis[ids] if len(axis) else 0.0, np.nan)

@@ -74,8 +74,8 @@ class Chain:
     def __init__(self, filters: Iterable[Filter] = ()) -> None:
         self.filters = tuple(filters)
         self.names = tuple(
-            f'{place} {each.name or type(each).__name__}'
-            for place, each in enumerate(self.filters, start=1)
+            f'{number} {filter_.name or type(filter_).__name__}'
+            for number, filter_ in enumerate(self.filters, start=1)
         )
 
     @classmethod
@@ -157,12 +157,12 @@ class Chain:
         """Return the chain as a list for ``from_list`` or JSON, with our names."""
         return [
             {
-                each.name: {
-                    declared.name: jsonable(getattr(each, declared.name))
-                    for declared in settings_of(type(each))
+                filter_.name: {
+                    declared.name: jsonable(getattr(filter_, declared.name))
+                    for declared in settings_of(type(filter_))
                 }
             }
-            for each in self.filters
+            for filter_ in self.filters
         ]
 
     def __len__(self) -> int:
@@ -190,16 +190,16 @@ class Chain:
         """
         scan = as_scan(scan)
         steps = []
-        for name, each in zip(self.names, self.filters, strict=True):
+        for name, filter_ in zip(self.names, self.filters, strict=True):
             start, points_in = clock(), len(scan)
             not_finite = 0
             try:
-                if isinstance(each, FiniteFilter):
+                if isinstance(filter_, FiniteFilter):
                     scan = finite(scan)
                     not_finite = points_in - len(scan)
-                    scan = each.apply_finite(scan)
+                    scan = filter_.apply_finite(scan)
                 else:
-                    scan = each.apply(scan)
+                    scan = filter_.apply(scan)
             except FilterError as error:
                 raise FilterError(f'filter {name}: {error}') from error
             milliseconds = (clock() - start) * 1e3
@@ -209,10 +209,10 @@ class Chain:
     def warm_up(self, dtype: npt.DTypeLike = np.float32) -> None:
         """Compile the kernels of this package's filters for points of a type."""
         scan = example(dtype)
-        for each in self.filters:
-            if type(each).__module__.startswith('surfel_mapper.'):
+        for filter_ in self.filters:
+            if type(filter_).__module__.startswith('surfel_mapper.'):
                 with contextlib.suppress(FilterError):  # needs a column that the example lacks
-                    replace(each).apply(scan)  # a copy: a filter may count its scans
+                    replace(filter_).apply(scan)  # a copy: a filter may count its scans
 
 
 def example(dtype: npt.DTypeLike) -> Scan:
@@ -256,25 +256,25 @@ def read(path: str) -> Any:
 
 def made(item: Any, where: str) -> Filter:
     """Return the filter that one item of a list describes."""
-    name, given = item, None
+    name, args = item, None
     if isinstance(item, Mapping):
         if len(item) != 1:
             raise ConfigError(
                 f'{where}: {len(item)} keys ({", ".join(map(str, item))}), expected one, the name '
                 'of the filter; parameters have to be indented deeper than the name'
             )
-        name, given = next(iter(item.items()))
+        name, args = next(iter(item.items()))
     if not isinstance(name, str):
         raise ConfigError(f'{where}: {name!r}, expected the name of a filter')
-    if given in (None, ''):
-        given = {}
-    if not isinstance(given, Mapping):
-        raise ConfigError(f'{where}, {name}: {given!r}, expected parameters, each `name: value`')
+    if args in (None, ''):
+        args = {}
+    if not isinstance(args, Mapping):
+        raise ConfigError(f'{where}, {name}: {args!r}, expected parameters, each `name: value`')
     try:
         cls = find(name)
     except ConfigError as error:
         raise ConfigError(f'{where}: {error}') from error
-    values = values_of(cls, given, f'{where}, {name}', libpointmatcher=name == cls.libpointmatcher)
+    values = values_of(cls, args, f'{where}, {name}', libpointmatcher=name == cls.libpointmatcher)
     try:
         return cls(**values)
     except ConfigError as error:  # a condition on several parameters
@@ -282,7 +282,7 @@ def made(item: Any, where: str) -> Filter:
 
 
 def values_of(
-    cls: type[Filter], given: Mapping[str, Any], where: str, *, libpointmatcher: bool
+    cls: type[Filter], args: Mapping[str, Any], where: str, *, libpointmatcher: bool
 ) -> dict[str, Any]:
     """
     Return the values of a filter's parameters from an item of a chain.
@@ -291,7 +291,7 @@ def values_of(
     ----------
     cls : type of Filter
         The filter.
-    given : mapping of str
+    args : mapping of str
         Our names or libpointmatcher's to values of the right type, or to their text.
     where : str
         What the errors begin with.
@@ -305,21 +305,21 @@ def values_of(
 
     """
     declared = settings_of(cls)
-    known = {each.key: each for each in declared}
-    known |= {each.libpointmatcher: each for each in declared if each.libpointmatcher}
+    by_name = {field.key: field for field in declared}
+    by_name |= {field.libpointmatcher: field for field in declared if field.libpointmatcher}
     values = (
-        {each.key: each.libpointmatcher_default for each in declared} if libpointmatcher else {}
+        {field.key: field.libpointmatcher_default for field in declared} if libpointmatcher else {}
     )
     named: dict[str, str] = {}
-    for name, value in given.items():
-        if name not in known:
-            expected = ', '.join(known) or 'it has none'
+    for name, value in args.items():
+        if name not in by_name:
+            expected = ', '.join(by_name) or 'it has none'
             raise ConfigError(
-                f'{where}: {name}: no such parameter{near(str(name), known)} ({expected})'
+                f'{where}: {name}: no such parameter{near(str(name), by_name)} ({expected})'
             )
-        key = known[name].key
-        other = named.setdefault(key, name)
-        if other != name:
-            raise ConfigError(f'{where}: {other} and {name} are one parameter, expected one')
-        values[key] = checked(f'{where}: {name}', value, known[name], takes_text=True)
+        key = by_name[name].key
+        first_name = named.setdefault(key, name)
+        if first_name != name:
+            raise ConfigError(f'{where}: {first_name} and {name} are one parameter, expected one')
+        values[key] = checked(f'{where}: {name}', value, by_name[name], takes_text=True)
     return values

@@ -56,8 +56,8 @@ def with_normals(scan: Scan) -> Scan:
     if NORMALS in scan.columns or any(name not in scan.columns for name in NORMAL_FIELDS):
         return scan
     normals = np.column_stack([scan.columns[name] for name in NORMAL_FIELDS])
-    others = {k: v for k, v in scan.columns.items() if k not in NORMAL_FIELDS}
-    return replace(scan, columns={**others, NORMALS: normals})
+    kept = {k: v for k, v in scan.columns.items() if k not in NORMAL_FIELDS}
+    return replace(scan, columns={**kept, NORMALS: normals})
 
 
 class LazyColumns(Mapping[str, Array]):
@@ -166,8 +166,8 @@ def as_fields(
         if scan.columns[name].ndim == 1:
             fields.setdefault(name, column[:, 0])
         elif is_flat or names != [f'{name}_{i}' for i in range(column.shape[1])]:
-            for i, each in enumerate(names):
-                fields.setdefault(each, column[:, i])
+            for i, component in enumerate(names):
+                fields.setdefault(component, column[:, i])
         elif column.shape[1]:
             fields.setdefault(name, column)
     return fields

@@ -59,10 +59,10 @@ class AddDescriptor(Filter):
     def apply(self, scan: Scan) -> Scan:
         """Return the scan with the column; one of another number of components is not replaced."""
         if self.column_name in scan.columns:
-            found = math.prod(scan.columns[self.column_name].shape[1:])
-            if found != self.num_components:
+            num_present = math.prod(scan.columns[self.column_name].shape[1:])
+            if num_present != self.num_components:
                 raise FilterError(
-                    f'the points have a column {self.column_name!r} of {found} components, '
+                    f'the points have a column {self.column_name!r} of {num_present} components, '
                     f'expected {self.num_components}; choose another column_name'
                 )
         column = np.empty((len(scan), self.num_components), scan.points.dtype)
@@ -198,16 +198,16 @@ class Sphericality(Filter):
             unstructured = e0 / e2
             structured = e1 / e2 * ((e1 - e0) / np.hypot(e0, e1))
         line, undefined = e1 <= 0.0, ~((e2 > 0.0) & (e0 >= 0.0))
-        for part in (unstructured, structured):
-            part[line] = 0.0
-            part[undefined] = np.nan
+        for ratio in (unstructured, structured):
+            ratio[line] = 0.0
+            ratio[undefined] = np.nan
         columns = {'sphericality': unstructured - structured}
         if self.keep_unstructureness:
             columns['unstructureness'] = unstructured
         if self.keep_structureness:
             columns['structureness'] = structured
         dtype = scan.points.dtype
-        return with_columns(scan, **{name: part.astype(dtype) for name, part in columns.items()})
+        return with_columns(scan, **{name: ratio.astype(dtype) for name, ratio in columns.items()})
 
 
 @register
@@ -265,10 +265,10 @@ class LabelMask(Filter):
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay."""
-        found = self.column(scan, self.column_name)
+        labels = self.column(scan, self.column_name)
         listed = np.zeros(len(scan), np.bool_)
         for label in self.labels:  # for few labels a third of the time of np.isin
-            listed |= found == label
+            listed |= labels == label
         return ~listed if self.remove else listed
 
 

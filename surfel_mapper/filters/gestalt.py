@@ -128,7 +128,7 @@ class Gestalt(ShapeFilter):
         """Return the keypoints, in the order of the points; nan is refused."""
         points = coordinates(scan)
         times = times_of(scan) if self.max_time_window < math.inf else None
-        kept, found = [], []
+        kept, shapes = [], []
         from scipy.spatial import cKDTree  # 0.3 s, only for chains with this filter
 
         tree = cKDTree(points)
@@ -144,10 +144,10 @@ class Gestalt(ShapeFilter):
             description = describe(points[row], points[near], self.radius_m)
             if description is not None:
                 kept.append(row)
-                found.append(description)
+                shapes.append(description)
         rows = np.array(kept, np.int64)
         columns = {
-            name: column.astype(scan.points.dtype) for name, column in self.columns(found).items()
+            name: column.astype(scan.points.dtype) for name, column in self.columns(shapes).items()
         }
         return with_columns(select(scan, rows), **columns)
 
@@ -161,37 +161,37 @@ class Gestalt(ShapeFilter):
         rows = least_of_each(random.random(len(points)), groups.rows.astype(np.int64), number)
         return np.sort(rows[random.random(number) < self.ratio])
 
-    def columns(self, found: list[dict[str, Any]]) -> dict[str, npt.NDArray[Any]]:
+    def columns(self, shapes: list[dict[str, Any]]) -> dict[str, npt.NDArray[Any]]:
         """Return the columns asked for."""
-        values = np.array([each['values'] for each in found]).reshape(-1, 3)
-        vectors = np.array([each['vectors'] for each in found]).reshape(-1, 3, 3)
-        count = np.array([each['count'] for each in found], np.int64)
+        values = np.array([shape['values'] for shape in shapes]).reshape(-1, 3)
+        vectors = np.array([shape['vectors'] for shape in shapes]).reshape(-1, 3, 3)
+        count = np.array([shape['count'] for shape in shapes], np.int64)
         columns = self.shape_columns(values, vectors, count)
         if self.keep_normals:
-            columns[NORMALS] = np.array([each['normal'] for each in found]).reshape(-1, 3)
+            columns[NORMALS] = np.array([shape['normal'] for shape in shapes]).reshape(-1, 3)
         names = [name for name in SIZES if 'gestalt' in name or name == 'warpedXYZ']
         names = names if self.keep_features else []
         names += ['means'] if self.keep_means else []
         names += ['covariance'] if self.keep_covariances else []
         for name in names:
-            columns[name] = np.array([each[name] for each in found]).reshape(-1, SIZES[name])
+            columns[name] = np.array([shape[name] for shape in shapes]).reshape(-1, SIZES[name])
         if self.keep_covariances:
             columns['covariance'] = columns['covariance'] * EIGEN_OF[self.eigen_of](count)[:, None]
         return columns
 
 
-def describe(place: Points, around: Points, radius_m: float) -> dict[str, Any] | None:
+def describe(keypoint: Points, around: Points, radius_m: float) -> dict[str, Any] | None:
     """Return the descriptor of a keypoint by the points around it; None: it has no direction."""
     moments = Moments.of_groups(around, np.zeros(len(around), np.int64), 1)
     values, vectors = eigen(moments.covariance)
     planarity, cylindricality, _ = shares(values)[0]
-    normal = vectors[0, 0] * (-1.0 if vectors[0, 0] @ place > 0.0 else 1.0)
+    normal = vectors[0, 0] * (-1.0 if vectors[0, 0] @ keypoint > 0.0 else 1.0)
     level = math.hypot(normal[0], normal[1])
     if not (planarity <= MAX_PLANARITY and level >= MIN_TILT):  # false if the normal is nan
         return None
     x, y = normal[0] / level, normal[1] / level
     R_keypoint_scan = np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
-    means, variances = relief((around - place) @ R_keypoint_scan.T, radius_m)
+    means, variances = relief((around - keypoint) @ R_keypoint_scan.T, radius_m)
     return {
         'count': len(around),
         'values': values[0],
@@ -201,7 +201,7 @@ def describe(place: Points, around: Points, radius_m: float) -> dict[str, Any] |
         'covariance': as_matrices(moments.covariance)[0],
         'gestaltMeans': means,
         'gestaltVariances': variances,
-        'warpedXYZ': R_keypoint_scan @ (moments.mean[0] - place),
+        'warpedXYZ': R_keypoint_scan @ (moments.mean[0] - keypoint),
         'gestaltShapes': (planarity, cylindricality),
     }
 

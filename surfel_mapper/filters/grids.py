@@ -106,8 +106,8 @@ class VoxelGrid(FiniteFilter):
             means = grid.centres(keys)
         unit = self.unit_normals
         columns = MergedColumns(scan.columns, groups, average=with_rows, unit=unit)
-        found = with_points(scan, means, columns)
-        return found if self.min_points == 1 else select(found, sums[:, 3] >= self.min_points)
+        reduced = with_points(scan, means, columns)
+        return reduced if self.min_points == 1 else select(reduced, sums[:, 3] >= self.min_points)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,11 +162,11 @@ class ScanVoxels:
         sums: npt.NDArray[np.float64] = np.empty((number + 1, 4))
         rows = np.empty(number if with_rows else 0, np.int32)
         xyz = np.ascontiguousarray(points.T)  # as decoded; the kernel is compiled for one layout
-        found = group_points(
+        num_voxels = group_points(
             xyz, self.size, self.shift, self.base, self.bits, keys, sums, first, rows
         )
-        sums = sums[:found]
-        return keys[1 : found + 1], sums, PointGroups(rows, first[:found], sums[:, 3])
+        sums = sums[:num_voxels]
+        return keys[1 : num_voxels + 1], sums, PointGroups(rows, first[:num_voxels], sums[:, 3])
 
     def centres(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         """Return the centres of voxels, (K, 3) m."""

@@ -135,7 +135,7 @@ class DistanceLimit(AxisFilter):
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay."""
-        test = beyond if self.remove_inside else before
+        test = beyond if self.remove_inside else nearer
         return test(scan, self.axis, self.distance_m)
 
 
@@ -150,7 +150,7 @@ class MaxDist(AxisFilter):
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay."""
-        return before(scan, self.axis, self.max_m)
+        return nearer(scan, self.axis, self.max_m)
 
 
 @register(libpointmatcher='MinDistDataPointsFilter')
@@ -167,8 +167,8 @@ class MinDist(AxisFilter):
         return beyond(scan, self.axis, self.min_m)
 
 
-def before(scan: Scan, axis: int, limit_m: float) -> Mask:
-    """Return which points lie before a limit along an axis; -1: nearer to the origin."""
+def nearer(scan: Scan, axis: int, limit_m: float) -> Mask:
+    """Return which points lie below a limit along an axis; -1: nearer to the origin."""
     measured, limit = measure(scan, axis, limit_m)
     return np.asarray(measured < limit, np.bool_)
 
@@ -235,10 +235,10 @@ class AngleLimit(Filter):
             theta_kind(theta[1], below=True),
         ]
         cosines = [cosine(limit) if math.isfinite(limit) else 0.0 for limit in (*phi, *theta)]
-        found = np.empty(len(scan), np.bool_)
+        is_beyond = np.empty(len(scan), np.bool_)
         of_type = np.array(cosines, scan.points.dtype)
-        in_wedge(scan.points.T, of_type, np.array(kinds), not self.remove_inside, found)
-        return found
+        in_wedge(scan.points.T, of_type, np.array(kinds), not self.remove_inside, is_beyond)
+        return is_beyond
 
 
 def phi_kind(limit_deg: float, *, below: bool) -> int:
@@ -297,7 +297,7 @@ class FieldOfView(Filter):
         edges = [f(limit) for limit in azimuth for f in (cosine, sine)]
         edges += [sine(limit) / cosine(limit) if abs(limit) < 90.0 else 0.0 for limit in elevation]
         extent = azimuth[1] - azimuth[0]
-        seen = np.empty(len(scan), np.bool_)
+        in_view = np.empty(len(scan), np.bool_)
         in_field_of_view(
             scan.points.T,
             np.array(edges, scan.points.dtype),
@@ -305,9 +305,9 @@ class FieldOfView(Filter):
             extent > 180.0,
             has_low,
             has_high,
-            seen,
+            in_view,
         )
-        return seen
+        return in_view
 
 
 def sine(angle_deg: float) -> float:

@@ -173,8 +173,8 @@ def by_component(average: Any, column: Array, groups: PointGroups) -> Array:
     """Return the averages of a column, component by component."""
     if column.ndim == 1:
         return np.asarray(average(column, groups))
-    parts = column.reshape(len(column), math.prod(column.shape[1:]))
-    means = [average(parts[:, i], groups) for i in range(parts.shape[1])]
+    components = column.reshape(len(column), math.prod(column.shape[1:]))
+    means = [average(components[:, i], groups) for i in range(components.shape[1])]
     shape = (len(groups.first), *column.shape[1:])
     return np.stack(means, axis=1).reshape(shape) if means else np.empty(shape, column.dtype)
 
@@ -196,10 +196,10 @@ def mean_time(values: Array, groups: PointGroups) -> Array:
     np.add.at(upper, groups.rows, values >> 32)
     np.add.at(lower, groups.rows, values & 0xFFFFFFFF)
     count = groups.count.astype(values.dtype)
-    whole, rest = np.divmod(upper, count)
-    down, left = np.divmod((rest << 32) + lower, count)
+    whole, carry = np.divmod(upper, count)
+    down, remainder = np.divmod((carry << 32) + lower, count)
     means = (whole << 32) + down
-    return np.where((means < 0) & (left > 0), means + 1, means).astype(values.dtype)
+    return np.where((means < 0) & (remainder > 0), means + 1, means).astype(values.dtype)
 
 
 def mean_colour(column: Array, groups: PointGroups) -> Array:

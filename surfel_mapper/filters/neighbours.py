@@ -41,7 +41,7 @@ MANY_LEAVES = 256
 
 Points = npt.NDArray[np.float64]
 Ids = npt.NDArray[np.int64]
-Places = npt.NDArray[np.int32]
+Indices = npt.NDArray[np.int32]
 
 Kind = TypeVar('Kind', bound=np.generic)
 
@@ -51,12 +51,11 @@ class SearchTree(NamedTuple):
     A search tree of points, as the kernels take it; kernels/search_tree.py describes the arrays.
 
     Results are in the order of the tree, where near points are close in memory; ``by_row`` sorts
-    them into the order of the input. A place is an index in the order of the tree, a row one in
-    the input.
+    them into the order of the input. Indices count in the order of the tree, rows in the input.
     """
 
     xyz: Points
-    order: Places
+    order: Indices
     links: npt.NDArray[np.int32]
     boxes: Points
     leaves: npt.NDArray[np.int32]
@@ -67,11 +66,11 @@ class SearchTree(NamedTuple):
         x, y, z = self.xyz[:, : len(self.order)]
         return x, y, z
 
-    def rows(self, places: Places, *, none: int) -> npt.NDArray[np.int32]:
-        """Return the row of each place, and ``none`` where the place is N."""
-        found = self.order.take(places, mode='clip')
-        found[places == len(self.order)] = none
-        return found
+    def rows(self, indices: Indices, *, none: int) -> npt.NDArray[np.int32]:
+        """Return the row of each index in the order of the tree; ``none`` if it is N."""
+        rows = self.order.take(indices, mode='clip')
+        rows[indices == len(self.order)] = none
+        return rows
 
     def by_row(self, values: npt.NDArray[Kind]) -> npt.NDArray[Kind]:
         """Return values (N, ...), one of each point, in the order of the input."""
@@ -115,8 +114,8 @@ def search_tree(points: Points, threads: int = 1) -> SearchTree:
     tasks = np.empty((4 * PARTS * threads, 3), np.int64)
     num_tasks = build_nodes(*arrays, 0, 0, num_leaves, least, tasks) if num_leaves else 0
 
-    def build(part: slice) -> None:
-        for node, begin, end in tasks[:num_tasks][part].tolist():
+    def build(chunk: slice) -> None:
+        for node, begin, end in tasks[:num_tasks][chunk].tolist():
             build_nodes(*arrays, node, begin, end, 0, tasks[:0])
 
     share(build, int(num_tasks), threads)
@@ -125,7 +124,7 @@ def search_tree(points: Points, threads: int = 1) -> SearchTree:
 
 
 def visit_neighbours(
-    visit: Callable[[slice, Places, Points], object],
+    visit: Callable[[slice, Indices, Points], object],
     tree: SearchTree,
     number: int,
     max_distance_m: float = math.inf,
@@ -134,26 +133,26 @@ def visit_neighbours(
     threads: int = 1,
 ) -> None:
     """
-    Call a function with the nearest neighbours of all points, piece by piece.
+    Call a function with the nearest neighbours of all points, block by block.
 
     Parameters
     ----------
     visit : callable
         Called, maybe by several threads at once, with the slice of P points in the order of the
-        tree, the places of their neighbours in that order (P, number) int32, N past the last, and
+        tree, the indices of their neighbours in that order (P, number) int32, N past the last, and
         the squared distances to them (P, number) float64, m^2, inf past the last. Each point is
-        in one piece.
+        in one block.
     tree : SearchTree
-        That of search_tree.
+        As search_tree returns it.
     number : int
         Neighbours of each, including the point itself or one at the same place; at most N.
     max_distance_m : float
         Points farther away are no neighbours.
     ordered : bool
-        Whether the nearest is first, of equally near ones that of the lowest row; otherwise in
-        no particular order.
+        Whether the nearest is first, of equally near ones the one of the lowest row. The order
+        is arbitrary otherwise.
     threads : int
-        Threads that share the work; the pieces do not depend on it.
+        Threads that share the work; the blocks do not depend on it.
 
     """
     if not len(tree.order):
@@ -164,8 +163,8 @@ def visit_neighbours(
     num_leaves = len(tree.leaves)
     step = max(AT_ONCE // (number * LEAF), 1)
 
-    def search(part: slice) -> None:
-        for begin in range(part.start * step, min(part.stop * step, num_leaves), step):
+    def search(chunk: slice) -> None:
+        for begin in range(chunk.start * step, min(chunk.stop * step, num_leaves), step):
             block = np.array([begin, min(begin + step, num_leaves)])
             points = slice(begin * LEAF, min((begin + step) * LEAF, len(tree.order)))
             shape = points.stop - points.start, number
@@ -198,8 +197,8 @@ def neighbour_rows(points: Points, number: int, threads: int = 1) -> npt.NDArray
     tree = search_tree(points, threads)
     ids = np.empty((len(points), number), np.int32)
 
-    def gather(part: slice, near: Places, _: Points) -> None:
-        ids[tree.order[part]] = tree.rows(near, none=len(points))
+    def gather(span: slice, near: Indices, _: Points) -> None:
+        ids[tree.order[span]] = tree.rows(near, none=len(points))
 
     visit_neighbours(gather, tree, number, ordered=True, threads=threads)
     return ids
@@ -232,8 +231,8 @@ class StatisticalOutliers(FiniteFilter):
         tree = search_tree(points, self.threads)
         distances = np.empty(len(points))
 
-        def average(part: slice, _: Places, squared: Points) -> None:
-            distances[part] = np.sqrt(squared).sum(axis=1) / (number - 1)  # its own is 0
+        def average(span: slice, _: Indices, squared: Points) -> None:
+            distances[span] = np.sqrt(squared).sum(axis=1) / (number - 1)  # its own is 0
 
         visit_neighbours(average, tree, number, threads=self.threads)
         limit = distances.mean() + self.std_ratio * distances.std(ddof=1)
@@ -262,8 +261,8 @@ class RadiusOutliers(FiniteFilter):
         tree = search_tree(points, self.threads)
         stays = np.empty(len(points), np.bool_)
 
-        def decide(part: slice, near: Places, _: Points) -> None:
-            stays[part] = near[:, -1] < len(points)  # as many as asked for
+        def decide(span: slice, near: Indices, _: Points) -> None:
+            stays[span] = near[:, -1] < len(points)  # as many as asked for
 
         visit_neighbours(decide, tree, number, self.radius_m, threads=self.threads)
         return tree.by_row(stays)

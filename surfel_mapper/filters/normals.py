@@ -60,19 +60,19 @@ def estimate_normals(
     chosen = SurfaceNormal(
         num_neighbours=num_neighbours, max_distance_m=max_distance_m, threads=threads
     )
-    given: npt.NDArray[Any] = as_scan(points).points
-    finite = np.isfinite(given).all(axis=1)
-    result = np.full((len(given), 3), np.nan)
+    all_points: npt.NDArray[Any] = as_scan(points).points
+    finite = np.isfinite(all_points).all(axis=1)
+    result = np.full((len(all_points), 3), np.nan)
     if not finite.any():
         return result
-    places = given[finite].astype(np.float64)
-    middle = places[0]
-    found = np.asarray(chosen.apply(places - middle).columns[NORMALS], np.float64)
+    valid_points = all_points[finite].astype(np.float64)
+    middle = valid_points[0]
+    normals = np.asarray(chosen.apply(valid_points - middle).columns[NORMALS], np.float64)
     if viewpoint is not None:
         sensor = as_numbers('viewpoint', viewpoint)
         if sensor.shape != (3,) or not np.isfinite(sensor).all():
             raise ValueError(f'viewpoint: {viewpoint}, expected x y z, finite')
-        sight = sensor - places
-        found = np.where((found * sight).sum(axis=1)[:, None] < 0.0, -found, found)
-    result[finite] = found
+        sight = sensor - valid_points
+        normals = np.where((normals * sight).sum(axis=1)[:, None] < 0.0, -normals, normals)
+    result[finite] = normals
     return result

@@ -73,18 +73,18 @@ def register(
 def _register(cls: F, *, name: str, libpointmatcher: str) -> F:
     if not (isinstance(cls, type) and issubclass(cls, Filter)):
         raise ConfigError(f'{cls!r}: expected a class derived from surfel_mapper.filters.Filter')
-    own = [each for each in cls.__mro__ if each not in (*FiniteFilter.__mro__, cls)] + [cls]
-    if not any(name in vars(each) for each in own for name in ('keep', 'apply', 'apply_finite')):
+    own = [base for base in cls.__mro__ if base not in (*FiniteFilter.__mro__, cls)] + [cls]
+    if not any(name in vars(base) for base in own for name in ('keep', 'apply', 'apply_finite')):
         raise ConfigError(f'{cls.__name__}: a filter has to implement keep or apply')
     cls.name = name or re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '_', cls.__name__).lower()
     cls.libpointmatcher = libpointmatcher
-    for each in filter(None, (cls.name, libpointmatcher)):
-        other = _FILTERS.setdefault(each, cls)
-        if (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
+    for key in filter(None, (cls.name, libpointmatcher)):
+        registered = _FILTERS.setdefault(key, cls)
+        if (registered.__module__, registered.__qualname__) != (cls.__module__, cls.__qualname__):
             raise ConfigError(
-                f'filter {each!r} of {cls.__module__}: {other.__module__} has one of this name'
+                f'filter {key!r} of {cls.__module__}: {registered.__module__} has one of this name'
             )
-        _FILTERS[each] = cls  # reloading a module replaces its filters
+        _FILTERS[key] = cls  # reloading a module replaces its filters
     return cls
 
 

@@ -159,11 +159,11 @@ class MaxQuantileOnAxis(Filter):
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay; those at the quantile and nan do not."""
         values = scan.points[:, self.axis]
-        known = values[values == values]
-        if not len(known):
+        valid = values[values == values]
+        if not len(valid):
             return np.zeros(len(scan), np.bool_)
-        rank = math.floor(len(known) * self.ratio)
-        quantile = np.partition(known, rank)[rank]
+        rank = math.floor(len(valid) * self.ratio)
+        quantile = np.partition(valid, rank)[rank]
         return np.asarray(values < quantile if self.remove_beyond else values > quantile)
 
 
@@ -226,8 +226,8 @@ def buckets(normals: Points, step_rad: float) -> Ids:
     """
     Return the bucket of every direction, (N,) int64.
 
-    Buckets are bands about z, each divided into parts of about equal area on the sphere;
-    libpointmatcher divides every band into the same number of parts, so those about z are small.
+    Buckets are bands about z, each divided into sectors of about equal area on the sphere.
+    libpointmatcher divides every band into the same number, which makes those about z small.
     """
     lengths = np.sqrt((normals * normals).sum(axis=1))
     cosine = np.divide(normals[:, 2], lengths, out=np.ones_like(lengths), where=lengths > 0.0)
@@ -235,11 +235,11 @@ def buckets(normals: Points, step_rad: float) -> Ids:
     band = np.arccos(np.clip(cosine, -1.0, 1.0)) / step_rad
     band = np.minimum(band.astype(np.int64), num_bands - 1)
     middles = np.minimum((np.arange(num_bands) + 0.5) * step_rad, math.pi)
-    num_parts = np.maximum(np.rint(2.0 * np.pi / step_rad * np.sin(middles)), 1.0)
+    num_sectors = np.maximum(np.rint(2.0 * np.pi / step_rad * np.sin(middles)), 1.0)
     turn = np.arctan2(normals[:, 1], normals[:, 0]) / (2.0 * np.pi) % 1.0
-    part = np.minimum(turn * num_parts[band], num_parts[band] - 1.0).astype(np.int64)
-    first = np.cumsum(num_parts) - num_parts
-    return np.asarray(first[band] + part, np.int64)
+    sector = np.minimum(turn * num_sectors[band], num_sectors[band] - 1.0).astype(np.int64)
+    first = np.cumsum(num_sectors) - num_sectors
+    return np.asarray(first[band] + sector, np.int64)
 
 
 @register(libpointmatcher='CovarianceSamplingDataPointsFilter')
@@ -292,9 +292,9 @@ def resistance(points: Points, normals: Points, torque_norm: int) -> Points:
     return np.asarray(forces @ motions[:, strengths >= UNHELD * strengths[-1]])
 
 
-def normals_of(each: Filter, scan: Scan) -> Points:
+def normals_of(filter_: Filter, scan: Scan) -> Points:
     """Return the normals, (N, 3) float64."""
-    normals = each.column(with_normals(scan), NORMALS)
+    normals = filter_.column(with_normals(scan), NORMALS)
     if normals.shape != (len(scan), 3):
         raise FilterError(f'{NORMALS}: shape {normals.shape}, expected (N, 3)')
     return normals.astype(np.float64)

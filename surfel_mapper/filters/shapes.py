@@ -36,7 +36,7 @@ from surfel_mapper.filters.kernels.shapes import group_moments, neighbour_moment
 from surfel_mapper.filters.neighbours import (
     coordinates,
     Ids,
-    Places,
+    Indices,
     Points,
     search_tree,
     SearchTree,
@@ -90,8 +90,8 @@ class Moments:
         return cls(count, mean, covariance, radius)
 
     @classmethod
-    def of_neighbours(cls, tree: SearchTree, near: Places) -> Moments:
-        """Return the moments of neighbours, from their places (M, K), N past the last."""
+    def of_neighbours(cls, tree: SearchTree, near: Indices) -> Moments:
+        """Return the moments of neighbours, from their indices (M, K), N past the last."""
         number = len(near)
         count, mean = np.empty(number, np.int64), np.empty((number, 3))
         covariance, radius = np.empty((6, number)), np.empty(number)
@@ -154,9 +154,9 @@ def eigen_by_size(matrices: Points) -> tuple[Points, Points]:
         As by eigen.
 
     """
-    found, columns = np.linalg.eigh(as_matrices(matrices))
-    order = np.argsort(np.abs(found), axis=1, kind='stable')
-    values = np.take_along_axis(np.abs(found), order, axis=1)
+    signed, columns = np.linalg.eigh(as_matrices(matrices))
+    order = np.argsort(np.abs(signed), axis=1, kind='stable')
+    values = np.take_along_axis(np.abs(signed), order, axis=1)
     vectors = np.take_along_axis(columns.transpose(0, 2, 1), order[:, :, None], axis=1)
     leading = np.abs(vectors).argmax(axis=2)[:, :, None]
     vectors = vectors * np.where(np.take_along_axis(vectors, leading, axis=2) < 0.0, -1.0, 1.0)
@@ -185,9 +185,9 @@ def shares(values: Points) -> Points:
     """
     e0, e1, e2 = values.T
     total = e0 + e1 + e2
-    parts = np.stack([2.0 * (e1 - e0), e2 - e1, 3.0 * e0], axis=1)
-    found = total[:, None] > 0.0
-    return np.asarray(np.divide(parts, total[:, None], out=np.zeros_like(parts), where=found))
+    terms = np.stack([2.0 * (e1 - e0), e2 - e1, 3.0 * e0], axis=1)
+    nonzero = total[:, None] > 0.0
+    return np.asarray(np.divide(terms, total[:, None], out=np.zeros_like(terms), where=nonzero))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -281,11 +281,11 @@ class SurfaceNormal(ShapeFilter):
         }
         ids = np.empty((len(points), number), np.int32) if self.needs_ids else None
 
-        def describe(part: slice, near: Places, _: Points) -> None:
-            for name, column in self.describe(tree, part, near).items():
-                columns[name][part] = column
+        def describe(span: slice, near: Indices, _: Points) -> None:
+            for name, column in self.describe(tree, span, near).items():
+                columns[name][span] = column
             if ids is not None:
-                ids[tree.order[part]] = tree.rows(near, none=-1)
+                ids[tree.order[span]] = tree.rows(near, none=-1)
 
         visit_neighbours(
             describe,
@@ -304,8 +304,10 @@ class SurfaceNormal(ShapeFilter):
             columns[MATCHED_IDS] = ids
         return with_columns(scan, **columns)
 
-    def describe(self, tree: SearchTree, part: slice, near: Places) -> dict[str, npt.NDArray[Any]]:
-        """Return the selected columns of a part of the points, from their neighbours."""
+    def describe(
+        self, tree: SearchTree, span: slice, near: Indices
+    ) -> dict[str, npt.NDArray[Any]]:
+        """Return the selected columns of a span of the points, from their neighbours."""
         moments = Moments.of_neighbours(tree, near)
         columns = self.shape_columns(
             *eigen(moments.covariance, smallest_only=not self.keep_eigen_vectors), moments.count
@@ -313,7 +315,7 @@ class SurfaceNormal(ShapeFilter):
         if self.keep_densities:
             columns[DENSITIES] = moments.density
         if self.keep_mean_distances:
-            points = np.stack([values[part] for values in tree.points], axis=1)
+            points = np.stack([values[span] for values in tree.points], axis=1)
             columns[MEAN_DISTS] = np.linalg.norm(points - moments.mean, axis=1)
         return columns
 
@@ -330,10 +332,10 @@ def smoothed(normals: Points, ids: npt.NDArray[np.int32]) -> Points:
     A normal and its opposite are equivalent: each is turned to the side of the point's own.
     """
     total = np.zeros_like(normals)
-    known = np.isfinite(normals[:, 0])
+    is_finite = np.isfinite(normals[:, 0])
     for column in ids.T:
-        counts = (column >= 0) & known[column]
-        others = np.where(counts[:, None], normals[column], 0.0)
-        side = np.einsum('ni,ni->n', others, normals)
-        total += np.where(side < 0.0, -1.0, 1.0)[:, None] * others
-    return unit(np.where(known[:, None], total, np.nan))
+        counts = (column >= 0) & is_finite[column]
+        neighbours = np.where(counts[:, None], normals[column], 0.0)
+        side = np.einsum('ni,ni->n', neighbours, normals)
+        total += np.where(side < 0.0, -1.0, 1.0)[:, None] * neighbours
+    return unit(np.where(is_finite[:, None], total, np.nan))

@@ -48,8 +48,8 @@ def outside_box(xyz, pose, low, high, is_outside):
         by = ((r10 * x + r11 * y) + r12 * z) + t1
         bz = ((r20 * x + r21 * y) + r22 * z) + t2
         within = (bx > lx) & (bx < hx) & (by > ly) & (by < hy) & (bz > lz) & (bz < hz)
-        known = (bx == bx) & (by == by) & (bz == bz)
-        is_outside[i] = (0 if within else 1) if known else -1
+        is_number = (bx == bx) & (by == by) & (bz == bz)
+        is_outside[i] = (0 if within else 1) if is_number else -1
 
 
 NEVER, ALWAYS, BOTH, EITHER = range(4)
@@ -57,7 +57,7 @@ NEVER, ALWAYS, BOTH, EITHER = range(4)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def in_field_of_view(xyz, edges, has_azimuth, is_wide, has_low, has_high, seen):
+def in_field_of_view(xyz, edges, has_azimuth, is_wide, has_low, has_high, within):
     """
     Find which points are within an azimuth and an elevation.
 
@@ -66,7 +66,7 @@ def in_field_of_view(xyz, edges, has_azimuth, is_wide, has_low, has_high, seen):
              tangents of the lowest and of the highest elevation
     has_azimuth, has_low, has_high  whether these bounds apply
     is_wide  whether the azimuth is more than half a turn
-    seen     (N,) bool, out; false at the origin and for coordinates that are not finite
+    within   (N,) bool, out; false at the origin and for coordinates that are not finite
     """
     start_cos, start_sin, end_cos, end_sin = edges[0], edges[1], edges[2], edges[3]
     low, high = edges[4], edges[5]
@@ -75,24 +75,24 @@ def in_field_of_view(xyz, edges, has_azimuth, is_wide, has_low, has_high, seen):
         x, y, z = all_x[i], all_y[i], all_z[i]
         planar = np.sqrt(x * x + y * y)
         somewhere = ((planar > 0.0) | (z != 0.0)) & (abs(planar + z) < np.inf)
-        after = y * start_cos >= x * start_sin
-        before = y * end_cos <= x * end_sin
-        turned = (after & before) | (is_wide & (after | before)) | (not has_azimuth)
+        past = y * start_cos >= x * start_sin
+        short = y * end_cos <= x * end_sin
+        turned = (past & short) | (is_wide & (past | short)) | (not has_azimuth)
         above = (z >= planar * low) | (not has_low)
         below = (z <= planar * high) | (not has_high)
-        seen[i] = somewhere & turned & above & below
+        within[i] = somewhere & turned & above & below
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def in_wedge(xyz, cosines, kinds, want_all, found):
+def in_wedge(xyz, cosines, kinds, want_all, is_beyond):
     """
     Find the points whose phi and theta are beyond limits.
 
-    xyz       (3, N) float32 or float64, m
-    cosines   (4,) of the type of xyz, of the limits: phi above, phi below, theta above, below
-    kinds     (4,) int64: for phi any, for theta NEVER, ALWAYS or BOTH
-    want_all  whether all four must hold, or any
-    found     (N,) bool, out; an undefined angle is beyond no limit
+    xyz        (3, N) float32 or float64, m
+    cosines    (4,) of the type of xyz, of the limits: phi above, phi below, theta above, below
+    kinds      (4,) int64: for phi any, for theta NEVER, ALWAYS or BOTH
+    want_all   whether all four must hold, or any
+    is_beyond  (N,) bool, out; an undefined angle is beyond no limit
     """
     c0, c1, c2, c3 = cosines[0], cosines[1], cosines[2], cosines[3]
     always0, both0, either0 = kinds[0] == ALWAYS, kinds[0] == BOTH, kinds[0] == EITHER
@@ -104,11 +104,11 @@ def in_wedge(xyz, cosines, kinds, want_all, found):
         x, y, z = all_x[i], all_y[i], all_z[i]
         planar_sq = x * x + y * y
         planar, distance = np.sqrt(planar_sq), np.sqrt(planar_sq + z * z)
-        left, right = y >= 0.0, y < 0.0
+        is_left, is_right = y >= 0.0, y < 0.0
         edge = planar * c0
-        phi_above = always0 | (both0 & left & (x < edge)) | (either0 & (left | (x > edge)))
+        phi_above = always0 | (both0 & is_left & (x < edge)) | (either0 & (is_left | (x > edge)))
         edge = planar * c1
-        phi_below = always1 | (both1 & right & (x < edge)) | (either1 & (right | (x > edge)))
+        phi_below = always1 | (both1 & is_right & (x < edge)) | (either1 & (is_right | (x > edge)))
         has_phi, has_theta = planar > 0.0, distance > 0.0
         phi_above &= has_phi
         phi_below &= has_phi
@@ -116,4 +116,4 @@ def in_wedge(xyz, cosines, kinds, want_all, found):
         theta_below = (always3 | (edge3 & (z > distance * c3))) & has_theta
         every = phi_above & phi_below & theta_above & theta_below
         some = phi_above | phi_below | theta_above | theta_below
-        found[i] = every | (some & (not want_all))
+        is_beyond[i] = every | (some & (not want_all))

@@ -65,12 +65,12 @@ def point_gap(boxes, node, x, y, z):
 
 
 @inlined()
-def box_gap(boxes, one, other):
+def box_gap(boxes, first, second):
     """Return the squared distance between the boxes of two nodes."""
-    total, one, other = 0.0, U(one), U(other)
+    total, first, second = 0.0, U(first), U(second)
     for axis in range(U(3)):
-        low = max(boxes[one, axis], boxes[other, axis])
-        high = min(boxes[one, U(3) + axis], boxes[other, U(3) + axis])
+        low = max(boxes[first, axis], boxes[second, axis])
+        high = min(boxes[first, U(3) + axis], boxes[second, U(3) + axis])
         apart = max(low - high, 0.0)
         total += apart * apart
     return total
@@ -84,12 +84,12 @@ def reach_of(links, boxes, leaf, k, num_points):
     It is the largest one between the boxes of the leaf and of its lowest ancestor of k points.
     """
     node, first = leaf, np.int64(links[FIRST, leaf]) * LEAF
-    held = min(first + LEAF, num_points) - first
-    while held < k and links[PARENT, node] >= 0:
+    num_inside = min(first + LEAF, num_points) - first
+    while num_inside < k and links[PARENT, node] >= 0:
         node = np.int64(links[PARENT, node])
         first = np.int64(links[FIRST, node]) * LEAF
         # the subtree of the left child, of half of the leaves, ends before the right one
-        held = min(first + (np.int64(links[RIGHT, node]) - node) * LEAF, num_points) - first
+        num_inside = min(first + (np.int64(links[RIGHT, node]) - node) * LEAF, num_points) - first
     total = TINY
     for axis in range(3):
         below = boxes[leaf, 3 + axis] - boxes[node, axis]
@@ -108,53 +108,53 @@ def sibling_of(links, node):
 
 
 @inlined()
-def scan(xs, ys, zs, base, x, y, z, bound, count, squares, found, apart):
-    """Append the points of a leaf closer than the bound; return the number of points held."""
+def scan(xs, ys, zs, base, x, y, z, bound, count, squares, indices, apart):
+    """Append the points of a leaf closer than the bound; return the number of neighbours."""
     for i in range(U(LEAF)):
         apart[i] = square(xs[base + i] - x, ys[base + i] - y, zs[base + i] - z)
     for i in range(U(LEAF)):
-        squares[count], found[count] = apart[i], np.int32(base + i)
+        squares[count], indices[count] = apart[i], np.int32(base + i)
         count += U(apart[i] < bound)
         # the entry of a farther point is overwritten
     return count
 
 
 @inlined()
-def search(xs, ys, zs, links, boxes, node, x, y, z, k, bound, held, apart, stack):
+def search(xs, ys, zs, links, boxes, node, x, y, z, k, bound, buffers, apart, stack):
     """
-    Search from a leaf upwards; return the number of points held and the bound.
+    Search from a leaf upwards; return the number of neighbours and the bound.
 
-    held  squares (C,) float64, out: squared distances of the points held; C at least k + 2 LEAF,
-          a multiple of VECTORS;
-          found (C,) int32, out: their places in the order of the tree;
-          floats (FLOATS,) float32, overwritten
+    buffers  squares (C,) float64, out: squared distances of the neighbours; C at least
+             k + 2 LEAF, a multiple of VECTORS;
+             indices (C,) int32, out: their indices in the order of the tree;
+             floats (FLOATS,) float32, overwritten
     """
-    squares, found, floats = held
+    squares, indices, floats = buffers
     full = U(len(squares) - LEAF)
     base = U(links[FIRST, node]) * U(LEAF)
-    count = scan(xs, ys, zs, base, x, y, z, bound, U(0), squares, found, apart)
+    count = scan(xs, ys, zs, base, x, y, z, bound, U(0), squares, indices, apart)
     if count > k:
-        bound = keep_least(squares, found, count, k, bound, floats)
+        bound = keep_least(squares, indices, count, k, bound, floats)
         count = k
     while links[PARENT, node] >= 0:
         node, stack[0] = sibling_of(links, node)
         top = 1
         while top > 0:
             top -= 1
-            other = stack[top]
-            if point_gap(boxes, other, x, y, z) >= bound:
+            branch = stack[top]
+            if point_gap(boxes, branch, x, y, z) >= bound:
                 continue
-            right = np.int64(links[RIGHT, other])
-            if right < 0:
-                base = U(links[FIRST, other]) * U(LEAF)
-                count = scan(xs, ys, zs, base, x, y, z, bound, count, squares, found, apart)
+            upper = np.int64(links[RIGHT, branch])
+            if upper < 0:
+                base = U(links[FIRST, branch]) * U(LEAF)
+                count = scan(xs, ys, zs, base, x, y, z, bound, count, squares, indices, apart)
                 if count > full:
-                    bound = keep_least(squares, found, count, k, bound, floats)
+                    bound = keep_least(squares, indices, count, k, bound, floats)
                     count = k
             else:
-                left = other + 1
-                left_first = point_gap(boxes, left, x, y, z) < point_gap(boxes, right, x, y, z)
-                stack[top], stack[top + 1] = (right, left) if left_first else (left, right)
+                lower = branch + 1
+                left_first = point_gap(boxes, lower, x, y, z) < point_gap(boxes, upper, x, y, z)
+                stack[top], stack[top + 1] = (upper, lower) if left_first else (lower, upper)
                 top += 2
     return count, bound
 
@@ -162,7 +162,7 @@ def search(xs, ys, zs, links, boxes, node, x, y, z, k, bound, held, apart, stack
 @inlined()
 def gather(links, boxes, leaf, reach, stack, near, bases):
     """
-    Gather the leaves whose boxes are closer to that of a leaf than a squared distance.
+    Gather the leaves with boxes closer to the box of a leaf than a squared distance.
 
     near   (6, GATHERED) float64, out: their boxes
     bases  (GATHERED,) uint64, out: their first points
@@ -174,19 +174,19 @@ def gather(links, boxes, leaf, reach, stack, near, bases):
     while top > 0:
         while top > 0 and num >= 0:
             top -= 1
-            other = stack[top]
-            if box_gap(boxes, leaf, other) >= reach:
+            branch = stack[top]
+            if box_gap(boxes, leaf, branch) >= reach:
                 continue
-            right = np.int64(links[RIGHT, other])
+            right = np.int64(links[RIGHT, branch])
             if right >= 0:
-                stack[top], stack[top + 1] = right, other + 1
+                stack[top], stack[top + 1] = right, branch + 1
                 top += 2
             elif num == GATHERED:
                 num = np.int64(-1)
             else:
                 for side in range(6):
-                    near[side, num] = boxes[other, side]
-                bases[num] = U(links[FIRST, other]) * U(LEAF)
+                    near[side, num] = boxes[branch, side]
+                bases[num] = U(links[FIRST, branch]) * U(LEAF)
                 num += 1
         top = 0
         if num >= 0 and links[PARENT, node] >= 0:
@@ -204,7 +204,7 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
     block      (2,) int64, the first leaf, and the one after the last
     within_sq  float64, m^2: only points closer than this
     ordered    bool, whether neighbours are sorted by distance, equal ones by row
-    near       (P, k) int32, out: neighbours' places in the order of the tree, N past the last
+    near       (P, k) int32, out: neighbours' indices in the order of the tree, N past the last
     squared    (P, k) float64, out: squared distances, m^2, inf past the last
     """
     xyz, order, links, boxes, leaves = tree
@@ -212,13 +212,13 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
     k = U(near.shape[1])
     size = (max(U(2) * k, k + U(32)) + U(LEAF + VECTORS - 1)) & ~U(VECTORS - 1)
     full = size - U(LEAF)
-    squares, found, apart = np.empty(size), np.empty(size, np.int32), np.empty(LEAF)
+    squares, indices, apart = np.empty(size), np.empty(size, np.int32), np.empty(LEAF)
     floats = np.empty(FLOATS, np.float32)
-    held = squares, found, floats
+    buffers = squares, indices, floats
     stack, sides = np.empty(128, np.int64), np.empty((6, GATHERED))
     low_x, low_y, low_z = sides[0], sides[1], sides[2]
     high_x, high_y, high_z = sides[3], sides[4], sides[5]
-    bases, taken, gaps = np.empty(GATHERED, U), np.empty(GATHERED, U), np.empty(GATHERED)
+    bases, close, gaps = np.empty(GATHERED, U), np.empty(GATHERED, U), np.empty(GATHERED)
     bound, last_x, last_y, last_z = within_sq, 0.0, 0.0, 0.0
     for leaf in range(block[0], block[1]):
         node = np.int64(leaves[leaf])
@@ -228,13 +228,13 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
         num_near = gather(links, boxes, node, reach, stack, sides, bases)
         at, visited = U(0), U(0)
         for _ in range(num):
-            place, out = start + at, start + at - U(block[0] * LEAF)
-            x, y, z = xs[place], ys[place], zs[place]
+            index, out = start + at, start + at - U(block[0] * LEAF)
+            x, y, z = xs[index], ys[index], zs[index]
             bound = widened(bound, square(x - last_x, y - last_y, z - last_z), reach)
             last_x, last_y, last_z = x, y, z
             if num_near < 0:
                 count, bound = search(
-                    xs, ys, zs, links, boxes, node, x, y, z, k, bound, held, apart, stack
+                    xs, ys, zs, links, boxes, node, x, y, z, k, bound, buffers, apart, stack
                 )
                 at += U(1)
             else:
@@ -243,32 +243,32 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
                     dy = outside(low_y[i], high_y[i], y)
                     dz = outside(low_z[i], high_z[i], z)
                     gaps[i] = square(dx, dy, dz)
-                count = scan(xs, ys, zs, start, x, y, z, bound, U(0), squares, found, apart)
+                count = scan(xs, ys, zs, start, x, y, z, bound, U(0), squares, indices, apart)
                 visited |= U(1) << at
                 at = U(place_of_least(apart, visited))
                 if count > k:
-                    bound = keep_least(squares, found, count, k, bound, floats)
+                    bound = keep_least(squares, indices, count, k, bound, floats)
                     count = k
-                num_taken = U(0)
+                num_close = U(0)
                 for i in range(U(1), U(num_near)):
-                    taken[num_taken], gaps[num_taken] = bases[i], gaps[i]
-                    num_taken += U(gaps[i] < bound)
-                for i in range(num_taken):
+                    close[num_close], gaps[num_close] = bases[i], gaps[i]
+                    num_close += U(gaps[i] < bound)
+                for i in range(num_close):
                     if gaps[i] < bound:
                         count = scan(
-                            xs, ys, zs, taken[i], x, y, z, bound, count, squares, found, apart
+                            xs, ys, zs, close[i], x, y, z, bound, count, squares, indices, apart
                         )
                         if count > full:
-                            bound = keep_least(squares, found, count, k, bound, floats)
+                            bound = keep_least(squares, indices, count, k, bound, floats)
                             count = k
             if count > k:
-                bound = keep_least(squares, found, count, k, bound, floats)
+                bound = keep_least(squares, indices, count, k, bound, floats)
             else:
                 bound = largest(squares, k) if count == k else within_sq
             count = min(count, k)
             if ordered:
-                sort(squares, found, order, count)
+                sort(squares, indices, order, count)
             for i in range(count):
-                near[out, i], squared[out, i] = found[i], squares[i]
+                near[out, i], squared[out, i] = indices[i], squares[i]
             for i in range(count, k):
                 near[out, i], squared[out, i] = len(order), math.inf

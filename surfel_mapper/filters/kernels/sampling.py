@@ -22,16 +22,16 @@ def choose(resists, by_motion, number, chosen):
     chosen     (N,) bool, in: false, out: whether chosen
     """
     num_motions = resists.shape[1]
-    held = np.zeros(num_motions)
-    place = np.zeros(num_motions, np.int64)
+    constrained = np.zeros(num_motions)
+    rank = np.zeros(num_motions, np.int64)
     for _ in range(number):
-        motion = np.argmin(held)
-        while chosen[by_motion[motion, place[motion]]]:
-            place[motion] += 1
-        point = by_motion[motion, place[motion]]
+        motion = np.argmin(constrained)
+        while chosen[by_motion[motion, rank[motion]]]:
+            rank[motion] += 1
+        point = by_motion[motion, rank[motion]]
         chosen[point] = True
         for k in range(num_motions):
-            held[k] += resists[point, k] * resists[point, k]
+            constrained[k] += resists[point, k] * resists[point, k]
 
 
 @njit(cache=True, nogil=True)

@@ -64,11 +64,11 @@ def build_nodes(points, order, links, boxes, xyz, node, begin, end, least, tasks
         for i in range(first, last):
             values[U(i)] = points[U(order[U(i)]), axis]
         split_at(values, order, first, last, middle * LEAF)
-        left, right = node + 1, node + 2 * (middle - begin)
-        links[RIGHT, node] = right
-        links[PARENT, left] = links[PARENT, right] = node
-        stack[top, 0], stack[top, 1], stack[top, 2] = right, middle, end
-        stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = left, begin, middle
+        lower, upper = node + 1, node + 2 * (middle - begin)
+        links[RIGHT, node] = upper
+        links[PARENT, lower] = links[PARENT, upper] = node
+        stack[top, 0], stack[top, 1], stack[top, 2] = upper, middle, end
+        stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = lower, begin, middle
         top += 2
     return num_tasks
 

@@ -57,7 +57,7 @@ def neighbour_moments(xs, ys, zs, near, count, mean, covariance, radius):
     Compute the moments of the neighbours of points.
 
     xs, ys, zs  (N,) float64, m
-    near        (M, K) int32, places of the neighbours in these, padded by N at the end
+    near        (M, K) int32, indices of the neighbours in these, padded by N at the end
     count       (M,) int64, out: number of neighbours
     mean        (M, 3) float64, out, m
     covariance  (6, M) float64, out: xx xy xz yy yz zz of scatter / (count - 1), m^2
@@ -69,16 +69,16 @@ def neighbour_moments(xs, ys, zs, near, count, mean, covariance, radius):
             number -= np.uint64(1)
         sx, sy, sz = 0.0, 0.0, 0.0
         for k in range(number):
-            place = np.uint64(near[i, k])
-            sx += xs[place]
-            sy += ys[place]
-            sz += zs[place]
-        held = np.float64(number)
-        mx, my, mz = sx / held, sy / held, sz / held
+            index = np.uint64(near[i, k])
+            sx += xs[index]
+            sy += ys[index]
+            sz += zs[index]
+        num = np.float64(number)
+        mx, my, mz = sx / num, sy / num, sz / num
         xx, xy, xz, yy, yz, zz, far_sq = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(number):
-            place = np.uint64(near[i, k])
-            x, y, z = xs[place] - mx, ys[place] - my, zs[place] - mz
+            index = np.uint64(near[i, k])
+            x, y, z = xs[index] - mx, ys[index] - my, zs[index] - mz
             xx += x * x
             xy += x * y
             xz += x * z
@@ -86,7 +86,7 @@ def neighbour_moments(xs, ys, zs, near, count, mean, covariance, radius):
             yz += y * z
             zz += z * z
             far_sq = max(far_sq, (x * x + y * y) + z * z)
-        share = 1.0 / max(held - 1.0, 1.0)
+        share = 1.0 / max(num - 1.0, 1.0)
         count[i] = np.int64(number)
         mean[i, 0], mean[i, 1], mean[i, 2] = mx, my, mz
         covariance[0, i], covariance[1, i] = xx * share, xy * share

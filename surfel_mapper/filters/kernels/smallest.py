@@ -3,9 +3,9 @@
 """
 The smallest of the squared distances that a search holds, and their order.
 
-A search holds some dozens of squares and the places of their points, and keeps the k smallest each
-time it holds too many. To avoid mispredicted branches, up to 32 are selected by their ranks, and
-more are split by a limit that k of them are below. Equal ones are partitioned.
+A search holds some dozens of squares and the indices of their points, and keeps the k smallest
+each time it holds too many. To avoid mispredicted branches, up to 32 are selected by their ranks,
+and more are split by a limit that k of them are below. Equal ones are partitioned.
 
 Source: interpolation search, Peterson 1957; selection by partitions, Hoare 1961.
 """
@@ -26,12 +26,12 @@ TRIALS = 8
 
 
 @kernel(error_model='numpy', fastmath={'nnan'})
-def keep_least(squares, found, count, k, high, floats):
+def keep_least(squares, indices, count, k, high, floats):
     """
     Move the k smallest of the first count squares to the front; return the largest of them.
 
     squares  (C,) float64, in and out; C a multiple of VECTORS, those past count are overwritten
-    found    (C,) int32, in and out: places, moved with the squares
+    indices  (C,) int32, in and out: indices of the points, moved with the squares
     high     float64: none of the squares is larger
     floats   (FLOATS,) float32, overwritten
 
@@ -39,10 +39,10 @@ def keep_least(squares, found, count, k, high, floats):
     of many squares below it is found by a few interpolations, counted with vector instructions.
     """
     if count <= U(FLOATS):
-        count = U(keep_ranked(squares, found, count, k, floats))
-        return largest(squares, k) if count == k else select(squares, found, count, k)
+        count = U(keep_ranked(squares, indices, count, k, floats))
+        return largest(squares, k) if count == k else select(squares, indices, count, k)
     if high == math.inf:
-        return select(squares, found, count, k)
+        return select(squares, indices, count, k)
     end = (count + U(VECTORS - 1)) & ~U(VECTORS - 1)
     for i in range(count, end):
         squares[i] = math.inf
@@ -56,19 +56,19 @@ def keep_least(squares, found, count, k, high, floats):
         if below == wanted:
             kept = U(0)
             for i in range(count):  # the others are not needed: no swaps, as move_below has them
-                value, place = squares[i], found[i]
-                squares[kept], found[kept] = value, place
+                value, index = squares[i], indices[i]
+                squares[kept], indices[kept] = value, index
                 kept += U(value < limit)
             return largest(squares, k)
         if below < wanted:
             low, num_low = limit, below
         else:
             high, num_high = limit, below
-    return select(squares, found, count, k)
+    return select(squares, indices, count, k)
 
 
 @inlined()
-def keep_ranked(squares, found, count, k, floats):
+def keep_ranked(squares, indices, count, k, floats):
     """
     Move the squares of rank below k, as float32, to the front; return their number.
 
@@ -78,25 +78,25 @@ def keep_ranked(squares, found, count, k, floats):
         floats[i] = np.float32(squares[i]) if i < count else np.float32(math.inf)
     kept = U(0)
     for i in range(count):
-        squares[kept], found[kept] = squares[i], found[i]
+        squares[kept], indices[kept] = squares[i], indices[i]
         kept += U(num_below(floats, floats[i]) < np.int64(k))
     return kept
 
 
 @kernel(error_model='numpy', fastmath={'nnan'})
-def select(squares, found, count, k):
+def select(squares, indices, count, k):
     """Partition the first count squares: the k smallest first; return the largest of these."""
     low, high = U(0), count
     while True:
         a, b, c = squares[low], squares[(low + high) >> U(1)], squares[high - U(1)]
         pivot = max(min(a, b), min(max(a, b), c))
-        less = move_below(squares, found, low, high, pivot)
+        less = move_below(squares, indices, low, high, pivot)
         if less == k:
             return largest(squares, k)
         if less > k:
             high = less
             continue
-        equal = move_up_to(squares, found, less, high, pivot)
+        equal = move_up_to(squares, indices, less, high, pivot)
         if equal >= k:
             return pivot
         low = equal
@@ -123,17 +123,17 @@ def largest(squares, count):
 
 
 @kernel()
-def sort(squares, found, order, count):
-    """Sort the points held by distance, equal ones by row."""
+def sort(squares, indices, order, count):
+    """Sort the neighbours by distance, equally near ones by row."""
     for i in range(U(1), count):
-        value, place, later = squares[i], found[i], i
+        value, index, later = squares[i], indices[i], i
         while later > U(0):
-            before = later - U(1)
-            farther = squares[before] > value
-            if squares[before] == value:
-                farther = order[U(found[before])] > order[U(place)]
+            earlier = later - U(1)
+            farther = squares[earlier] > value
+            if squares[earlier] == value:
+                farther = order[U(indices[earlier])] > order[U(index)]
             if not farther:
                 break
-            squares[later], found[later] = squares[before], found[before]
-            later = before
-        squares[later], found[later] = value, place
+            squares[later], indices[later] = squares[earlier], indices[earlier]
+            later = earlier
+        squares[later], indices[later] = value, index

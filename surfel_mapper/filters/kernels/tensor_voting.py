@@ -21,11 +21,11 @@ REACH = 3.0
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def direction(points, own, other):
+def direction(points, own, neighbour):
     """Return the unit vector to a point from another, and their squared distance, m^2."""
-    x = points[own, 0] - points[other, 0]
-    y = points[own, 1] - points[other, 1]
-    z = points[own, 2] - points[other, 2]
+    x = points[own, 0] - points[neighbour, 0]
+    y = points[own, 1] - points[neighbour, 1]
+    z = points[own, 2] - points[neighbour, 2]
     length_sq = (x * x + y * y) + z * z
     length = math.sqrt(length_sq)
     if length > 0.0:
@@ -53,16 +53,16 @@ def first_votes(points, ids, sigma, to_neighbours, votes):
     for i in range(len(ids)):
         own = ids[i, 0]
         for k in range(1, ids.shape[1]):
-            other = ids[i, k]
-            if other == len(points):
+            neighbour = ids[i, k]
+            if neighbour == len(points):
                 break
-            x, y, z, length_sq = direction(points, own, other)
+            x, y, z, length_sq = direction(points, own, neighbour)
             far = math.sqrt(length_sq) / sigma
             if not (length_sq > 0.0 and far < REACH):
                 continue
             end = (far - REACH) * (far - REACH)
             weight = far * far * (end * end) / 16.0
-            to = other if to_neighbours else i
+            to = neighbour if to_neighbours else i
             votes[0, to] += weight * (1.0 - x * x)
             votes[1, to] -= weight * x * y
             votes[2, to] -= weight * x * z
@@ -89,14 +89,14 @@ def closed_form_votes(points, ids, tensors, sigma, symmetric, votes):
         own = ids[i, 0]
         xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(1, ids.shape[1]):
-            other = ids[i, k]
-            if other == len(points):
+            neighbour = ids[i, k]
+            if neighbour == len(points):
                 break
-            x, y, z, length_sq = direction(points, own, other)
+            x, y, z, length_sq = direction(points, own, neighbour)
             if not (length_sq > 0.0 and math.sqrt(length_sq) / sigma < REACH):
                 continue
-            txx, txy, txz = tensors[other, 0], tensors[other, 1], tensors[other, 2]
-            tyy, tyz, tzz = tensors[other, 3], tensors[other, 4], tensors[other, 5]
+            txx, txy, txz = tensors[neighbour, 0], tensors[neighbour, 1], tensors[neighbour, 2]
+            tyy, tyz, tzz = tensors[neighbour, 3], tensors[neighbour, 4], tensors[neighbour, 5]
             ux = (txx * x + txy * y) + txz * z
             uy = (txy * x + tyy * y) + tyz * z
             uz = (txz * x + tyz * y) + tzz * z

@@ -57,13 +57,13 @@ def group_points(xyz, size, shift, base, bits, keys, sums, first, rows):
         num_runs = find_runs(chunk_keys, len(x), starts)
         if 4 * (num_rows + num_runs) > len(table):
             table = enlarged_table(table, keys[1:], num_rows)
-        known = num_rows
+        new_row = num_rows
         num_rows = number_runs(chunk_keys, starts, num_runs, table, keys, num_rows, run_rows)
-        sums[known:num_rows] = 0.0
+        sums[new_row:num_rows] = 0.0
         for run in range(U(num_runs)):
             # rows are numbered as they appear; a branch would be mispredicted at new voxels
-            first[known] = start + np.int64(starts[run])
-            known += run_rows[run] == known
+            first[new_row] = start + np.int64(starts[run])
+            new_row += run_rows[run] == new_row
         if LONG * num_runs > len(x):
             add_points(x, y, z, chunk_keys, run_rows, flat)
         else:
