@@ -66,7 +66,7 @@ def _source_digests() -> dict[str, str]:
     for module in sources:
         needed, new = {module}, {module}
         while new:
-            new = {name for each in new for name in imports[each]} - needed
+            new = {name for importer in new for name in imports[importer]} - needed
             needed |= new
         joined = b''.join(sources[name] for name in sorted(needed))
         digests[module] = hashlib.sha256(joined).hexdigest()

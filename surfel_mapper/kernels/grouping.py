@@ -88,15 +88,15 @@ def number_runs(chunk_keys, starts, num_runs, table, keys, num_rows, run_rows):
         prefetch(table, home(chunk_keys[ahead], shift))
         key = chunk_keys[U(np.uint32(starts[run]))]
         keys[U(0)] = key
-        place = U(home(key, shift))
-        place = (place + U(keys[U(table[place] + 1)] != key)) & mask
-        row = np.int64(table[place])
+        entry = U(home(key, shift))
+        entry = (entry + U(keys[U(table[entry] + 1)] != key)) & mask
+        row = np.int64(table[entry])
         while keys[U(row + 1)] != key:
-            place = (place + U(1)) & mask
-            row = np.int64(table[place])
+            entry = (entry + U(1)) & mask
+            row = np.int64(table[entry])
         is_new = row < 0
         row = np.int64(number) if is_new else row
-        table[place] = row
+        table[entry] = row
         keys[number + U(1)] = key
         number += U(is_new)
         run_rows[run] = row
@@ -110,10 +110,10 @@ def enlarged_table(table, keys, num_rows):
     shift = hash_shift(len(larger))
     mask = len(larger) - 1
     for row in range(num_rows):
-        place = home(keys[row], shift)
-        while larger[place] >= 0:
-            place = (place + 1) & mask
-        larger[place] = row
+        entry = home(keys[row], shift)
+        while larger[entry] >= 0:
+            entry = (entry + 1) & mask
+        larger[entry] = row
     return larger
 
 
@@ -129,19 +129,19 @@ def build_table(keys, table):
     shift = hash_shift(len(table))
     mask = len(table) - 1
     for row in range(len(keys)):
-        place = home(keys[row], shift)
-        while table[place] >= 0:
-            place = (place + 1) & mask
-        table[place] = row
+        entry = home(keys[row], shift)
+        while table[entry] >= 0:
+            entry = (entry + 1) & mask
+        table[entry] = row
 
 
 @kernel()
 def find_key(key, keys, table, shift):
     """Return the row of a voxel key in a table of build_table, -1 if not found."""
     mask = len(table) - 1
-    place = home(key, shift)
-    row = np.int64(table[place])
+    entry = home(key, shift)
+    row = np.int64(table[entry])
     while row >= 0 and keys[row] != key:
-        place = (place + 1) & mask
-        row = np.int64(table[place])
+        entry = (entry + 1) & mask
+        row = np.int64(table[entry])
     return row

@@ -107,7 +107,7 @@ def row_of(hashed, bucket, buckets):
 
 
 @njit(cache=True, nogil=True, inline='always')
-def is_full(hashed, directory, held, depth):
+def is_full(hashed, directory, counts, depth):
     """
     Return whether the segment of a hash has to split before the next insertion.
 
@@ -116,7 +116,7 @@ def is_full(hashed, directory, held, depth):
     and look-ups would take twice as long before that moment as after it.
     """
     segment = np.int64(directory[U(hashed >> (32 - depth))])
-    return held[U(segment)] >= FULLEST - (segment * 79) % (SEGMENT // 4)
+    return counts[U(segment)] >= FULLEST - (segment * 79) % (SEGMENT // 4)
 
 
 @inlined()
@@ -130,8 +130,8 @@ def find_row(key, rows, table, depth):
     hashed = hash_key(key)
     bucket = first_bucket(hashed, directory, depth)
     while True:
-        for place in range(bucket, bucket + BUCKET):
-            entry = buckets[place]
+        for index in range(bucket, bucket + BUCKET):
+            entry = buckets[index]
             row = (entry & LOW) - 1
             if row >= 0 and (entry >> 32) & LOW == hashed and rows[row, KEY] == key:
                 return row
@@ -143,44 +143,44 @@ def find_row(key, rows, table, depth):
 @inlined()
 def insert_row(hashed, row, table, depth):
     """Insert the row of a voxel that is not in the table."""
-    directory, buckets, held, _ = table
-    insert_entry(hashed, row, directory, buckets, held, depth)
+    directory, buckets, counts, _ = table
+    insert_entry(hashed, row, directory, buckets, counts, depth)
 
 
 @njit(cache=True, nogil=True, inline='always')
-def insert_entry(hashed, row, directory, buckets, held, depth):
+def insert_entry(hashed, row, directory, buckets, counts, depth):
     """
     Insert a row as ``insert_row`` does, for loops that unpacked the table before.
 
     Unpacking it for each voxel counts references to four arrays, a quarter of an insertion.
     """
     bucket = first_bucket(hashed, directory, depth)
-    held[U(bucket) // U(SEGMENT)] += 1
-    place = num_used(buckets, bucket)
-    while place == BUCKET:
+    counts[U(bucket) // U(SEGMENT)] += 1
+    offset = num_used(buckets, bucket)
+    while offset == BUCKET:
         bucket = next_bucket(bucket)
-        place = num_used(buckets, bucket)
-    buckets[U(bucket + place)] = (hashed << 32) | (row + 1)
+        offset = num_used(buckets, bucket)
+    buckets[U(bucket + offset)] = (hashed << 32) | (row + 1)
 
 
 @inlined()
 def remove_row(key, row, table, depth):
     """Remove the row of a voxel from the table."""
-    directory, buckets, held, _ = table
-    remove_entry(hash_key(key), row, directory, buckets, held, depth)
+    directory, buckets, counts, _ = table
+    remove_entry(hash_key(key), row, directory, buckets, counts, depth)
 
 
 @njit(cache=True, nogil=True, inline='always')
-def remove_entry(hashed, row, directory, buckets, held, depth):
+def remove_entry(hashed, row, directory, buckets, counts, depth):
     """Remove a row by its hash, for loops that unpacked the table before; see ``insert_entry``."""
     bucket = first_bucket(hashed, directory, depth)
-    held[U(bucket) // U(SEGMENT)] -= 1
-    place = place_of_half(buckets, bucket, row + 1)
-    while place == BUCKET:
+    counts[U(bucket) // U(SEGMENT)] -= 1
+    offset = place_of_half(buckets, bucket, row + 1)
+    while offset == BUCKET:
         bucket = next_bucket(bucket)
-        place = place_of_half(buckets, bucket, row + 1)
+        offset = place_of_half(buckets, bucket, row + 1)
     last = num_used(buckets, bucket) - 1
-    buckets[U(bucket + place)] = buckets[U(bucket + last)]
+    buckets[U(bucket + offset)] = buckets[U(bucket + last)]
     buckets[U(bucket + last)] = 0
     if last == BUCKET - 1:
         take_back(bucket, buckets)
@@ -199,11 +199,11 @@ def take_back(bucket, buckets):
     while num == BUCKET:
         later = next_bucket(later)
         num = num_used(buckets, later)
-        for place in range(later, later + num):
-            home = home_of((buckets[place] >> 32) & LOW)
+        for index in range(later, later + num):
+            home = home_of((buckets[index] >> 32) & LOW)
             if (later - home) & (SEGMENT - 1) >= (later - bucket) & (SEGMENT - 1):
-                buckets[bucket + BUCKET - 1] = buckets[place]
-                buckets[place] = buckets[later + num - 1]
+                buckets[bucket + BUCKET - 1] = buckets[index]
+                buckets[index] = buckets[later + num - 1]
                 buckets[later + num - 1] = 0
                 bucket = later
                 break
@@ -221,37 +221,37 @@ def split_segment(hashed, table, state, entries):
     Without room for another segment, or if the directory would have to double, nothing changes
     and the result is False.
     """
-    directory, buckets, held, local_depth = table
+    directory, buckets, counts, local_depth = table
     depth = state[DEPTH]
     old = np.int64(directory[hashed >> (32 - depth)])
     bits = np.int64(local_depth[old])
     new = state[NEXT_SEGMENT]
-    if bits == depth or new == len(held):
+    if bits == depth or new == len(counts):
         return False
     state[NEXT_SEGMENT] = new + 1
     local_depth[old] = local_depth[new] = bits + 1
-    for place in range(SEGMENT):
-        entries[place] = buckets[old * SEGMENT + place]
-        buckets[old * SEGMENT + place] = buckets[new * SEGMENT + place] = 0
+    for index in range(SEGMENT):
+        entries[index] = buckets[old * SEGMENT + index]
+        buckets[old * SEGMENT + index] = buckets[new * SEGMENT + index] = 0
     # the upper half of the directory entries with the old prefix gets the new segment
     span = 1 << (depth - bits)
     first = (hashed >> (32 - bits)) << (depth - bits) if bits > 0 else 0
     for prefix in range(first + span // 2, first + span):
         directory[prefix] = new
-    held[old] = held[new] = 0
-    for place in range(SEGMENT):
-        entry = entries[place]
+    counts[old] = counts[new] = 0
+    for index in range(SEGMENT):
+        entry = entries[index]
         if entry != 0:
-            insert_entry((entry >> 32) & LOW, (entry & LOW) - 1, directory, buckets, held, depth)
+            insert_entry((entry >> 32) & LOW, (entry & LOW) - 1, directory, buckets, counts, depth)
     return True
 
 
 @inlined()
 def makes_room(hashed, table, state, entries):
     """Split the segment of a hash until it has room for a row; return False if it cannot split."""
-    directory, _, held, _ = table
+    directory, _, counts, _ = table
     depth = state[DEPTH]
-    while is_full(hashed, directory, held, depth):
+    while is_full(hashed, directory, counts, depth):
         if not split_segment(hashed, table, state, entries):
             return False
     return True

@@ -82,15 +82,15 @@ def store_sums(words, at, sums):
     words[int(at) : int(at) + WORDS] = sums
 
 
-def sum_unless(is_dropped, sums, others):
-    """Return others, with sums added unless these are dropped."""
-    return others if is_dropped else sums + others
+def sum_unless(is_dropped, sums, base):
+    """Return base plus sums, or base alone if the sums are dropped."""
+    return base if is_dropped else sums + base
 
 
-def plus_place(sums, place):
-    """Return sums with one point more; its place int64, see quantise."""
-    x, y, z, one = (int(place) >> BITS * i & (1 << BITS) - 1 for i in range(4))
-    words = one << COUNT_BITS | x, z << HIGH_BITS | y
+def plus_place(sums, packed):
+    """Return sums with one point more, an int64 packed by quantise."""
+    x, y, z, count = (int(packed) >> BITS * i & (1 << BITS) - 1 for i in range(4))
+    words = count << COUNT_BITS | x, z << HIGH_BITS | y
     return sums + np.array([*words, x * x, x * y, x * z, y * y, y * z, z * z])
 
 
@@ -142,9 +142,9 @@ def place_of_least(numbers, passed):
              their size) the first is the least
     passed   uint64: bit i is set if numbers[i] is passed over
     """
-    places = np.arange(NUMBERS)
+    indices = np.arange(NUMBERS)
     upper = numbers[:NUMBERS].view(np.int64) >> HIGH_BITS
-    ranked = (upper & -NUMBERS | places)[int(passed) >> places & 1 == 0]
+    ranked = (upper & -NUMBERS | indices)[int(passed) >> indices & 1 == 0]
     return np.int64(ranked.min(initial=_HALF) % NUMBERS)
 
 
@@ -178,12 +178,12 @@ def _type_of_stored(context):
 
 @type_callable(sum_unless)
 def _type_of_sum_unless(context):
-    return lambda is_dropped, sums, others: _LANES
+    return lambda is_dropped, sums, base: _LANES
 
 
 @type_callable(plus_place)
 def _type_of_sum(context):
-    return lambda sums, place: _LANES
+    return lambda sums, packed: _LANES
 
 
 @type_callable(highest_match)
@@ -224,21 +224,21 @@ def _emit_store(context, builder, signature, arguments):
 
 @lower_builtin(sum_unless, types.boolean, Lanes, Lanes)
 def _emit_sum_unless(context, builder, signature, arguments):
-    is_dropped, sums, others = arguments
+    is_dropped, sums, base = arguments
     both = ir.Constant(ir.ArrayType(_VECTOR, 2), [_constant([-1] * WORDS), _constant([0] * WORDS)])
     masks = cgutils.global_constant(builder, 'masks', both)
     masks.align = 8 * WORDS
     # loaded: spreading a number over lanes needs the execution port that picks bytes of places
     mask = builder.load(builder.gep(masks, [_WORD(0), builder.zext(is_dropped, _WORD)]))
-    return builder.add(builder.and_(sums, mask), others)
+    return builder.add(builder.and_(sums, mask), base)
 
 
 @lower_builtin(plus_place, Lanes, types.int64)
 def _emit_plus_place(context, builder, signature, arguments):
-    sums, place = arguments
+    sums, packed = arguments
     # the fence keeps spreading and picking apart: LLVM merges them into an instruction of three
     # micro-operations on Intel, and adding took 1.2 times as long
-    spread = builder.bitcast(_fenced(builder, _spread(builder, place)), _BYTES)
+    spread = builder.bitcast(_fenced(builder, _spread(builder, packed)), _BYTES)
     first, second = (_pick(builder, spread, ((), (), *bytes_)) for bytes_ in _FACTORS)
     lower_halves = _constant([_HALF] * WORDS)  # the compiler has to know that factors are short
     product = builder.mul(builder.and_(first, lower_halves), builder.and_(second, lower_halves))
@@ -250,10 +250,10 @@ def _emit_plus_place(context, builder, signature, arguments):
 def _emit_highest_match(context, builder, signature, arguments):
     words = _emit_load(context, builder, signature, arguments)
     upper = builder.shl(arguments[2], _WORD(HIGH_BITS))
-    rest = builder.xor(words, _spread(builder, upper))
+    difference = builder.xor(words, _spread(builder, upper))
     zeros = _constant([0] * WORDS)
-    differs = builder.lshr(rest, _constant([HIGH_BITS] * WORDS))
-    lower = builder.select(builder.icmp_unsigned('==', differs, zeros), rest, zeros)
+    differs = builder.lshr(difference, _constant([HIGH_BITS] * WORDS))
+    lower = builder.select(builder.icmp_unsigned('==', differs, zeros), difference, zeros)
     halves = ir.VectorType(_HALF_WORD, 2 * WORDS)  # processors have maxima of 32 bits
     takes = ir.FunctionType(_HALF_WORD, [halves])
     name = 'llvm.vector.reduce.umax.v16i32'
@@ -285,10 +285,10 @@ def _emit_num_below(context, builder, signature, arguments):
     limit = builder.insert_element(ir.Constant(eight, ir.Undefined), arguments[1], _HALF_WORD(0))
     limit = builder.shuffle_vector(limit, limit, _indices([0] * WORDS))
     bits = _HALF_WORD(0)
-    for part in range(FLOATS // WORDS):  # eight at once: compilers have one instruction for that
-        floats = builder.load(builder.gep(address, [_HALF_WORD(part)]), align=4)
+    for group in range(FLOATS // WORDS):  # eight at once: compilers have one instruction for that
+        floats = builder.load(builder.gep(address, [_HALF_WORD(group)]), align=4)
         below = builder.bitcast(builder.fcmp_ordered('<', floats, limit), _MASK)
-        shifted = builder.shl(builder.zext(below, _HALF_WORD), _HALF_WORD(WORDS * part))
+        shifted = builder.shl(builder.zext(below, _HALF_WORD), _HALF_WORD(WORDS * group))
         bits = builder.or_(bits, shifted)
     return builder.zext(builder.ctpop(bits), _WORD)
 
@@ -308,8 +308,8 @@ def _emit_place_of_least(context, builder, signature, arguments):
     takes = ir.FunctionType(_HALF_WORD, [halves])
     name = 'llvm.vector.reduce.umin.v16i32'
     least = cgutils.get_or_insert_function(builder.module, takes, name)
-    found = builder.call(least, [builder.select(passed, highest, ranked)])
-    return builder.zext(builder.and_(found, _HALF_WORD(NUMBERS - 1)), _WORD)
+    minimum = builder.call(least, [builder.select(passed, highest, ranked)])
+    return builder.zext(builder.and_(minimum, _HALF_WORD(NUMBERS - 1)), _WORD)
 
 
 def _address(context, builder, signature, arguments):

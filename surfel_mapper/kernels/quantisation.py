@@ -42,13 +42,13 @@ ONE = 1 << (3 * BITS)
 
 
 @inlined(error_model='numpy')
-def quantise(x, y, z, pose, scale, range_sq, keys, places):
+def quantise(x, y, z, pose, scale, range_sq, keys, packed):
     """
     Quantise the points of a chunk, without branches, so that the compiler vectorises the loop.
 
     x, y, z  (C,) float32 or float64, sensor frame, m
     keys     (CHUNK,) int64, out: voxel keys, -1 for points that are rejected
-    places   (CHUNK,) int64, out: ONE | z << 32 | y << 16 | x, with x, y, z in [0, 65536) from the
+    packed   (CHUNK,) int64, out: ONE | z << 32 | y << 16 | x, with x, y, z in [0, 65536) from the
              lower corner of the voxel; any place for points that are rejected
 
     pose, scale, range_sq  see reduce_points
@@ -74,7 +74,7 @@ def quantise(x, y, z, pose, scale, range_sq, keys, places):
         ix, iy, iz = qx >> BITS, qy >> BITS, qz >> BITS
         key = (ix << (2 * INDEX_BITS)) | (iy << INDEX_BITS) | iz
         keys[i] = key if enters else -1
-        places[i] = ((qz & PLACE) << (2 * BITS)) | ((qy & PLACE) << BITS) | (qx & PLACE) | ONE
+        packed[i] = ((qz & PLACE) << (2 * BITS)) | ((qy & PLACE) << BITS) | (qx & PLACE) | ONE
 
 
 @njit(cache=True, nogil=True, inline='always')

@@ -35,14 +35,14 @@ def compact(xyz, keep, out):
         if kept > 0 and k + U(BLOCK) > num_out:
             break  # the block would be written past the end of out
         for axis in range(3):
-            values, to, place = xyz[axis], out[axis], k
+            values, to, cursor = xyz[axis], out[axis], k
             if kept == BLOCK:
                 for j in range(U(BLOCK)):
                     to[k + j] = values[i + j]
             elif kept > 0:
                 for j in range(U(BLOCK)):
-                    to[place] = values[i + j]
-                    place += U(keep[i + j])
+                    to[cursor] = values[i + j]
+                    cursor += U(keep[i + j])
         i += U(BLOCK)
         k += U(kept)
     while k < num_out:
@@ -61,12 +61,12 @@ def copy_ranges(points, ranges, out):
     ranges  (K, 2) int64, first row of each range, and the row after its last
     out     (M, 3) float64, M the number of rows of all ranges
     """
-    place = 0
+    row = 0
     for k in range(len(ranges)):
         for i in range(ranges[k, 0], ranges[k, 1]):
             for j in range(3):
-                out[place, j] = points[i, j]
-            place += 1
+                out[row, j] = points[i, j]
+            row += 1
 
 
 @njit(cache=True, nogil=True)
