@@ -81,9 +81,9 @@ def point_times(
         If the unit or the reference is none of these.
 
     """
-    for what, given, known in (('unit', unit, UNITS_NS), ('reference', reference, REFERENCES)):
-        if given != 'auto' and given not in known:
-            raise ValueError(f'{what}: {given!r}, expected one of auto, {", ".join(known)}')
+    for key, value, allowed in (('unit', unit, UNITS_NS), ('reference', reference, REFERENCES)):
+        if value != 'auto' and value not in allowed:
+            raise ValueError(f'{key}: {value!r}, expected one of auto, {", ".join(allowed)}')
     name = field or next((name for name in FIELDS if name in scan.columns), '')
     if name not in scan.columns:
         raise CloudFormatError(
@@ -210,14 +210,14 @@ def _readings(
     """Return the ways to read times, as (unit in ns, whether since the epoch), likeliest first."""
     floating = dtype.kind == 'f'
     units = (['s', 'ns'] if floating else ['ns']) if unit == 'auto' else [unit]
-    found = []
+    readings = []
     for unit_ns in (UNITS_NS[name] for name in units):
         from_stamp, from_epoch = abs(int(low) * unit_ns), abs(int(low) * unit_ns - stamp_ns)
         likely = [False, True] if from_stamp <= from_epoch else [True, False]
-        found += [(unit_ns, is_epoch) for is_epoch in likely]
+        readings += [(unit_ns, is_epoch) for is_epoch in likely]
     if reference == 'auto' and dtype == np.float32:
         reference = 'stamp'  # since the epoch it would count in steps of 128 s
-    return [way for way in found if reference in ('auto', 'epoch' if way[1] else 'stamp')]
+    return [way for way in readings if reference in ('auto', 'epoch' if way[1] else 'stamp')]
 
 
 def _offsets(
@@ -248,10 +248,10 @@ def _track(
         pose = pose_at(end)
         turn = _turn(poses[-1], pose)
         chord = 2.0 * math.sqrt(float((turn * turn).sum()))
-        parts = min(max(math.ceil(0.5 * math.pi * chord / MAX_TURN_RAD), 1), end - start)
-        between = [start + (end - start) * part // parts for part in range(1, parts)]
+        num_steps = min(max(math.ceil(0.5 * math.pi * chord / MAX_TURN_RAD), 1), end - start)
+        between = [start + (end - start) * step // num_steps for step in range(1, num_steps)]
         further = [*map(pose_at, between), pose]
-        turns += [turn] if parts == 1 else [*map(_turn, [poses[-1], *further], further)]
+        turns += [turn] if num_steps == 1 else [*map(_turn, [poses[-1], *further], further)]
         knots += [*between, end]
         poses += further
     return knots, poses, turns

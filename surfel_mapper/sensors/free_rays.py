@@ -81,23 +81,23 @@ def rays_of_beams(
     """
     level = points[..., 0] + 1j * points[..., 1].astype(np.float64)
     reach = np.abs(level)
-    known = reach > 0.0
-    heading = np.divide(level, reach, out=np.zeros_like(level), where=known)
-    slope = np.divide(points[..., 2], reach, out=np.zeros_like(reach), where=known)
+    has_point = reach > 0.0
+    heading = np.divide(level, reach, out=np.zeros_like(level), where=has_point)
+    slope = np.divide(points[..., 2], reach, out=np.zeros_like(reach), where=has_point)
     offset: npt.NDArray[np.complex128] = np.ones(len(points), np.complex128)
     for _ in range(ROUNDS):  # columns with gaps have other rows than those without
         across = unit((heading * offset.conj()[:, None]).sum(axis=0))
         offset = unit((heading * across.conj()).sum(axis=1))
     predicted = offset[:, None] * across
     step = 2.0 * np.pi / points.shape[1]
-    off = np.abs(np.angle(heading[known] * predicted[known].conj()))
+    off = np.abs(np.angle(heading[has_point] * predicted[has_point].conj()))
     are_beams = len(off) > 0 and np.median(off) <= MOST_OFF * step
-    beam = slope.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    beam = slope.sum(axis=1) / np.maximum(has_point.sum(axis=1), 1)
     row, column = np.nonzero(infinite & (predicted != 0.0) & are_beams)
-    found = predicted[row, column]
-    rays = np.stack([found.real, found.imag, beam[row]], axis=1)
+    level_ray = predicted[row, column]
+    rays = np.stack([level_ray.real, level_ray.imag, beam[row]], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return rays.astype(np.float32), known.argmax(axis=0)[column], column
+    return rays.astype(np.float32), has_point.argmax(axis=0)[column], column
 
 
 def unit(numbers: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
