@@ -68,25 +68,25 @@ class Route:
     def __init__(self, corners: Corners) -> None:
         if len(corners) < 2:
             raise ConfigError(f'corners: {len(corners)}, expected two or more')
-        places = np.array(corners, np.float64)
-        if not np.isfinite(places).all():
-            raise ConfigError(f'corners: {places.tolist()}, expected finite places')
-        ways = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        points = np.array(corners, np.float64)
+        if not np.isfinite(points).all():
+            raise ConfigError(f'corners: {points.tolist()}, expected finite places')
+        ways = np.linalg.norm(np.diff(points, axis=0), axis=1)
         if not ways.min() >= 2.0 * TURN_RADIUS_M:
             raise ConfigError(
                 f'corners: {ways.min():g} m apart, expected {2.0 * TURN_RADIUS_M:g} m or more'
             )
-        steps = np.diff(places, axis=0) / ways[:, None]
-        pieces = [places[:1]]
-        for number in range(1, len(places) - 1):
-            corner, before, after = places[number], steps[number - 1], steps[number]
+        steps = np.diff(points, axis=0) / ways[:, None]
+        pieces = [points[:1]]
+        for number in range(1, len(points) - 1):
+            corner, incoming, outgoing = points[number], steps[number - 1], steps[number]
             along = np.linspace(0.0, 1.0, 33)[:, None]
-            a, b = corner - TURN_RADIUS_M * before, corner + TURN_RADIUS_M * after
+            a, b = corner - TURN_RADIUS_M * incoming, corner + TURN_RADIUS_M * outgoing
             pieces.append((1 - along) ** 2 * a + 2 * along * (1 - along) * corner + along**2 * b)
-        route = np.concatenate([*pieces, places[-1:]])
+        route = np.concatenate([*pieces, points[-1:]])
         is_apart = np.linalg.norm(np.diff(route, axis=0), axis=1) > MIN_STEP_M
-        self._places = route[np.concatenate([[True], is_apart])]
-        slopes = np.diff(self._places, axis=0)
+        self._points = route[np.concatenate([[True], is_apart])]
+        slopes = np.diff(self._points, axis=0)
         lengths = np.linalg.norm(slopes, axis=1)
         self._along = np.concatenate([[0.0], np.cumsum(lengths)])
         self._heading = np.unwrap(np.arctan2(slopes[:, 1], slopes[:, 0]))
@@ -103,7 +103,7 @@ class Route:
         heading = float(np.interp(along_m, middle, self._heading))
         slope = self._heading[piece]
         over = along_m - self._along[piece]
-        x, y = self._places[piece] + over * np.array([math.cos(slope), math.sin(slope)])
+        x, y = self._points[piece] + over * np.array([math.cos(slope), math.sin(slope)])
         turn = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, heading]))
         return pose_matrix((x, y, 0.0), q_xyzw(turn))
 
@@ -125,17 +125,17 @@ def circuit_primitives(seed: int, corners: Corners) -> list[Primitive]:
         another.
 
     """
-    places = [(float(x), float(y)) for x, y in corners]
-    legs = sorted({tuple(sorted(leg)) for leg in pairwise(places)})
+    points = [(float(x), float(y)) for x, y in corners]
+    legs = sorted({tuple(sorted(leg)) for leg in pairwise(points)})
     if not legs:
         raise ConfigError(f'corners: {len(corners)}, expected two or more')
     check_overlap(legs)
     pose = street_pose()
     T_world_street = pose_matrix(pose[:3], pose[3:])
     T_street_world = inverse(T_world_street)
-    kept = [_ground(T_world_street, np.array(places))]
+    kept = [_ground(T_world_street, np.array(points))]
     for number, (first, last) in enumerate(legs):
-        others = np.array([leg for leg in legs if leg != (first, last)]).reshape(-1, 2, 2)
+        other_legs = np.array([leg for leg in legs if leg != (first, last)]).reshape(-1, 2, 2)
         T_street_leg = _leg_pose(first, last)
         length_m = math.dist(first, last)
         move = compose(T_world_street, compose(T_street_leg, T_street_world))
@@ -145,9 +145,9 @@ def circuit_primitives(seed: int, corners: Corners) -> list[Primitive]:
             at = compose(T_street_world, primitive.T_world_primitive)[:2, 3]
             if not -END_M <= at[0] <= length_m + END_M:
                 continue
-            place = T_street_leg[:2, :2] @ at + T_street_leg[:2, 3]
+            position = T_street_leg[:2, :2] @ at + T_street_leg[:2, 3]
             reach_m = math.hypot(*primitive.half_m[:2]) + PAVEMENT_Y_M[1]
-            if (_distances(place, others) < reach_m).any():
+            if (_distances(position, other_legs) < reach_m).any():
                 continue
             kept.append(_moved(primitive, move))
     return kept
@@ -201,11 +201,11 @@ def _moved(primitive: Primitive, motion: Transform) -> Primitive:
 
 
 def _distances(
-    place: npt.NDArray[np.float64], legs: npt.NDArray[np.float64]
+    position: npt.NDArray[np.float64], legs: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Return the distances of a place (2,) from (L, 2, 2) legs, (L,) m."""
+    """Return the distances of a position (2,) from (L, 2, 2) legs, (L,) m."""
     first, way = legs[:, 0], legs[:, 1] - legs[:, 0]
-    off = place - first
+    off = position - first
     along = (off * way).sum(axis=1) / (way * way).sum(axis=1)
     off = off - np.clip(along, 0.0, 1.0)[:, None] * way
     distances_m: npt.NDArray[np.float64] = np.hypot(off[:, 0], off[:, 1])

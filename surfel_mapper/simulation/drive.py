@@ -95,9 +95,9 @@ class Drive:
         if not 0 <= self.start_ns < END_NS:
             raise ConfigError(f'start_ns: {self.start_ns}, expected a value in [0, {END_NS})')
         if self.corners:
-            places = tuple((float(x), float(y)) for x, y in self.corners)
-            object.__setattr__(self, 'corners', places)
-            route_along(places)
+            corners = tuple((float(x), float(y)) for x, y in self.corners)
+            object.__setattr__(self, 'corners', corners)
+            route_along(corners)
         for name in ('start', 'base_to_sensor'):
             pose = getattr(self, name)
             try:
@@ -136,9 +136,9 @@ class Drive:
 
     def twist(self, stamp_ns: int) -> npt.NDArray[np.float64]:
         """Return the velocity of base_link in base_link (6,), m/s and then rad/s."""
-        before = self.T_odom_base(stamp_ns - TWIST_STEP_NS)
-        after = self.T_odom_base(stamp_ns + TWIST_STEP_NS)
-        return se3_log(compose(inverse(before), after)) / (2e-9 * TWIST_STEP_NS)
+        start = self.T_odom_base(stamp_ns - TWIST_STEP_NS)
+        end = self.T_odom_base(stamp_ns + TWIST_STEP_NS)
+        return se3_log(compose(inverse(start), end)) / (2e-9 * TWIST_STEP_NS)
 
 
 @dataclass(frozen=True, slots=True)

@@ -149,11 +149,11 @@ def load_simulation(path: str | Path) -> Simulation:
     world = World.load(Path(path) / WORLD_FILE)
     file = Path(path) / SIMULATION_FILE
     with refusing(file, FileFormatError):
-        found = json.loads(read_small_file(file))
+        document = json.loads(read_small_file(file))
         try:
-            lidar, drive = Lidar(**_tuples(found['lidar'])), Drive(**_tuples(found['drive']))
+            lidar, drive = Lidar(**_tuples(document['lidar'])), Drive(**_tuples(document['drive']))
             return Simulation(
-                world, lidar, drive, num_scans=found['num_scans'], rolling=found['rolling']
+                world, lidar, drive, num_scans=document['num_scans'], rolling=document['rolling']
             )
         except ConfigError as error:
             raise FileFormatError(f'{file}: {error}') from error

@@ -80,10 +80,10 @@ class Street:
         """Yield the ground and a house across each end."""
         size = (self._length_m + 2.0 * BEYOND_M + 40.0, GROUND_WIDTH_M)
         middle = (self._length_m / 2.0, 0.0, 0.0)
-        yield self._place('rectangle', size, middle, label='ground', reflectivity=0.25)
+        yield self._primitive('rectangle', size, middle, label='ground', reflectivity=0.25)
         for x in (-BEYOND_M - 4.0, self._length_m + BEYOND_M + 4.0):
             turn = (self._about(0.0, 1.0), self._about(0.0, 1.0), self._about(0.0, 8.0))
-            yield self._place('box', (8.0, 40.0, 24.0), (x, 0.0, 2.0), turn, label='building')
+            yield self._primitive('box', (8.0, 40.0, 24.0), (x, 0.0, 2.0), turn, label='building')
 
     def pavement(self, side: int) -> Iterator[Primitive]:
         """Yield the slabs of a pavement."""
@@ -93,7 +93,7 @@ class Street:
             size = (slab + 0.5, far - near, 1.0)
             centre = (x + slab / 2.0, side * (near + far) / 2.0, PAVEMENT_HEIGHT_M - 0.5)
             turn = (self._about(0.0, 0.4), self._about(0.0, 0.1), self._about(0.0, 0.2))
-            yield self._place('box', size, centre, turn, label='pavement', reflectivity=0.4)
+            yield self._primitive('box', size, centre, turn, label='pavement', reflectivity=0.4)
 
     def houses(self, side: int) -> Iterator[Primitive]:
         """Yield a row of houses, some with a gap, a bay window or a sign."""
@@ -104,16 +104,16 @@ class Street:
             turn = (self._about(0.0, 1.5), self._about(0.0, 1.5), self._about(0.0, 4.0))
             look = {'label': 'building', 'reflectivity': self._rng.uniform(0.3, 0.8)}
             centre = (x + width / 2.0, front + side * 5.0, height / 2.0 - 1.0)
-            yield self._place('box', (width, 10.0, height + 2.0), centre, turn, **look)
+            yield self._primitive('box', (width, 10.0, height + 2.0), centre, turn, **look)
             if rng.random() < 0.5:
                 size = (rng.uniform(2.0, 4.0), 2.0, rng.uniform(2.0, height - 3.5))
                 centre = (x + width / 2.0, front + side * 0.2, 3.0 + size[2] / 2.0)
-                yield self._place('box', size, centre, turn, **look)
+                yield self._primitive('box', size, centre, turn, **look)
             if rng.random() < 0.3:
                 centre = (x + rng.uniform(1.0, width - 1.0), front - side * 0.7, 3.2)
                 turn = (self._about(0.0, 2.0), self._about(0.0, 2.0), self._about(0.0, 5.0))
                 look = {'label': 'sign', 'reflectivity': 0.9}
-                yield self._place('box', (0.06, 0.8, 1.2), centre, turn, **look)
+                yield self._primitive('box', (0.06, 0.8, 1.2), centre, turn, **look)
             x += width + (rng.uniform(3.0, 8.0) if rng.random() < 0.2 else -0.2)
 
     def cars(self, side: int) -> Iterator[Primitive]:
@@ -126,14 +126,14 @@ class Street:
             turn = (self._about(0.0, 1.5), self._about(0.0, 1.5), self._about(0.0, 5.0))
             look = {'label': 'car', 'reflectivity': self._rng.uniform(0.2, 0.9)}
             body, cabin = (length, 1.8, height + 0.4), (length * 0.55, 1.6, 0.8)
-            yield self._place('box', body, (*at, height / 2.0 - 0.2), turn, **look)
-            yield self._place('box', cabin, (*at, height + 0.25), turn, **look)
+            yield self._primitive('box', body, (*at, height / 2.0 - 0.2), turn, **look)
+            yield self._primitive('box', cabin, (*at, height + 0.25), turn, **look)
 
     def furniture(self, side: int) -> Iterator[Primitive]:
         """Yield lamps, trees and bins on the pavement, in turn."""
         kinds = (self._lamp, self._tree, self._bin, self._tree)
-        places = np.arange(-BEYOND_M, self._length_m + BEYOND_M, 5.5)
-        for number, x in enumerate(places.tolist()):
+        along = np.arange(-BEYOND_M, self._length_m + BEYOND_M, 5.5)
+        for number, x in enumerate(along.tolist()):
             if self._rng.random() < 0.75:
                 at = x + self._about(0.0, 0.8), side * self._about(6.6, 0.3)
                 yield from kinds[number % len(kinds)](*at)
@@ -142,27 +142,29 @@ class Street:
         height = self._rng.uniform(4.5, 6.5)
         turn = (self._about(0.0, 2.0), self._about(0.0, 2.0), 0.0)
         size = (self._rng.uniform(0.07, 0.12), height)
-        yield self._place('cylinder', size, (x, y, height / 2.0 - 0.2), turn, label='pole')
-        yield self._place('sphere', (0.3,), (x, y, height), label='lamp', reflectivity=0.95)
+        yield self._primitive('cylinder', size, (x, y, height / 2.0 - 0.2), turn, label='pole')
+        yield self._primitive('sphere', (0.3,), (x, y, height), label='lamp', reflectivity=0.95)
 
     def _tree(self, x: float, y: float) -> Iterator[Primitive]:
         size = (self._rng.uniform(0.15, 0.35), 5.0)
         turn = (self._about(0.0, 5.0), self._about(0.0, 5.0), 0.0)
-        yield self._place('cylinder', size, (x, y, 2.2), turn, label='trunk', reflectivity=0.3)
+        yield self._primitive('cylinder', size, (x, y, 2.2), turn, label='trunk', reflectivity=0.3)
         for _ in range(2):
             centre = (self._about(x, 0.6), self._about(y, 0.6), self._about(5.0, 0.5))
             radius = self._rng.uniform(0.9, 1.4)
-            yield self._place('sphere', (radius,), centre, label='crown', reflectivity=0.45)
+            yield self._primitive('sphere', (radius,), centre, label='crown', reflectivity=0.45)
 
     def _bin(self, x: float, y: float) -> Iterator[Primitive]:
         turn = (self._about(0.0, 4.0), self._about(0.0, 4.0), 0.0)
-        yield self._place('tube', (0.32, 1.6), (x, y, 0.3), turn, label='bin', reflectivity=0.6)
+        yield self._primitive(
+            'tube', (0.32, 1.6), (x, y, 0.3), turn, label='bin', reflectivity=0.6
+        )
 
     def _about(self, value: float, spread: float) -> float:
         """Return a uniform random number in value +- spread."""
         return float(self._rng.uniform(value - spread, value + spread))
 
-    def _place(
+    def _primitive(
         self,
         kind: str,
         size_m: tuple[float, ...],

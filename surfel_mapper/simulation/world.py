@@ -86,11 +86,11 @@ def _fill(
     inside = boxes[members]
     tree.box[node, :3] = inside[:, :3].min(axis=0)
     tree.box[node, 3:] = inside[:, 3:].max(axis=0)
-    after = node + 2 * len(members) - 1
-    tree.next[node] = after
+    end = node + 2 * len(members) - 1
+    tree.next[node] = end
     if len(members) == 1:
         tree.primitive[node] = members[0]
-        return after
+        return end
     centres = inside[:, :3] + inside[:, 3:]
     axis = int(np.argmax(np.ptp(centres, axis=0)))
     order = members[np.argsort(centres[:, axis], kind='stable')]
@@ -224,8 +224,8 @@ class World:
         surface = np.empty(len(ahead), dtype=np.int64)
         raycast.cast(start, ahead, *self._tables, range_m, surface)
         range_m[surface < 0] = np.inf
-        places = start + np.where(surface < 0, 0.0, range_m)[:, None] * ahead
-        return range_m, surface, self._normals(places, surface)
+        hits = start + np.where(surface < 0, 0.0, range_m)[:, None] * ahead
+        return range_m, surface, self._normals(hits, surface)
 
     def surface_at(self, positions: npt.ArrayLike) -> tuple[IntArray, FloatArray, FloatArray]:
         """
@@ -246,11 +246,11 @@ class World:
             Outward unit normal of the surface, nan for none.
 
         """
-        places = _rows(positions, 'positions')
-        surface = np.empty(len(places), dtype=np.int64)
-        distance_m = np.empty(len(places))
-        surfaces.nearest_surface(places, *self._tables, distance_m, surface)
-        return surface, distance_m, self._normals(places, surface)
+        xyz = _rows(positions, 'positions')
+        surface = np.empty(len(xyz), dtype=np.int64)
+        distance_m = np.empty(len(xyz))
+        surfaces.nearest_surface(xyz, *self._tables, distance_m, surface)
+        return surface, distance_m, self._normals(xyz, surface)
 
     def normal_at(self, positions: npt.ArrayLike) -> FloatArray:
         """Return the (N, 3) outward normals of the surfaces nearest to (N, 3) positions, m."""
@@ -287,9 +287,9 @@ class World:
             If the mapping does not describe a world, or a value is invalid.
 
         """
-        found = mapping.get('format') if isinstance(mapping, Mapping) else type(mapping).__name__
-        if found != FORMAT:
-            raise FileFormatError(f'format: {found!r}, expected {FORMAT!r}')
+        format_ = mapping.get('format') if isinstance(mapping, Mapping) else type(mapping).__name__
+        if format_ != FORMAT:
+            raise FileFormatError(f'format: {format_!r}, expected {FORMAT!r}')
         try:
             primitives = [Primitive.from_mapping(entry) for entry in mapping['primitives']]
             return cls(primitives, mapping['start'])
@@ -320,10 +320,10 @@ class World:
             except FileFormatError as error:
                 raise FileFormatError(f'{path}: {error}') from error
 
-    def _normals(self, places: FloatArray, surface: IntArray) -> FloatArray:
+    def _normals(self, positions: FloatArray, surface: IntArray) -> FloatArray:
         """Return the (N, 3) outward normals of surfaces at positions on or near them."""
-        normals = np.empty((len(places), 3))
-        surfaces.outward_normals(places, surface, self._kind, self._pose, normals)
+        normals = np.empty((len(positions), 3))
+        surfaces.outward_normals(positions, surface, self._kind, self._pose, normals)
         return normals
 
 

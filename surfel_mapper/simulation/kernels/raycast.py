@@ -44,7 +44,7 @@ def cast(
         for axis in range(3):
             ray[axis] = origins[row * apart, axis]
             ray[3 + axis] = directions[row, axis]
-        nearest, found = range_m[row], -1
+        nearest, surface_id = range_m[row], -1
         if last >= 0:
             # Neighbours often hit the same primitive; its distance prunes most of the tree.
             into_primitive(ray, pose[last], start)
@@ -61,9 +61,9 @@ def cast(
                 into_primitive(ray, pose[primitive], start)
                 distance, face = hit(start, kind[primitive], half[primitive])
                 if distance < nearest:
-                    nearest, found, last = distance, primitive * FACES + face, primitive
+                    nearest, surface_id, last = distance, primitive * FACES + face, primitive
             node += 1
-        range_m[row], surface[row] = nearest, found
+        range_m[row], surface[row] = nearest, surface_id
 
 
 @njit(cache=True, nogil=True)

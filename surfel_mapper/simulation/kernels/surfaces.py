@@ -41,31 +41,31 @@ def nearest_surface(
     distance_m  (N,) float64 m, out
     surface     (N,) int64, out; -1 without primitives and for non-finite positions
     """
-    place, local = np.zeros(6), np.zeros(6)
+    position, local = np.zeros(6), np.zeros(6)
     last = 0
     for row in range(len(positions)):
-        nearest, found = np.inf, -1
+        nearest, surface_id = np.inf, -1
         finite = True
         for axis in range(3):
-            place[axis] = positions[row, axis]
-            finite = finite and np.isfinite(place[axis])
+            position[axis] = positions[row, axis]
+            finite = finite and np.isfinite(position[axis])
         if finite and len(kind) > 0:
             # Neighbours often share their surface; its distance prunes most of the tree at once.
-            into_primitive(place, pose[last], local)
+            into_primitive(position, pose[last], local)
             nearest = np.nextafter(gap(local, kind[last], half[last])[0], np.inf)
         node = 0
         while finite and node < len(node_next):
-            if not distance_to_box(place, node_box[node]) < nearest:
+            if not distance_to_box(position, node_box[node]) < nearest:
                 node = node_next[node]
                 continue
             primitive = node_primitive[node]
             if primitive >= 0:
-                into_primitive(place, pose[primitive], local)
+                into_primitive(position, pose[primitive], local)
                 distance, face = gap(local, kind[primitive], half[primitive])
                 if distance < nearest:
-                    nearest, found, last = distance, primitive * FACES + face, primitive
+                    nearest, surface_id, last = distance, primitive * FACES + face, primitive
             node += 1
-        distance_m[row], surface[row] = nearest, found
+        distance_m[row], surface[row] = nearest, surface_id
 
 
 @njit(cache=True, nogil=True)
@@ -78,14 +78,14 @@ def outward_normals(positions, surface, kind, pose, normals):
     normals    (N, 3) float64, out; nan without a surface, on the axis of a cylinder and at the
                centre of a sphere
     """
-    place, local, normal = np.zeros(6), np.zeros(6), np.zeros(3)
+    position, local, normal = np.zeros(6), np.zeros(6), np.zeros(3)
     for row in range(len(positions)):
         if surface[row] < 0:
             normals[row] = np.nan
             continue
         primitive, face = surface[row] // FACES, surface[row] % FACES
-        place[:3] = positions[row]
-        into_primitive(place, pose[primitive], local)
+        position[:3] = positions[row]
+        into_primitive(position, pose[primitive], local)
         local_normal(local, kind[primitive], face, normal)
         for axis in range(3):
             normals[row, axis] = (
@@ -125,11 +125,11 @@ def into_primitive(ray, pose, local):
 
 
 @njit(cache=True, nogil=True)
-def distance_to_box(place, box):
+def distance_to_box(position, box):
     """Return the distance of a position from a box, 0 inside it."""
     total = 0.0
     for axis in range(3):
-        outside = max(box[axis] - place[axis], place[axis] - box[3 + axis], 0.0)
+        outside = max(box[axis] - position[axis], position[axis] - box[3 + axis], 0.0)
         total += outside * outside
     return math.sqrt(total)
 
@@ -153,9 +153,9 @@ def gap(local, kind, half):
         return solid_gap(wall, end, -np.inf), face
     gaps = abs(x) - half[0], abs(y) - half[1], abs(z) - half[2]
     axis = 0
-    for other in (1, 2):
-        if gaps[other] > gaps[axis]:
-            axis = other
+    for candidate in (1, 2):
+        if gaps[candidate] > gaps[axis]:
+            axis = candidate
     return solid_gap(*gaps), 2 * axis + (0 if local[axis] >= 0.0 else 1)
 
 
