@@ -77,11 +77,11 @@ class Ages:
         for scan in newest_first:
             if not missing:
                 break
-            found = self._thin(scan.moments.key, int(limit))
-            left = np.empty_like(found.keys)
-            num, num_left = mark_seen(found.keys, limit, keys, table, stamps, scan.stamp_ns, left)
+            thin = self._thin(scan.moments.key, int(limit))
+            kept = np.empty_like(thin.keys)
+            num, num_kept = mark_seen(thin.keys, limit, keys, table, stamps, scan.stamp_ns, kept)
             missing -= num
-            thinned[id(found.all_keys)] = found._replace(keys=left[:num_left].copy())
+            thinned[id(thin.all_keys)] = thin._replace(keys=kept[:num_kept].copy())
         self._thinned = thinned
         return stamps
 

@@ -80,11 +80,11 @@ def quantised(
         raise TypeError(
             f'columns: a {type(columns).__name__}, expected arrays by name: {", ".join(names)}'
         )
-    parts = []
+    channels = []
     for name in names:
         column = checked_channels(columns, name, num_points)
-        parts.append(_unpacked(column) if name == 'rgb' else _fixed(column))
-    return np.ascontiguousarray(np.concatenate(parts, axis=1))
+        channels.append(_unpacked(column) if name == 'rgb' else _fixed(column))
+    return np.ascontiguousarray(np.concatenate(channels, axis=1))
 
 
 def checked_channels(

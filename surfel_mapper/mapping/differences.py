@@ -78,12 +78,12 @@ def diff(
         voxels apart.
 
     """
-    for each in (before, after):
-        if not isinstance(each, SurfelMap):
-            raise TypeError(f'diff: a {type(each).__name__}, expected two SurfelMaps')
+    for surfel_map in (before, after):
+        if not isinstance(surfel_map, SurfelMap):
+            raise TypeError(f'diff: a {type(surfel_map).__name__}, expected two SurfelMaps')
     if not 0.0 <= as_real('angle_deg', angle_deg) <= 90.0:  # false for nan
         raise ValueError(f'angle_deg: {angle_deg}, expected 0 to 90 degrees')
-    lattices = [(each.voxel_size_m, each.level) for each in (before, after)]
+    lattices = [(surfel_map.voxel_size_m, surfel_map.level) for surfel_map in (before, after)]
     if lattices[0] != lattices[1]:
         raise MapError(
             f'maps of voxel size {before.voxel_size_m:g} m, level {before.level}, and '
@@ -92,7 +92,7 @@ def diff(
     if not np.array_equal(before.origin_m, after.origin_m):
         before = before.at_origin(after.origin_m)
     old, new = before.surfels(min_points), after.surfels(min_points)
-    keys = [pack_keys(each.voxel_index) for each in (old, new)]
+    keys = [pack_keys(surfels.voxel_index) for surfels in (old, new)]
     _, i, j = np.intersect1d(keys[0], keys[1], return_indices=True)
     cosine = np.abs((old.normal[i] * new.normal[j]).sum(axis=1))
     is_flat = np.minimum(old.planarity[i], new.planarity[j]) > FLAT

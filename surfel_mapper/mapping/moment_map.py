@@ -364,8 +364,8 @@ class MomentMap:
         limit = layout.MAX_MAP_COUNT >> (2 * self.level)
         if self._table.num_points + moments.num_points <= limit:
             return  # usual: even all points in one voxel would be allowed
-        found = self._table.find(moments.key)
-        largest = int((self._table.counts(found) + moments.count).max(initial=0))
+        rows = self._table.find(moments.key)
+        largest = int((self._table.counts(rows) + moments.count).max(initial=0))
         if largest > limit:
             raise MapLimitError(
                 f'a voxel would hold {largest} points; at most {limit}: use smaller voxels '

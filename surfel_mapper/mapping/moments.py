@@ -166,10 +166,10 @@ def point_keys(
 
 def whole_keys(key: npt.ArrayLike) -> npt.NDArray[np.int64]:
     """Return voxel keys (K,) as the kernels take them; TypeError for other arrays."""
-    found = as_array('keys', key)
-    if found.ndim != 1 or (found.size and found.dtype.kind not in 'iu'):
-        raise TypeError(f'keys: {found.dtype} {found.shape}, expected int64 (K,)')
-    return np.ascontiguousarray(found, np.int64)
+    keys = as_array('keys', key)
+    if keys.ndim != 1 or (keys.size and keys.dtype.kind not in 'iu'):
+        raise TypeError(f'keys: {keys.dtype} {keys.shape}, expected int64 (K,)')
+    return np.ascontiguousarray(keys, np.int64)
 
 
 def pack_keys(voxel_index: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
@@ -233,9 +233,9 @@ def shifted_moments(moments: ScanMoments, voxels: npt.NDArray[np.int64]) -> Scan
     return replace(moments, key=pack_keys(index))
 
 
-def joined_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
+def joined_moments(shards: Sequence[ScanMoments]) -> ScanMoments:
     """
-    Return the moments of all parts of a map, which share no voxel.
+    Return the moments of all shards of a map, which share no voxel.
 
     Raises
     ------
@@ -245,14 +245,14 @@ def joined_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
     """
     names = (*HASHED_ARRAYS, 'channels')
     arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in names
+        name: np.concatenate([getattr(shard, name) for shard in shards]) for name in names
     }
     key = np.sort(arrays['key'])
     twice = np.flatnonzero(key[1:] == key[:-1])
     if len(twice):
         index = unpack_keys(key[twice[:1]])[0].tolist()
         raise MapError(f'{len(twice)} voxels occur twice, expected once each: {index}, ...')
-    return replace(parts[0], **arrays)
+    return replace(shards[0], **arrays)
 
 
 def check_arrays(moments: ScanMoments) -> None:
@@ -262,9 +262,9 @@ def check_arrays(moments: ScanMoments) -> None:
         array = getattr(moments, name)
         shape = (len(moments), *width)
         if not (isinstance(array, np.ndarray) and array.shape == shape and array.dtype in types):
-            found = f'{getattr(array, "dtype", type(array).__name__)} {np.shape(array)}'
-            expected = ' or '.join(each.__name__ for each in types)
-            raise MapError(f'{name} of the moments: {found}, expected {expected} {shape}')
+            actual = f'{getattr(array, "dtype", type(array).__name__)} {np.shape(array)}'
+            expected = ' or '.join(dtype.__name__ for dtype in types)
+            raise MapError(f'{name} of the moments: {actual}, expected {expected} {shape}')
 
 
 def check_possible(moments: ScanMoments) -> None:
@@ -310,13 +310,13 @@ def digest_of(
     level: int,
     num_voxels: int,
     columns: tuple[str, ...],
-    parts: Callable[[str], Iterable[npt.NDArray[Any]]],
+    chunks: Callable[[str], Iterable[npt.NDArray[Any]]],
 ) -> str:
     """
     Return the SHA-256 of the state of a map in hexadecimal.
 
-    The arrays are hashed one after the other and in parts, so that a map larger than the memory
-    can be hashed too.
+    The arrays are hashed one after the other and in chunks. A map larger than the memory can be
+    hashed too.
 
     Parameters
     ----------
@@ -328,8 +328,8 @@ def digest_of(
         Voxels of the whole map.
     columns : tuple of str
         Columns of the points that the map sums.
-    parts : callable
-        Yields the array of a name of HASHED_ARRAYS, or of ``channels``, in any number of parts:
+    chunks : callable
+        Yields the array of a name of HASHED_ARRAYS, or of ``channels``, in any number of chunks:
         a row for each voxel, sorted by key.
 
     Notes
@@ -344,10 +344,10 @@ def digest_of(
     state = hashlib.sha256(b'surfel map 1')
     state.update(struct.pack('<dqq', voxel_size_m, level, num_voxels))
     for name in HASHED_ARRAYS:
-        for part in parts(name):
-            state.update(np.ascontiguousarray(part, dtype='<i8').data)
+        for chunk in chunks(name):
+            state.update(np.ascontiguousarray(chunk, dtype='<i8').data)
     if columns:
         state.update(','.join(columns).encode())
-        for part in parts('channels'):
-            state.update(np.ascontiguousarray(part, dtype='<i8').data)
+        for chunk in chunks('channels'):
+            state.update(np.ascontiguousarray(chunk, dtype='<i8').data)
     return state.hexdigest()

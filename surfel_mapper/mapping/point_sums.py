@@ -98,41 +98,41 @@ class PointSums:
             return np.full(3, np.nan)
         return self.anchor + self.total / self.num_points
 
-    def with_added(self, other: PointSums) -> PointSums:
+    def with_added(self, sums: PointSums) -> PointSums:
         """Return the sums of the union of both sets of points."""
-        if other.num_points == 0:
+        if sums.num_points == 0:
             return self
         if self.num_points == 0:
-            return other
-        added = other._total_about(self.anchor)
-        between = _between(self.num_points, self.total, other.num_points, added)
-        scatter = self.scatter + (other.scatter + between)
+            return sums
+        added = sums._total_about(self.anchor)
+        between = _between(self.num_points, self.total, sums.num_points, added)
+        scatter = self.scatter + (sums.scatter + between)
         return PointSums(
-            self.num_points + other.num_points,
+            self.num_points + sums.num_points,
             self.anchor,
             self.total + added,
             scatter,
-            self.rounding + other.rounding + ROUNDING * _trace(scatter),
+            self.rounding + sums.rounding + ROUNDING * _trace(scatter),
         )
 
-    def with_removed(self, other: PointSums) -> PointSums:
+    def with_removed(self, sums: PointSums) -> PointSums:
         """Return the sums without the points of another; empty if it has as many or more."""
-        left = self.num_points - other.num_points
-        if other.num_points == 0:
+        num_points = self.num_points - sums.num_points
+        if sums.num_points == 0:
             return self
-        if left <= 0:
+        if num_points <= 0:
             return NO_POINTS
-        removed = other._total_about(self.anchor)
+        removed = sums._total_about(self.anchor)
         total = self.total - removed
-        if left == 1:
+        if num_points == 1:
             return PointSums.without_scatter(1, self.anchor, total)
-        between = _between(left, total, other.num_points, removed)
+        between = _between(num_points, total, sums.num_points, removed)
         return PointSums(
-            left,
+            num_points,
             self.anchor,
             total,
-            self.scatter - (other.scatter + between),
-            self.rounding + other.rounding + ROUNDING * _trace(self.scatter),
+            self.scatter - (sums.scatter + between),
+            self.rounding + sums.rounding + ROUNDING * _trace(self.scatter),
         )
 
     def _total_about(self, anchor: Array) -> Array:

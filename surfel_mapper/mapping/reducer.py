@@ -173,7 +173,7 @@ class Reducer:
         scratch: Scratch,
     ) -> ScanMoments:
         """Return the moments of points (3, N); see SurfelMap.reduce."""
-        num_points, part = xyz.shape[1], WIDEST
+        num_points, size = xyz.shape[1], WIDEST
         if num_points <= WIDEST:
             num = scratch.fill(xyz, quantisation)
             left_out = scratch.left_out.tolist()
@@ -190,15 +190,15 @@ class Reducer:
             largest = pack_moments(keys, sums, origin, self.voxel_size_m, moments.arrays)
             if largest <= FULL:
                 return moments
-            part = max(FULL, num_points * FULL // (2 * largest))  # half full on average
-        starts = range(0, num_points, part)
-        parts = (np.ascontiguousarray(xyz[:, i : i + part]) for i in starts)
-        return summed_moments([self._moments(p, quantisation, origin, scratch) for p in parts])
+            size = max(FULL, num_points * FULL // (2 * largest))  # half full on average
+        starts = range(0, num_points, size)
+        chunks = (np.ascontiguousarray(xyz[:, i : i + size]) for i in starts)
+        return summed_moments([self._moments(p, quantisation, origin, scratch) for p in chunks])
 
 
-def summed_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
+def summed_moments(chunks: Sequence[ScanMoments]) -> ScanMoments:
     """
-    Return the moments of the points of all parts of a scan.
+    Return the moments of the points of all chunks of a scan.
 
     Raises
     ------
@@ -206,13 +206,13 @@ def summed_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
         If a voxel gets more than 2^23 points.
 
     """
-    keys = np.concatenate([part.key for part in parts])
+    keys = np.concatenate([chunk.key for chunk in chunks])
     key, first, rows = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(first)  # of first appearance
     key, rows = key[order], np.argsort(order)[rows]
 
     def summed(name: str) -> npt.NDArray[np.int64]:
-        values = np.concatenate([getattr(part, name) for part in parts])
+        values = np.concatenate([getattr(chunk, name) for chunk in chunks])
         sums = np.zeros((len(key), *values.shape[1:]), np.int64)
         np.add.at(sums, rows, values)
         return sums
@@ -224,17 +224,19 @@ def summed_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
             f'{largest} points in one voxel of one scan; '
             f'at most {MAX_SCAN_COUNT}: use smaller voxels or split the scan'
         )
-    view = np.empty((len(key), 3), np.int16)  # equal in all parts
-    view[rows] = np.concatenate([part.view for part in parts])
-    causes = [cause for cause in CAUSES if any(cause in part.left_out for part in parts)]
+    view = np.empty((len(key), 3), np.int16)  # equal in all chunks
+    view[rows] = np.concatenate([chunk.view for chunk in chunks])
+    causes = [cause for cause in CAUSES if any(cause in chunk.left_out for chunk in chunks)]
     return replace(
-        parts[0],
+        chunks[0],
         key=key,
         count=count.astype(np.int32),
         total=total if largest > FULL else total.astype(np.int32),
         product=summed('product'),
         view=view,
-        left_out={cause: sum(part.left_out.get(cause, 0) for part in parts) for cause in causes},
+        left_out={
+            cause: sum(chunk.left_out.get(cause, 0) for chunk in chunks) for cause in causes
+        },
     )
 
 
@@ -262,10 +264,10 @@ def squared_limits(min_range_m: float, max_range_m: float) -> npt.NDArray[np.flo
 
 def as_origin(origin: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return the position of the sensor as the kernels take it; ValueError if it is none."""
-    place = np.ascontiguousarray(as_numbers('origin', origin))
-    if place.shape != (3,) or not all(map(math.isfinite, place.tolist())):
+    position = np.ascontiguousarray(as_numbers('origin', origin))
+    if position.shape != (3,) or not all(map(math.isfinite, position.tolist())):
         raise ValueError('origin: expected the finite position of the sensor, x y z')
-    return place
+    return position
 
 
 def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:

@@ -273,13 +273,13 @@ def _checked(
     limit: float = MAX_COORDINATE_M,
 ) -> Array:
     """Return numbers as a new float64 array of a shape, by default (3,) or (N, 3)."""
-    found = as_array(name, numbers)
-    if found.dtype.kind not in 'fiu':
-        raise ValueError(f'{name}: dtype {found.dtype}, expected real numbers')
-    fits = found.shape == shape if shape else found.ndim in (1, 2) and found.shape[-1] == 3
+    raw = as_array(name, numbers)
+    if raw.dtype.kind not in 'fiu':
+        raise ValueError(f'{name}: dtype {raw.dtype}, expected real numbers')
+    fits = raw.shape == shape if shape else raw.ndim in (1, 2) and raw.shape[-1] == 3
     if not fits:
-        raise ValueError(f'{name}: shape {found.shape}, expected {shape or "(3,) or (N, 3)"}')
-    array = found.astype(np.float64)
+        raise ValueError(f'{name}: shape {raw.shape}, expected {shape or "(3,) or (N, 3)"}')
+    array = raw.astype(np.float64)
     good = np.abs(array) <= limit  # false for nan
     if not good.all():
         raise ValueError(f'{name}: found {array[~good][0]}, expected numbers up to {limit:g}')

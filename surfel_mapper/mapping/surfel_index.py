@@ -61,10 +61,10 @@ class SurfelIndex:
             Rows of ``surfels``; -1 if the voxel has no surfel.
 
         """
-        places = _places(points)
-        rows = np.empty(len(places), np.int64)
+        xyz = _as_xyz(points)
+        rows = np.empty(len(xyz), np.int64)
         scale = (1 << self._bits) / self.voxel_size_m
-        rows_at(places, scale, self._bits, self._keys, self._table, rows)
+        rows_at(xyz, scale, self._bits, self._keys, self._table, rows)
         return rows
 
     def nearest(
@@ -88,9 +88,9 @@ class SurfelIndex:
             Distance to the position of the surfel; inf if none is near.
 
         """
-        places = _places(points)
-        rows = self._best(places, max_distance_m, 1, np.empty(0))[:, 0]
-        step = self._of(self.surfels.position, rows) - places
+        xyz = _as_xyz(points)
+        rows = self._best(xyz, max_distance_m, 1, np.empty(0))[:, 0]
+        step = self._of(self.surfels.position, rows) - xyz
         distance = np.sqrt((step * step).sum(axis=1))
         return rows, np.where(rows >= 0, distance, math.inf)
 
@@ -123,7 +123,7 @@ class SurfelIndex:
         """
         if k < 1:
             raise ValueError(f'k: {k}, expected 1 or more')
-        return self._best(_places(points), max_distance_m, k, -self.surfels.planarity)
+        return self._best(_as_xyz(points), max_distance_m, k, -self.surfels.planarity)
 
     def in_box(self, low: npt.ArrayLike, high: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """Return the rows of the surfels in a box, m, including its faces, ascending."""
@@ -137,7 +137,7 @@ class SurfelIndex:
         """Return the rows of the surfels within a distance of a point, ascending."""
         if not radius_m >= 0.0:
             raise ValueError(f'radius_m: {radius_m}, expected zero or more')
-        step = self.surfels.position - _places(np.reshape(np.asarray(center), (1, 3)))
+        step = self.surfels.position - _as_xyz(np.reshape(np.asarray(center), (1, 3)))
         return np.flatnonzero((step * step).sum(axis=1) <= radius_m * radius_m)
 
     def plane_distance(
@@ -161,19 +161,19 @@ class SurfelIndex:
             surfel, or it has no normal.
 
         """
-        places = _places(points)
-        rows = self.nearest(places, max_distance_m)[0] if max_distance_m > 0 else self.at(places)
-        step = places - self._of(self.surfels.position, rows)
+        xyz = _as_xyz(points)
+        rows = self.nearest(xyz, max_distance_m)[0] if max_distance_m > 0 else self.at(xyz)
+        step = xyz - self._of(self.surfels.position, rows)
         return np.asarray((step * self._of(self.surfels.normal, rows)).sum(axis=1))
 
     def _best(
-        self, places: npt.NDArray[np.float64], radius_m: float, k: int, ranks: Any
+        self, xyz: npt.NDArray[np.float64], radius_m: float, k: int, ranks: Any
     ) -> npt.NDArray[np.int64]:
         if not 0.0 <= radius_m < math.inf:
             raise ValueError(f'max_distance_m: {radius_m}, expected zero or more, finite')
-        rows = np.empty((len(places), k), np.int64)
+        rows = np.empty((len(xyz), k), np.int64)
         best_around(
-            places,
+            xyz,
             radius_m,
             self.voxel_size_m,
             self.surfels.position,
@@ -193,9 +193,9 @@ class SurfelIndex:
         return np.where((rows >= 0)[:, None], values[rows], math.nan)
 
 
-def _places(points: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def _as_xyz(points: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return points as (N, 3) float64 in C order."""
-    places = np.require(as_numbers('points', points), requirements=['C', 'A', 'W'])
-    if places.ndim != 2 or places.shape[1] != 3:
-        raise ValueError(f'points: shape {places.shape}, expected (N, 3)')
-    return places
+    xyz = np.require(as_numbers('points', points), requirements=['C', 'A', 'W'])
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise ValueError(f'points: shape {xyz.shape}, expected (N, 3)')
+    return xyz

@@ -243,10 +243,10 @@ class SurfelMap(MomentMap):
     def covariances_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
         """Return the covariances of rows (K,): (K, 6), xx xy xz yy yz zz, m^2."""
         rows = self._table.checked(rows)
-        found = np.empty((len(rows), 6))
+        covariances = np.empty((len(rows), 6))
         bits = layout.BITS + self.level
-        derive_covariances(self._table.rows.array, rows, self.voxel_size_m, bits, found)
-        return found
+        derive_covariances(self._table.rows.array, rows, self.voxel_size_m, bits, covariances)
+        return covariances
 
     def surfels_changed(self, since: int | None = None, min_points: int = 1) -> Surfels:
         """
@@ -332,11 +332,11 @@ class SurfelMap(MomentMap):
             range of the indices.
 
         """
-        other = SurfelMap(
+        shifted = SurfelMap(
             self.voxel_size_m, columns=self.columns, level=self.level, origin_m=origin_m
         )
-        other.merge(self)
-        return other
+        shifted.merge(self)
+        return shifted
 
     def copy(self) -> SurfelMap:
         """Return an independent copy."""

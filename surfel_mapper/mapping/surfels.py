@@ -225,12 +225,13 @@ class Surfels:
         )
 
 
-def concatenated(parts: Sequence[Surfels]) -> Surfels:
-    """Return the surfels of all parts."""
-    names = [each.name for each in fields(Surfels) if each.name != 'channels']
-    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+def concatenated(tables: Sequence[Surfels]) -> Surfels:
+    """Return the surfels of all tables."""
+    names = [field.name for field in fields(Surfels) if field.name != 'channels']
+    columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
     channels = {
-        name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels
+        name: np.concatenate([table.channels[name] for table in tables])
+        for name in tables[0].channels
     }
     return Surfels(**columns, channels=channels)
 

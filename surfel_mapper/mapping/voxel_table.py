@@ -107,8 +107,8 @@ class VoxelTable:
                 self._make_room()
         except BaseException:
             for start in range(0, num_added, 1024):  # in parts: there may be no memory for more
-                part = slice(start, min(start + 1024, num_added))
-                self._subtract(moments.select(part), rows[part], 1)
+                chunk = slice(start, min(start + 1024, num_added))
+                self._subtract(moments.select(chunk), rows[chunk], 1)
             raise
         if self._channels:
             self._channels.array[rows.astype(np.intp)] += moments.channels
@@ -116,9 +116,9 @@ class VoxelTable:
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key, -1 if not found."""
-        found = np.empty(len(key), np.int32)
-        find_rows(key, self.rows.array, self._hash.arrays, self._state, found)
-        return found
+        rows = np.empty(len(key), np.int32)
+        find_rows(key, self.rows.array, self._hash.arrays, self._state, rows)
+        return rows
 
     def remove(
         self, moments: ScanMoments, version: int, min_points: int = 1
@@ -148,16 +148,16 @@ class VoxelTable:
 
     def checked(self, rows: npt.ArrayLike) -> npt.NDArray[np.int32]:
         """Return rows (K,) as the kernels take them; IndexError if the table does not have one."""
-        found = as_array('rows', rows)
-        if found.ndim != 1 or found.dtype.kind != 'i':
-            raise IndexError(f'rows: {found.dtype} {found.shape}, expected those of find')
+        array = as_array('rows', rows)
+        if array.ndim != 1 or array.dtype.kind != 'i':
+            raise IndexError(f'rows: {array.dtype} {array.shape}, expected those of find')
         last = self._hash.rows_used - 1
-        if len(found) and not 0 <= found.min() <= found.max() <= last:
+        if len(array) and not 0 <= array.min() <= array.max() <= last:
             raise IndexError(
-                f'rows {found.min()} to {found.max()}, expected 0 to {last}; find returns -1 for '
+                f'rows {array.min()} to {array.max()}, expected 0 to {last}; find returns -1 for '
                 'voxels that are not in the map'
             )
-        return found.astype(np.int32, copy=False)
+        return array.astype(np.int32, copy=False)
 
     def keys(self, chosen: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
         """
@@ -166,14 +166,14 @@ class VoxelTable:
         With indices of another width than intp NumPy (2.4) may end the process when memory runs
         out, both in reading and in assigning.
         """
-        found: npt.NDArray[np.int64] = self.rows.array[chosen.astype(np.intp), layout.KEY]
-        return found
+        keys: npt.NDArray[np.int64] = self.rows.array[chosen.astype(np.intp), layout.KEY]
+        return keys
 
     def counts(self, chosen: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
         """Return the numbers of points of some rows, (K,); 0 for rows of -1."""
-        found = np.empty(len(chosen), np.int64)
-        read_counts(self.rows.array, chosen, found)
-        return found
+        counts = np.empty(len(chosen), np.int64)
+        read_counts(self.rows.array, chosen, counts)
+        return counts
 
     def channels(self, chosen: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
         """Return the channel sums of some rows, (K, C)."""
@@ -223,24 +223,24 @@ class VoxelTable:
         num = rows_held(self.rows.array, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
-    def _add(self, moments: ScanMoments, start: int, found: npt.NDArray[np.int32]) -> int:
+    def _add(self, moments: ScanMoments, start: int, rows: npt.NDArray[np.int32]) -> int:
         """Add moments from a voxel on, as far as there is room; see add_moments."""
         stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
         done: int = add_moments(
             *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
-            *(self._state, stamp_of(self._version), start, found),
+            *(self._state, stamp_of(self._version), start, rows),
         )
         return done
 
     def _subtract(
-        self, moments: ScanMoments, found: npt.NDArray[np.int32], min_points: int
+        self, moments: ScanMoments, rows: npt.NDArray[np.int32], min_points: int
     ) -> tuple[int, npt.NDArray[np.int32]]:
         """Subtract moments without channels; see remove_moments."""
-        fallen: npt.NDArray[np.int32] = np.empty((len(found), 3), np.int32)
+        fallen: npt.NDArray[np.int32] = np.empty((len(rows), 3), np.int32)
         stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
         missing, num_fallen = remove_moments(
             *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
-            *(self._state, stamp_of(self._version), found, min_points, fallen),
+            *(self._state, stamp_of(self._version), rows, min_points, fallen),
         )
         return missing, fallen[:num_fallen]
 

@@ -279,13 +279,13 @@ class SlidingWindow:
 
         """
         min_points = as_whole('min_points', min_points)
-        held = self._map.moments(voxel_index)
-        if not len(held):
+        moments = self._map.moments(voxel_index)
+        if not len(moments):
             return np.empty((0, 3), np.int32)
-        rest = deque((without(scan, held.key), m) for scan, m in self._scans)
-        nbytes = sum(scan.nbytes for scan, _ in rest)
-        fallen = self._map.remove(held, min_points)  # last: copies of scans can lack memory
-        self._scans, self._nbytes = rest, nbytes
+        scans = deque((without(scan, moments.key), m) for scan, m in self._scans)
+        nbytes = sum(scan.nbytes for scan, _ in scans)
+        fallen = self._map.remove(moments, min_points)  # last: copies of scans can lack memory
+        self._scans, self._nbytes = scans, nbytes
         return fallen
 
     def move(
@@ -319,28 +319,28 @@ class SlidingWindow:
         min_points = as_whole('min_points', min_points)
         checked_scans(scans.values())
         old = list(self)
-        if absent := [place for place in scans if place not in range(len(old))]:
+        if absent := [index for index in scans if index not in range(len(old))]:
             raise IndexError(f'scan {absent[0]} of {len(old)} kept ones, expected 0 or more')
-        left = np.concatenate([np.empty(0, np.int64), *(old[p].moments.key for p in scans)])
-        full = self._full(left, min_points)
+        keys = np.concatenate([np.empty(0, np.int64), *(old[p].moments.key for p in scans)])
+        full = self._full(keys, min_points)
         with ExitStack() as undo:
-            for place, scan in scans.items():
+            for index, scan in scans.items():
                 self._map.insert(scan.moments)
                 undo.callback(self._map.remove, scan.moments)
-                self._map.remove(old[place].moments)
-                undo.callback(self._map.insert, old[place].moments)
+                self._map.remove(old[index].moments)
+                undo.callback(self._map.insert, old[index].moments)
             undo.pop_all()
         self._travel = Travel(self._scans[0][1] if self._scans else 0.0)
         self._scans.clear()
         self._nbytes = 0
-        for place, scan in enumerate(old):
-            self._append(scans.get(place, scan))
-        return unpack_keys(np.setdiff1d(full, self._full(left, min_points)))
+        for index, scan in enumerate(old):
+            self._append(scans.get(index, scan))
+        return unpack_keys(np.setdiff1d(full, self._full(keys, min_points)))
 
     def _full(self, keys: npt.NDArray[np.int64], min_points: int) -> npt.NDArray[np.int64]:
         """Return those of the keys whose voxels hold at least min_points points."""
-        held = self._map.moments(unpack_keys(keys))
-        return held.key[held.count >= min_points]
+        moments = self._map.moments(unpack_keys(keys))
+        return moments.key[moments.count >= min_points]
 
     def clear(self) -> None:
         """Remove all scans and clear the map."""
@@ -401,10 +401,10 @@ SETTINGS = tuple(declared.key for declared in settings_of(WindowConfig) if decla
 def checked_scans(scans: Iterable[WindowedScan]) -> list[WindowedScan]:
     """Return scans as a list; raise TypeError for others."""
     check_kind('scans', scans, Iterable)
-    found = list(scans)
-    for scan in found:
+    listed = list(scans)
+    for scan in listed:
         check_kind('scans', scan, WindowedScan)
-    return found
+    return listed
 
 
 def without(scan: WindowedScan, keys: npt.NDArray[np.int64]) -> WindowedScan:
@@ -412,13 +412,13 @@ def without(scan: WindowedScan, keys: npt.NDArray[np.int64]) -> WindowedScan:
     hit = contains(keys, scan.moments.key)
     if not hit.any():
         return scan
-    rest = replace(scan, moments=scan.moments.select(~hit))
+    kept = replace(scan, moments=scan.moments.select(~hit))
     if scan.points is None:
-        return rest
+        return kept
     size_m = scan.moments.voxel_size_m
     stay = ~contains(keys, point_keys(scan.points, scan.T_map_sensor, size_m))
     columns = {name: column[stay] for name, column in scan.columns.items()}
-    return replace(rest, points=scan.points[stay], columns=columns)
+    return replace(kept, points=scan.points[stay], columns=columns)
 
 
 def contains(keys: npt.NDArray[np.int64], wanted: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:

@@ -102,18 +102,18 @@ def best_around(points, radius, voxel_size, positions, ranks, keys, table, rows)
 @kernel()
 def insert_ranked(rank, row, best, rows, i):
     """Insert a row into the sorted best rows of point i; a rank of nan is ignored."""
-    place = len(best)
-    while place > 0 and (
-        rank < best[place - 1] or (rank == best[place - 1] and row < rows[i, place - 1])
+    index = len(best)
+    while index > 0 and (
+        rank < best[index - 1] or (rank == best[index - 1] and row < rows[i, index - 1])
     ):
-        place -= 1
-    if place == len(best) or not rank < math.inf:
+        index -= 1
+    if index == len(best) or not rank < math.inf:
         return
-    for later in range(len(best) - 1, place, -1):
+    for later in range(len(best) - 1, index, -1):
         best[later] = best[later - 1]
         rows[i, later] = rows[i, later - 1]
-    best[place] = rank
-    rows[i, place] = row
+    best[index] = rank
+    rows[i, index] = row
 
 
 @kernel()
@@ -160,10 +160,10 @@ def rows_changed_at(rows, stamps, changed, stamp, min_points):
     kept = np.empty(len(changed), np.int32)
     ignored = EMPTIED if min_points < 1 else 0
     num, num_changed = U(0), U(len(changed))
-    for place in range(num_changed):
-        if place + U(EARLY) < num_changed:
-            prefetch_early(stamps, np.int64(changed[place + U(EARLY)]))
-        row = changed[place]
+    for index in range(num_changed):
+        if index + U(EARLY) < num_changed:
+            prefetch_early(stamps, np.int64(changed[index + U(EARLY)]))
+        row = changed[index]
         kept[num] = row  # a branch would be mispredicted half of the time
         num += U((stamps[U(row)] ^ stamp) <= ignored)
     return kept[:num] if min_points <= 1 else kept[: keep_full(rows, kept, num, min_points)]
@@ -174,10 +174,10 @@ def keep_full(rows, kept, num, min_points):
     """Move the rows of at least min_points points to the front; return their number."""
     flat = rows.ravel()
     num_full = 0
-    for place in range(num):
-        if place + AHEAD < num:
-            prefetch(flat, np.int64(kept[place + AHEAD]) * ROW)
-        row = kept[place]
+    for index in range(num):
+        if index + AHEAD < num:
+            prefetch(flat, np.int64(kept[index + AHEAD]) * ROW)
+        row = kept[index]
         kept[num_full] = row
         num_full += count_of(flat, first_word(row)) >= min_points
     return num_full
@@ -247,23 +247,23 @@ def rows_held(rows, used, min_points, chosen, mixed):
 
 
 @kernel()
-def mark_seen(seen, limit, keys, table, marks, mark, left):
+def mark_seen(observed, limit, keys, table, marks, mark, kept):
     """
     Mark the unmarked surfels whose voxels a scan observed.
 
-    seen    (S,) int64, voxel keys of the scan
-    limit   uint64, largest mixed key of the surfels
-    keys    (K,) int64, of the surfels
-    table   (B,) int32, hash table of the keys, as build_table makes it
-    marks   (K,) int64, in and out: -1 for an unmarked surfel
-    mark    int64
-    left    (S,) int64, out: the keys seen, without those of surfels marked before
+    observed  (S,) int64, voxel keys of the scan
+    limit     uint64, largest mixed key of the surfels
+    keys      (K,) int64, of the surfels
+    table     (B,) int32, hash table of the keys, as build_table makes it
+    marks     (K,) int64, in and out: -1 for an unmarked surfel
+    mark      int64
+    kept      (S,) int64, out: the keys observed, without the surfels marked before
 
-    Returns the number of surfels marked and of keys left.
+    Returns the number of surfels marked and of keys kept.
     """
     shift = hash_shift(len(table))
-    num = num_left = 0
-    for key in seen:
+    num = num_kept = 0
+    for key in observed:
         if mix(key) <= limit:
             row = find_key(key, keys, table, shift)
             if row >= 0:
@@ -271,9 +271,9 @@ def mark_seen(seen, limit, keys, table, marks, mark, left):
                     continue
                 marks[row] = mark
                 num += 1
-        left[num_left] = key
-        num_left += 1
-    return num, num_left
+        kept[num_kept] = key
+        num_kept += 1
+    return num, num_kept
 
 
 @kernel()

@@ -60,9 +60,9 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     scratch   table (B,) int32, row of each key by hash, B a power of two, all -1 before and after;
               keys (E + 2,) int64, out: from keys[2] on voxel keys in the order of first
               appearance, E <= B / 2;
-              sums (E + 2, WORDS) int64, out: from sums[1] on those of the places in the voxel,
-              as lanes.py packs them; those of more than FULL points are wrong;
-              of one chunk: chunk_keys (CHUNK + 1,) int64, places (CHUNK,) int64,
+              sums (E + 2, WORDS) int64, out: from sums[1] on those of the points in the voxel,
+              as lanes.py packs them; wrong for more than FULL points;
+              of one chunk: chunk_keys (CHUNK + 1,) int64, packed (CHUNK,) int64,
               starts (CHUNK + AHEAD,) int32, run_rows (CHUNK,) int32; zeros before the first use
     left_out  (4,) int64, out: number of points rejected as not finite, too near, too far, beyond
               the voxel indices
@@ -70,7 +70,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     Points left out have the key -1, whose row is the first: sums[0] is of no use but for its
     count. The last row stays zero. After -1 call with larger arrays.
     """
-    table, keys, sums, chunk_keys, places, starts, run_rows = scratch
+    table, keys, sums, chunk_keys, packed, starts, run_rows = scratch
     words = sums.ravel()
     left_out[:] = 0
     keys[1] = -1
@@ -83,17 +83,17 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     for start in range(0, len(all_x), CHUNK):
         chunk = slice(start, start + CHUNK)
         x, y, z = all_x[chunk], all_y[chunk], all_z[chunk]
-        quantise(x, y, z, pose, scale, range_sq, chunk_keys, places)
+        quantise(x, y, z, pose, scale, range_sq, chunk_keys, packed)
         num_runs = find_runs(chunk_keys, len(x), starts)
         if num_rows + num_runs >= len(sums):
             table[:] = -1
             return -1
-        known = num_rows
+        first_new = num_rows
         num_rows = number_runs(chunk_keys, starts, num_runs, table, keys, num_rows, run_rows)
-        sums[known:num_rows] = 0
+        sums[first_new:num_rows] = 0
         later = slice(start + CHUNK, start + 2 * CHUNK)
         points = all_x[later], all_y[later], all_z[later]
-        add_places(places, len(x), chunk_keys, run_rows, words, points)
+        add_packed(packed, len(x), chunk_keys, run_rows, words, points)
         if sums[0, 0] > num_left_out:
             num_left_out = sums[0, 0]
             for run in range(num_runs):
@@ -105,20 +105,20 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
 
 
 @kernel()
-def add_places(places, num, chunk_keys, run_rows, words, later):
+def add_packed(packed, num, chunk_keys, run_rows, words, later):
     """
-    Add the places of a chunk of points to the sums of their voxels.
+    Add the packed points of a chunk to the sums of their voxels.
 
-    places      (CHUNK,) int64, of which num count, at least one; see quantise
+    packed      (CHUNK,) int64, of which num count, at least one; see quantise
     chunk_keys  (CHUNK + 1,) int64, voxel key of each point
     run_rows    (CHUNK,) int32, row of the voxel of each run
     words       (8 M,) int64, in and out: sums of the voxels; the last eight are zero
     later       x, y, z (L,) float32 or float64 of the points of the next chunk, to be prefetched
 
-    Without branches, which real lidars would mispredict at every third to eighth point: sums stay
-    in registers and are stored after each point. A new run drops them, by a mask, and takes those
-    of its voxel. A point of the same run takes the zeros at the end instead, because reading
-    the row that the point before it wrote would wait for that write.
+    There are no branches, which real lidars would mispredict at every third to eighth point. Sums
+    stay in registers and are stored after each point. A new run drops them, by a mask, and takes
+    the sums of its voxel. A point of the same run takes the zeros at the end instead, because
+    reading the row that the previous point wrote would wait for that write.
     """
     x, y, z = later
     zeros = U(len(words) - WORDS)
@@ -134,9 +134,9 @@ def add_places(places, num, chunk_keys, run_rows, words, later):
             previous = chunk_keys[i]
             run += U(is_new)
             at = U(WORDS) * U(np.uint32(run_rows[run]))
-            others = load_sums(words, at if is_new else zeros)
-            others = plus_place(others, places[i])
-            sums = sum_unless(is_new, sums, others)
+            stored = load_sums(words, at if is_new else zeros)
+            stored = plus_place(stored, packed[i])
+            sums = sum_unless(is_new, sums, stored)
             store_sums(words, at, sums)
 
 
@@ -226,10 +226,10 @@ def look_back(keys, origin, voxel_size, view):
             dy = oy - (np.int32(ky) + 0.5) * voxel_size
             dz = oz - (np.int32(kz) + 0.5) * voxel_size
             length = math.sqrt((dx * dx + dy * dy) + dz * dz)
-            known = length > 0.0  # false for nan
-            towards[0, i] = np.rint(VIEW_SCALE * (dx / length)) if known else 0.0
-            towards[1, i] = np.rint(VIEW_SCALE * (dy / length)) if known else 0.0
-            towards[2, i] = np.rint(VIEW_SCALE * (dz / length)) if known else 0.0
+            defined = length > 0.0  # false for nan
+            towards[0, i] = np.rint(VIEW_SCALE * (dx / length)) if defined else 0.0
+            towards[1, i] = np.rint(VIEW_SCALE * (dy / length)) if defined else 0.0
+            towards[2, i] = np.rint(VIEW_SCALE * (dz / length)) if defined else 0.0
         for i in range(num):
             for axis in range(3):
                 view[start + i, axis] = np.int16(towards[axis, i])
@@ -247,7 +247,7 @@ def sum_channels(xyz, pose, scale, range_sq, keys, table, values, sums):
     sums    (K, C) int64, out
     """
     chunk_keys = np.empty(CHUNK, np.int64)
-    places = np.empty(CHUNK, np.int64)
+    packed = np.empty(CHUNK, np.int64)
     starts = np.empty(CHUNK + 1, np.int32)
     shift = hash_shift(len(table))
     sums[:, :] = 0
@@ -255,7 +255,7 @@ def sum_channels(xyz, pose, scale, range_sq, keys, table, values, sums):
     for start in range(0, len(all_x), CHUNK):
         chunk = slice(start, start + CHUNK)
         x, y, z = all_x[chunk], all_y[chunk], all_z[chunk]
-        quantise(x, y, z, pose, scale, range_sq, chunk_keys, places)
+        quantise(x, y, z, pose, scale, range_sq, chunk_keys, packed)
         num_runs = find_runs(chunk_keys, len(x), starts)
         for run in range(num_runs):
             key = chunk_keys[starts[run]]

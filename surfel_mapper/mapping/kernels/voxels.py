@@ -86,51 +86,51 @@ is taken AHEAD new voxels later, to be prefetched; in the cache line of key and 
 
 
 @njit(cache=True, nogil=True, inline='always')
-def look_ahead(place, last, keys, flat, directory, buckets, depth, hashes, likely):
+def look_ahead(index, last, keys, flat, directory, buckets, depth, hashes, likely):
     """
     Hash the voxel HASHED places ahead; find and prefetch the row of the one FOUND places ahead.
 
-    place   int64, from HASHED before the first voxel on
+    index   int64, from HASHED before the first voxel on
     last    int64, the last voxel
     keys    (K,) int64, at least one
     flat    (R * 12,) int64, the rows
     hashes  (RING,) int64, in and out: hash of voxel i at i & LAST
     likely  (RING,) int64, out: a row with this hash, to be confirmed by its key; -1 if not found
     """
-    hashed = hash_key(keys[U(min(place + HASHED, last))])
-    hashes[U((place + HASHED) & LAST)] = hashed
+    hashed = hash_key(keys[U(min(index + HASHED, last))])
+    hashes[U((index + HASHED) & LAST)] = hashed
     prefetch(directory, hashed >> (32 - depth))
-    earlier, nearer = hashes[U((place + EARLIER) & LAST)], hashes[U((place + NEARER) & LAST)]
+    earlier, nearer = hashes[U((index + EARLIER) & LAST)], hashes[U((index + NEARER) & LAST)]
     prefetch_early(buckets, first_bucket(earlier, directory, depth))
     prefetch(buckets, first_bucket(nearer, directory, depth))
-    row = likely_row(hashes[U((place + FOUND) & LAST)], directory, buckets, depth)
-    likely[U((place + FOUND) & LAST)] = row
+    row = likely_row(hashes[U((index + FOUND) & LAST)], directory, buckets, depth)
+    likely[U((index + FOUND) & LAST)] = row
     prefetch_row(flat, max(row, 0))  # an address before the slab may cost a walk of page tables
 
 
 @kernel()
-def find_rows(keys, rows, table, state, found):
+def find_rows(keys, rows, table, state, row_of):
     """
     Look up the row of every voxel.
 
-    keys   (K,) int64
-    found  (K,) int32, out: row, -1 if not found
+    keys    (K,) int64
+    row_of  (K,) int32, out: row, -1 if not found
     """
     directory, buckets, _, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
     hashes, likely = np.zeros(RING, np.int64), np.empty(RING, np.int64)
-    for place in range(-HASHED if len(keys) else 0, len(keys)):
-        look_ahead(place, len(keys) - 1, keys, flat, directory, buckets, depth, hashes, likely)
-        if place >= 0:
-            row, key = likely[U(place & LAST)], keys[U(place)]
+    for index in range(-HASHED if len(keys) else 0, len(keys)):
+        look_ahead(index, len(keys) - 1, keys, flat, directory, buckets, depth, hashes, likely)
+        if index >= 0:
+            row, key = likely[U(index & LAST)], keys[U(index)]
             if row >= 0 and flat[first_word(row) + U(KEY)] != key:
                 row = find_row(key, rows, table, depth)
-            found[U(place)] = row
+            row_of[U(index)] = row
 
 
 @kernel()
-def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, found):
+def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, row_of):
     """
     Add the moments of the voxels of a scan from start on; return the first that was not added.
 
@@ -139,54 +139,54 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, 
     stamps       (R,) uint32, out: the last change of each row
     stamp        uint32, of this change; see kernels/layout.py
     start        int64, the first voxel to add
-    found        (K,) int32, out: row of each voxel
+    row_of       (K,) int32, out: row of each voxel
 
     Returns K if all were added. Otherwise slab, segments or directory have no room for a voxel:
     make room and continue from there.
     """
     keys, count, _, _, _ = moments
     words = words_of(moments)
-    directory, buckets, held, _ = table
+    directory, buckets, counts, _ = table
     flat = rows.ravel()
     depth, stop = state[DEPTH], len(keys)
     hashes, likely = np.zeros(RING, np.int64), np.empty(RING, np.int64)
     entries = np.empty(SEGMENT, np.int64)  # here: what fails later would leave the counts wrong
     num_points, num_new, done = np.int64(0), 0, stop
-    for place in range(start - HASHED if start < stop else stop, stop):
-        look_ahead(place, stop - 1, keys, flat, directory, buckets, depth, hashes, likely)
-        if place < start:
+    for index in range(start - HASHED if start < stop else stop, stop):
+        look_ahead(index, stop - 1, keys, flat, directory, buckets, depth, hashes, likely)
+        if index < start:
             continue
-        voxel, slot = U(place), U(place & LAST)
+        voxel, slot = U(index), U(index & LAST)
         key, hashed, row = keys[voxel], hashes[slot], likely[slot]
         if row >= 0 and flat[first_word(row) + U(KEY)] != key:
             row = find_row(key, rows, table, depth)
         if row < 0:
-            full = is_full(hashed, directory, held, depth)
+            full = is_full(hashed, directory, counts, depth)
             if not full or makes_room(hashed, table, state, entries):
                 row = take_row(flat, state)
             if row < 0:
-                done = place
+                done = index
                 break
-            insert_entry(hashed, row, directory, buckets, held, depth)
+            insert_entry(hashed, row, directory, buckets, counts, depth)
             num_new += 1
             clear_row(flat, first_word(row), key)
         num_points += np.int64(count[voxel])
         change_row(words, view_weight, flat, first_word(row), voxel, 1)
-        found[voxel] = row
+        row_of[voxel] = row
     state[POINTS] += num_points
     state[VOXELS] += num_new
-    set_stamps(stamps, found[start:done], stamp)
+    set_stamps(stamps, row_of[start:done], stamp)
     return done
 
 
 @njit(cache=True, nogil=True, inline='always')
-def set_stamps(stamps, found, stamp):
+def set_stamps(stamps, rows, stamp):
     """Stamp the rows (K,) int32."""
-    num = U(len(found))
-    for place in range(num):
-        if place + U(EARLY) < num:
-            prefetch_early(stamps, np.int64(found[place + U(EARLY)]))
-        stamps[U(found[place])] = stamp
+    num = U(len(rows))
+    for index in range(num):
+        if index + U(EARLY) < num:
+            prefetch_early(stamps, np.int64(rows[index + U(EARLY)]))
+        stamps[U(rows[index])] = stamp
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -213,7 +213,7 @@ def free_row(flat, at, following, later):
 
 @kernel()
 def remove_moments(
-    moments, view_weight, rows, stamps, table, state, stamp, found, min_points, fallen
+    moments, view_weight, rows, stamps, table, state, stamp, row_of, min_points, fallen
 ):
     """
     Subtract moments, or nothing if a voxel does not hold its own; free the rows that get empty.
@@ -221,7 +221,7 @@ def remove_moments(
     moments, view_weight  as of add_moments
     stamps      (R,) uint32, out: the last change of each row
     stamp       uint32, of this change; see kernels/layout.py
-    found       (K,) int32, in: row of each voxel, or a hint of it; out: the row
+    row_of      (K,) int32, in: row of each voxel, or a hint of it; out: the row
     min_points  smallest number of points of a surfel, at least 1
     fallen      (K, 3) int32, out: indices of the voxels that held min_points before and hold
                 fewer
@@ -235,57 +235,57 @@ def remove_moments(
     """
     keys, count, _, _, _ = moments
     words = words_of(moments)
-    directory, buckets, num_held, _ = table
+    directory, buckets, counts, _ = table
     depth, num = state[DEPTH], U(len(keys))
     flat = rows.ravel()
     emptied, hashes = np.empty(num, np.int32), np.empty(num, np.int64)
     num_emptied, num_fallen = 0, 0
     num_points, missing = np.int64(0), np.int64(-1)
-    for place in range(num):
-        if place + U(EARLY) < num:
-            prefetch_row_early(flat, np.int64(found[place + U(EARLY)]))
-            prefetch_row(flat, np.int64(found[place + U(AHEAD)]))
-        key, n = keys[place], np.int64(count[place])
-        row = np.int64(found[place])
+    for voxel in range(num):
+        if voxel + U(EARLY) < num:
+            prefetch_row_early(flat, np.int64(row_of[voxel + U(EARLY)]))
+            prefetch_row(flat, np.int64(row_of[voxel + U(AHEAD)]))
+        key, n = keys[voxel], np.int64(count[voxel])
+        row = np.int64(row_of[voxel])
         if not (0 <= row < len(rows) and is_voxel(flat, first_word(row), key)):
             row = find_row(key, rows, table, depth)
-            found[place] = row
+            row_of[voxel] = row
         at = first_word(max(row, 0))
-        held = count_of(flat, at) if row >= 0 else np.int64(-1)
-        if held < n or (held == n and not holds_exactly(words, view_weight, flat, at, place)):
-            missing = np.int64(place)
+        stored = count_of(flat, at) if row >= 0 else np.int64(-1)
+        if stored < n or (stored == n and not holds_exactly(words, view_weight, flat, at, voxel)):
+            missing = np.int64(voxel)
             break
-        if held >= min_points > held - n:
+        if stored >= min_points > stored - n:
             fallen[num_fallen, 0], fallen[num_fallen, 1], fallen[num_fallen, 2] = unpack(key)
             num_fallen += 1
-        if held == n:
+        if stored == n:
             later = np.int64(-1)
             if num_emptied >= AHEAD:
-                later = np.int64(found[U(emptied[U(num_emptied - AHEAD)])])
+                later = np.int64(row_of[U(emptied[U(num_emptied - AHEAD)])])
             free_row(flat, at, state[FREE_ROW], later)
             state[FREE_ROW] = row
-            emptied[U(num_emptied)], hashes[U(num_emptied)] = place, hash_key(key)
+            emptied[U(num_emptied)], hashes[U(num_emptied)] = voxel, hash_key(key)
             num_emptied += 1
         else:
-            change_row(words, view_weight, flat, at, place, -1)
+            change_row(words, view_weight, flat, at, voxel, -1)
         num_points += n
     if missing >= 0:
         for i in range(num_emptied - 1, -1, -1):
-            links = flat[first_word(found[U(emptied[i])]) + U(FREE)]
+            links = flat[first_word(row_of[U(emptied[i])]) + U(FREE)]
             state[FREE_ROW] = (links & LOW) - 1
-        put_back(keys, words, view_weight, flat, found, missing)
+        put_back(keys, words, view_weight, flat, row_of, missing)
         return missing, 0
     state[POINTS] -= num_points
     state[VOXELS] -= num_emptied
-    set_stamps(stamps, found, stamp)
+    set_stamps(stamps, row_of, stamp)
     for i in range(U(num_emptied)):
         if i + U(HASHED) < U(num_emptied):
             prefetch(directory, hashes[i + U(HASHED)] >> (32 - depth))
             earlier, nearer = hashes[i + U(EARLIER)], hashes[i + U(NEARER)]
             prefetch_early(buckets, first_bucket(earlier, directory, depth))
             prefetch(buckets, first_bucket(nearer, directory, depth))
-        row = np.int64(found[U(emptied[i])])
-        remove_entry(hashes[i], row, directory, buckets, num_held, depth)
+        row = np.int64(row_of[U(emptied[i])])
+        remove_entry(hashes[i], row, directory, buckets, counts, depth)
         stamps[U(row)] = stamp | EMPTIED
     return missing, num_fallen
 
@@ -297,13 +297,13 @@ def is_voxel(flat, at, key):
 
 
 @inlined()
-def put_back(keys, words, view_weight, flat, found, stop):
+def put_back(keys, words, view_weight, flat, row_of, stop):
     """Add the moments of the first voxels to their rows again, also to emptied ones."""
-    for place in range(U(stop)):
-        at = first_word(found[place])
+    for voxel in range(U(stop)):
+        at = first_word(row_of[voxel])
         if count_of(flat, at) == 0:
-            clear_row(flat, at, keys[place])
-        change_row(words, view_weight, flat, at, place, 1)
+            clear_row(flat, at, keys[voxel])
+        change_row(words, view_weight, flat, at, voxel, 1)
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -322,33 +322,33 @@ def words_of(moments):
 
 
 @njit(cache=True, nogil=True, inline='always')
-def change_row(words, view_weight, flat, at, place, sign):
+def change_row(words, view_weight, flat, at, voxel, sign):
     """Add the moments of a voxel, as words_of returns them, to its row; subtract with sign -1."""
     count, total, product, view = words
-    n = np.int64(count[place])
+    n = np.int64(count[voxel])
     weight = sign * (n if view_weight == 0 else np.int64(1))
-    x, y, z = U(3) * place, U(3) * place + U(1), U(3) * place + U(2)
+    x, y, z = U(3) * voxel, U(3) * voxel + U(1), U(3) * voxel + U(2)
     sums = sign * np.int64(total[x]), sign * np.int64(total[y]), sign * np.int64(total[z])
     views = weight * np.int64(view[x]), weight * np.int64(view[y]), weight * np.int64(view[z])
     add_to_row(flat, at, sign * n, sums, views)
     for pair in range(U(6)):
-        flat[at + U(PRODUCT) + pair] += sign * product[U(6) * place + pair]
+        flat[at + U(PRODUCT) + pair] += sign * product[U(6) * voxel + pair]
 
 
 @inlined()
-def holds_exactly(words, view_weight, flat, at, place):
+def holds_exactly(words, view_weight, flat, at, voxel):
     """Return whether the sums of a row are the moments of a voxel, as words_of returns them."""
     count, total, product, view = words
-    weight = np.int64(count[place]) if view_weight == 0 else np.int64(1)
+    weight = np.int64(count[voxel]) if view_weight == 0 else np.int64(1)
     x, y, z = view_of(flat, at)
-    first = U(3) * place
+    first = U(3) * voxel
     equal = x == weight * view[first]
     equal &= y == weight * view[first + U(1)]
     equal &= z == weight * view[first + U(2)]
     for axis in range(3):
         equal &= sum_of(flat, at, axis) == total[first + U(axis)]
     for pair in range(U(6)):
-        equal &= flat[at + U(PRODUCT) + pair] == product[U(6) * place + pair]
+        equal &= flat[at + U(PRODUCT) + pair] == product[U(6) * voxel + pair]
     return equal
 
 
@@ -370,15 +370,15 @@ def coarse_rows(fine_keys, level, table, keys, rows):
         x, y, z = unpack(key)
         coarse = ((x >> level) + INDEX_OFFSET) << (2 * INDEX_BITS)
         coarse |= (((y >> level) + INDEX_OFFSET) << INDEX_BITS) | ((z >> level) + INDEX_OFFSET)
-        place = home(coarse, shift)
-        row = np.int64(table[place])
+        entry = home(coarse, shift)
+        row = np.int64(table[entry])
         while row >= 0 and keys[row] != coarse:
-            place = (place + 1) & mask
-            row = np.int64(table[place])
+            entry = (entry + 1) & mask
+            row = np.int64(table[entry])
         if row < 0:
             row = np.int64(num)
             num += 1
-            table[place] = row
+            table[entry] = row
             keys[row] = coarse
         rows[i] = row
     return num
