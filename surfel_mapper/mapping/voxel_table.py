@@ -33,6 +33,7 @@ from surfel_mapper.mapping.kernels.queries import (
 from surfel_mapper.mapping.kernels.rows import read_counts
 from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
+    add_sums,
     find_rows,
     remove_moments,
 )
@@ -44,6 +45,9 @@ MAX_DEPTH = 24
 
 Change = tuple[int, npt.NDArray[np.int32]]
 """A version, and the rows that it changed."""
+
+Arrays = tuple[npt.NDArray[Any], ...]
+"""Moments as the kernels take them."""
 
 LEAST = 1 << 18
 """Minimum capacity of the change log, rows; 1 MiB."""
@@ -101,15 +105,18 @@ class VoxelTable:
 
         """
         rows = np.empty(len(moments), np.int32)
+        arrays, sums = kernel_arrays(moments)
         num_added, self._version = 0, version
         try:
-            while (num_added := self._add(moments, num_added, rows)) < len(moments):
+            while (num_added := self._add(arrays, num_added, rows)) < len(moments):
                 self._make_room()
         except BaseException:
-            for start in range(0, num_added, 1024):  # in parts: there may be no memory for more
-                chunk = slice(start, min(start + 1024, num_added))
-                self._subtract(moments.select(chunk), rows[chunk], 1)
+            for start in range(0, num_added, 1024):  # there may be no memory for all at once
+                voxels = slice(start, min(start + 1024, num_added))
+                self._subtract(tuple(array[voxels] for array in arrays), rows[voxels], 1)
             raise
+        if sums:
+            add_sums(self.rows.array, rows, 1, *sums)
         if self._channels:
             self._channels.array[rows.astype(np.intp)] += moments.channels
         return rows
@@ -136,12 +143,17 @@ class VoxelTable:
             The indices of the voxels that fell below min_points.
 
         """
-        if moments.rows is None or len(moments.rows) != len(moments):
+        arrays, sums = kernel_arrays(moments)
+        if sums or moments.rows is None or len(moments.rows) != len(moments):
             rows = self.find(moments.key)
         else:
             rows = np.array(moments.rows, np.int32)  # hints, confirmed by the kernel
         self._version = version
-        missing, fallen = self._subtract(moments, rows, max(min_points, 1))
+        if sums:
+            add_sums(self.rows.array, rows, -1, *sums)
+        missing, fallen = self._subtract(arrays, rows, max(min_points, 1))
+        if missing >= 0 and sums:
+            add_sums(self.rows.array, rows, 1, *sums)
         if missing < 0 and self._channels:
             self._channels.array[rows.astype(np.intp)] -= moments.channels
         return missing, rows, fallen
@@ -223,23 +235,23 @@ class VoxelTable:
         num = rows_held(self.rows.array, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
-    def _add(self, moments: ScanMoments, start: int, rows: npt.NDArray[np.int32]) -> int:
+    def _add(self, moments: Arrays, start: int, rows: npt.NDArray[np.int32]) -> int:
         """Add moments from a voxel on, as far as there is room; see add_moments."""
         stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
         done: int = add_moments(
-            *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
+            *(moments, self.rows.array, stamps, table),
             *(self._state, stamp_of(self._version), start, rows),
         )
         return done
 
     def _subtract(
-        self, moments: ScanMoments, rows: npt.NDArray[np.int32], min_points: int
+        self, moments: Arrays, rows: npt.NDArray[np.int32], min_points: int
     ) -> tuple[int, npt.NDArray[np.int32]]:
         """Subtract moments without channels; see remove_moments."""
         fallen: npt.NDArray[np.int32] = np.empty((len(rows), 3), np.int32)
         stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
         missing, num_fallen = remove_moments(
-            *(moments.arrays, moments.view_is_sum, self.rows.array, stamps, table),
+            *(moments, self.rows.array, stamps, table),
             *(self._state, stamp_of(self._version), rows, min_points, fallen),
         )
         return missing, fallen[:num_fallen]
@@ -304,6 +316,25 @@ class ChangeLog:
             return None
         changes = [*takewhile(lambda change: change[0] > version, reversed(self._entries))]
         return table.changed_at(changes, min_points)
+
+
+def kernel_arrays(moments: ScanMoments) -> tuple[Arrays, Arrays]:
+    """
+    Return moments in the types of scans, and the sums that exceed these types.
+
+    The kernels that add and remove take two seconds to compile for each combination of types.
+    Sums of a map, int64, are zero in the first result. They follow as total (K, 3) and view
+    (K, 3), which ``add_sums`` adds; of a scan there are none.
+    """
+    key, count, total, product, view = moments.arrays
+    count = count.view(np.uint32) if count.dtype == np.int32 else count.astype(np.uint32)
+    if total.dtype == np.int32 and view.dtype == np.int16:
+        return (key, count, total, product, view), ()
+    if not moments.view_is_sum:
+        view = view * moments.count[:, None].astype(np.int64)
+    sums = np.asarray(total, np.int64), np.ascontiguousarray(view, np.int64)
+    zeros = np.zeros((len(key), 3), np.int32), np.zeros((len(key), 3), np.int16)
+    return (key, count, zeros[0], product, zeros[1]), sums
 
 
 def stamp_of(version: int) -> int:

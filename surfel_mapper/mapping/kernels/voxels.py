@@ -130,16 +130,16 @@ def find_rows(keys, rows, table, state, row_of):
 
 
 @kernel()
-def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, row_of):
+def add_moments(moments, rows, stamps, table, state, stamp, start, row_of):
     """
     Add the moments of the voxels of a scan from start on; return the first that was not added.
 
-    moments      keys (K,) int64, count (K,), total (K, 3), product (K, 6), view (K, 3)
-    view_weight  0: the view is multiplied by the count; 1: it is a sum already
-    stamps       (R,) uint32, out: the last change of each row
-    stamp        uint32, of this change; see kernels/layout.py
-    start        int64, the first voxel to add
-    row_of       (K,) int32, out: row of each voxel
+    moments  keys (K,) int64, count (K,) uint32, total (K, 3) int32, product (K, 6) int64 and view
+             (K, 3) int16 of every point of the voxel
+    stamps   (R,) uint32, out: the last change of each row
+    stamp    uint32, of this change; see kernels/layout.py
+    start    int64, the first voxel to add
+    row_of   (K,) int32, out: row of each voxel
 
     Returns K if all were added. Otherwise slab, segments or directory have no room for a voxel:
     make room and continue from there.
@@ -171,7 +171,7 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, 
             num_new += 1
             clear_row(flat, first_word(row), key)
         num_points += np.int64(count[voxel])
-        change_row(words, view_weight, flat, first_word(row), voxel, 1)
+        change_row(words, flat, first_word(row), voxel, 1)
         row_of[voxel] = row
     state[POINTS] += num_points
     state[VOXELS] += num_new
@@ -212,13 +212,11 @@ def free_row(flat, at, following, later):
 
 
 @kernel()
-def remove_moments(
-    moments, view_weight, rows, stamps, table, state, stamp, row_of, min_points, fallen
-):
+def remove_moments(moments, rows, stamps, table, state, stamp, row_of, min_points, fallen):
     """
     Subtract moments, or nothing if a voxel does not hold its own; free the rows that get empty.
 
-    moments, view_weight  as of add_moments
+    moments     as of add_moments
     stamps      (R,) uint32, out: the last change of each row
     stamp       uint32, of this change; see kernels/layout.py
     row_of      (K,) int32, in: row of each voxel, or a hint of it; out: the row
@@ -252,7 +250,7 @@ def remove_moments(
             row_of[voxel] = row
         at = first_word(max(row, 0))
         stored = count_of(flat, at) if row >= 0 else np.int64(-1)
-        if stored < n or (stored == n and not holds_exactly(words, view_weight, flat, at, voxel)):
+        if stored < n or (stored == n and not holds_exactly(words, flat, at, voxel)):
             missing = np.int64(voxel)
             break
         if stored >= min_points > stored - n:
@@ -267,13 +265,13 @@ def remove_moments(
             emptied[U(num_emptied)], hashes[U(num_emptied)] = voxel, hash_key(key)
             num_emptied += 1
         else:
-            change_row(words, view_weight, flat, at, voxel, -1)
+            change_row(words, flat, at, voxel, -1)
         num_points += n
     if missing >= 0:
         for i in range(num_emptied - 1, -1, -1):
             links = flat[first_word(row_of[U(emptied[i])]) + U(FREE)]
             state[FREE_ROW] = (links & LOW) - 1
-        put_back(keys, words, view_weight, flat, row_of, missing)
+        put_back(keys, words, flat, row_of, missing)
         return missing, 0
     state[POINTS] -= num_points
     state[VOXELS] -= num_emptied
@@ -297,13 +295,13 @@ def is_voxel(flat, at, key):
 
 
 @inlined()
-def put_back(keys, words, view_weight, flat, row_of, stop):
+def put_back(keys, words, flat, row_of, stop):
     """Add the moments of the first voxels to their rows again, also to emptied ones."""
     for voxel in range(U(stop)):
         at = first_word(row_of[voxel])
         if count_of(flat, at) == 0:
             clear_row(flat, at, keys[voxel])
-        change_row(words, view_weight, flat, at, voxel, 1)
+        change_row(words, flat, at, voxel, 1)
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -322,11 +320,11 @@ def words_of(moments):
 
 
 @njit(cache=True, nogil=True, inline='always')
-def change_row(words, view_weight, flat, at, voxel, sign):
+def change_row(words, flat, at, voxel, sign):
     """Add the moments of a voxel, as words_of returns them, to its row; subtract with sign -1."""
     count, total, product, view = words
     n = np.int64(count[voxel])
-    weight = sign * (n if view_weight == 0 else np.int64(1))
+    weight = sign * n
     x, y, z = U(3) * voxel, U(3) * voxel + U(1), U(3) * voxel + U(2)
     sums = sign * np.int64(total[x]), sign * np.int64(total[y]), sign * np.int64(total[z])
     views = weight * np.int64(view[x]), weight * np.int64(view[y]), weight * np.int64(view[z])
@@ -335,11 +333,28 @@ def change_row(words, view_weight, flat, at, voxel, sign):
         flat[at + U(PRODUCT) + pair] += sign * product[U(6) * voxel + pair]
 
 
+@kernel()
+def add_sums(rows, chosen, sign, total, view):
+    """
+    Add sums of positions and views to rows; subtract them with sign -1.
+
+    chosen  (K,) int32, rows; -1 is skipped
+    total   (K, 3) int64, sums of positions
+    view    (K, 3) int64, sums of views
+    """
+    flat = rows.ravel()
+    for i in range(len(chosen)):
+        if chosen[i] >= 0:
+            sums = sign * total[i, 0], sign * total[i, 1], sign * total[i, 2]
+            views = sign * view[i, 0], sign * view[i, 1], sign * view[i, 2]
+            add_to_row(flat, first_word(chosen[i]), 0, sums, views)
+
+
 @inlined()
-def holds_exactly(words, view_weight, flat, at, voxel):
+def holds_exactly(words, flat, at, voxel):
     """Return whether the sums of a row are the moments of a voxel, as words_of returns them."""
     count, total, product, view = words
-    weight = np.int64(count[voxel]) if view_weight == 0 else np.int64(1)
+    weight = np.int64(count[voxel])
     x, y, z = view_of(flat, at)
     first = U(3) * voxel
     equal = x == weight * view[first]

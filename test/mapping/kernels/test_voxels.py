@@ -13,6 +13,7 @@ from surfel_mapper.kernels import hashing
 from surfel_mapper.kernels.layout import EMPTIED, KEY, ROW
 from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
+    add_sums,
     find_rows,
     remove_moments,
 )
@@ -20,6 +21,13 @@ from surfel_mapper.mapping.moments import pack_keys, unpack_keys
 from test import reference
 from test.kernels.modes import both
 from test.mapping.kernels.packed_rows import unpacked
+
+
+def without_sums(moments):
+    """Return moments in the types of scans, sums of positions and views zero."""
+    key, count, _, product, _ = moments
+    zeros = np.zeros((len(key), 3), np.int32), np.zeros((len(key), 3), np.int16)
+    return key, count.astype(np.uint32), zeros[0], product, zeros[1]
 
 
 class Memory:
@@ -47,9 +55,11 @@ class Memory:
         changed = np.full(len(moments[0]), -1, np.int32)
         done = self.call(
             add_moments,
-            *(moments, 1, self.rows, self.stamps, self.table, self.state),
+            *(without_sums(moments), self.rows, self.stamps, self.table, self.state),
             *(2 * version, start, changed),
         )
+        added = slice(start, done)
+        self.add_sums(changed[added], 1, moments[2][added], moments[4][added])
         return done, changed[start:done].tolist()
 
     def find(self, keys):
@@ -60,18 +70,25 @@ class Memory:
     def remove(self, moments, version, min_points=1, hints=None):
         """Return the first voxel that does not hold its moments, and the fallen voxels."""
         fallen = np.full((len(moments[0]), 3), -1, np.int32)
-        found = self.find(moments[0]) if hints is None else hints
+        rows = self.find(moments[0])
+        found = rows.copy() if hints is None else hints
+        self.add_sums(rows, -1, moments[2], moments[4])
         missing, num = self.call(
             remove_moments,
-            *(moments, 1, self.rows, self.stamps, self.table, self.state),
+            *(without_sums(moments), self.rows, self.stamps, self.table, self.state),
             *(2 * version, found, min_points, fallen),
         )
+        if missing >= 0:
+            self.add_sums(rows, 1, moments[2], moments[4])
         if missing < 0:
             empty = [unpacked(row)[0] == 0 for row in self.rows[found]]
             np.testing.assert_array_equal(
                 self.stamps[found], 2 * version + EMPTIED * np.array(empty)
             )
         return missing, list(map(tuple, fallen[:num].tolist()))
+
+    def add_sums(self, rows, sign, total, view):
+        self.call(add_sums, self.rows, rows, sign, total, view)
 
     def content(self):
         """Return the content of the table as a dict."""
