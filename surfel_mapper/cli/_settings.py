@@ -11,16 +11,37 @@ checked as those of a YAML file. The node has no such options, because ROS has i
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING, TypeVar
 
 from surfel_mapper.cli._arguments import real
 
 if TYPE_CHECKING:
     from surfel_mapper.config import Config
+    from surfel_mapper.config.settings import Stage
+
+T = TypeVar('T', bound='Stage')
+
+SET_HELP = (
+    'setting that overrides --config, as map.min_points=3; repeatable '
+    '(`surfel-mapper info --parameters` lists all)'
+)
+
+MAP_SHORTCUTS = {
+    '--voxel-size': ('map.voxel_size_m', 'edge of a voxel, m; the setting map.voxel_size_m (0.5)')
+}
+"""Options of verbs that map."""
 
 
-def add_settings(parser: argparse.ArgumentParser, config_help: str, *, maps: bool = True) -> None:
+def add_settings(
+    parser: argparse.ArgumentParser,
+    config_help: str = '',
+    *,
+    shortcuts: Mapping[str, tuple[str, str]] = MAP_SHORTCUTS,
+    set_help: str = SET_HELP,
+) -> None:
     """
     Declare the options for settings.
 
@@ -29,31 +50,27 @@ def add_settings(parser: argparse.ArgumentParser, config_help: str, *, maps: boo
     parser : ArgumentParser
         Parser of a verb.
     config_help : str
-        Help of ``--config``.
-    maps : bool
-        Whether the verb maps, and so takes a voxel size.
+        Help of ``--config``; without it there is no such option.
+    shortcuts : mapping of str to (str, str)
+        Options that set a number of their own, each with the setting and its help.
+    set_help : str
+        Help of ``--set``.
 
     """
     add = parser.add_argument_group('settings').add_argument
-    add('--config', type=Path, metavar='FILE', help=config_help)
+    if config_help:
+        add('--config', type=Path, metavar='FILE', help=config_help)
     overrides: dict[str, Any] = {'dest': 'settings', 'action': 'append', 'default': []}
     action = add(
         '--set',
         type=assignment,
         metavar='NAME=VALUE',
-        help='setting that overrides --config, as map.min_points=3; repeatable '
-        '(`surfel-mapper info --parameters` lists all)',
+        help=set_help,
         **overrides,
     )
     action.completer = setting_names  # type: ignore[attr-defined]
-    if maps:
-        add(
-            '--voxel-size',
-            type=voxel_size,
-            metavar='M',
-            help='edge of a voxel, m; the setting map.voxel_size_m (0.5)',
-            **overrides,
-        )
+    for option, (name, text) in shortcuts.items():
+        add(option, type=partial(number_of, name), metavar='NUMBER', help=text, **overrides)
 
 
 def assignment(text: str) -> tuple[str, Any]:
@@ -69,10 +86,10 @@ def assignment(text: str) -> tuple[str, Any]:
         raise argparse.ArgumentTypeError(f'{text!r}: not YAML: {error}') from error
 
 
-def voxel_size(text: str) -> tuple[str, float]:
-    """Return name and value of the setting of the voxel size."""
+def number_of(name: str, text: str) -> tuple[str, float]:
+    """Return name and value of a setting that is a number."""
     try:
-        return 'map.voxel_size_m', real(text)
+        return name, real(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f'{text!r}, expected a number') from error
 
@@ -89,3 +106,16 @@ def configured(args: argparse.Namespace) -> Config:
     from surfel_mapper.config import load_config
 
     return load_config(args.config).replace(dict(args.settings))
+
+
+def configured_stage(args: argparse.Namespace, stage: type[T]) -> T:
+    """Return a stage that is not part of the configuration, with the settings of the options."""
+    from surfel_mapper.config.settings import near, settings_of, stage_name
+    from surfel_mapper.errors import ConfigError
+
+    keys = {declared.name: declared.key for declared in settings_of(stage, stage_name(stage))}
+    settings = dict(args.settings)
+    for name in settings:
+        if name not in keys:
+            raise ConfigError(f'{name}: no such setting{near(name, keys)}')
+    return stage(**{keys[name]: value for name, value in settings.items()})

@@ -10,6 +10,7 @@ voxels are half as large as those of the map.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 import json
 import logging
 from pathlib import Path
@@ -21,6 +22,7 @@ import numpy.typing as npt
 from surfel_mapper.cli._arguments import add_formats, add_overwrite, real
 from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._settings import add_settings, configured_stage
 from surfel_mapper.cli._verbosity import add_verbosity
 from surfel_mapper.compilation import stage
 
@@ -40,6 +42,16 @@ FORMATS = ('json', 'parquet', 'obj', 'glb')
 DEFAULT = ('json',)
 """Formats without --formats."""
 
+SHORTCUTS = {
+    '--voxel-size': ('models.voxel_size_m', 'm (0.04; for a map half its voxel size)'),
+    '--noise': ('models.noise_m', 'sigma of the range of the sensor, m (lidar: 0.02)'),
+    '--noise-per-range-sq': (
+        'models.noise_per_range_sq',
+        'sigma that grows with range^2, 1/m (Kinect: 0.001425)',
+    ),
+}
+"""Options for the settings that matter first."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -54,25 +66,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_overwrite(parser)
     add_formats(parser, FORMATS, DEFAULT)
-    parser.add_argument(
-        '--voxel-size', type=real, metavar='M', help='m (0.04; for a map half its voxel size)'
+    add_settings(
+        parser,
+        shortcuts=SHORTCUTS,
+        set_help='setting of the models, as models.min_points=100; repeatable (docs/models.md '
+        'lists all)',
     )
     parser.add_argument(
-        '--profile', default='robust', help="robust, or paper: the paper's rules to the letter"
-    )
-    parser.add_argument(
-        '--noise',
-        type=real,
-        default=0.0,
-        metavar='M',
-        help='sigma of the range of the sensor (lidar: 0.02)',
-    )
-    parser.add_argument(
-        '--noise-per-range-sq',
-        type=real,
-        default=0.0,
-        metavar='S',
-        help='sigma that grows with range^2, 1/m (Kinect: 0.001425)',
+        '--profile',
+        type=lambda name: ('models.profile', name),
+        dest='settings',
+        action='append',
+        help="robust (default), or paper: the paper's rules to the letter",
     )
     parser.add_argument(
         '--viewpoint',
@@ -97,15 +102,12 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.viz.drawings import draw_points
 
     check_free(args.output, args.overwrite)
+    config = configured_stage(args, ModelsConfig)
     with stage(1, 2, 'reading'):
         points, voxel_size_m, viewpoint, origin_m = read(args)
-    _log.info('%s: %d points, voxels of %g m', args.cloud, len(points), voxel_size_m)
-    config = ModelsConfig(
-        voxel_size_m=voxel_size_m,
-        profile=args.profile,
-        noise_m=args.noise,
-        noise_per_range_sq=args.noise_per_range_sq,
-    )
+    if 'models.voxel_size_m' not in dict(args.settings):
+        config = replace(config, voxel_size_m=voxel_size_m)
+    _log.info('%s: %d points, voxels of %g m', args.cloud, len(points), config.voxel_size_m)
     with stage(2, 2, 'fitting'):
         model = fit(points, config, viewpoint)
     make_directory(args.output)
@@ -124,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
 def read(
     args: argparse.Namespace,
 ) -> tuple[npt.NDArray[Any], float, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return points (N, 3), size of voxels, viewpoint (3,) and the origin (3,) of the map, m."""
+    """Return points (N, 3), default voxel size, viewpoint (3,) and origin (3,) of the map, m."""
     from surfel_mapper.config import ModelsConfig
     from surfel_mapper.errors import FileFormatError
     from surfel_mapper.files import map_state, parquet, parquet_tiles
@@ -162,8 +164,7 @@ def read(
         voxel_size_m, viewpoint = ModelsConfig().voxel_size_m, np.zeros(3)
     if args.viewpoint is not None:
         viewpoint = np.array(args.viewpoint) - origin_m
-    size_m = args.voxel_size if args.voxel_size is not None else voxel_size_m
-    return points, size_m, viewpoint, origin_m
+    return points, voxel_size_m, viewpoint, origin_m
 
 
 def exact_map(path: Path) -> Path:

@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_settings(
         parser,
         'configuration whose frames.base_to_sensor is the pose of the sensor on the robot',
-        maps=False,
+        shortcuts={},
     )
     add_overwrite(parser)
     parser.add_argument('--json', action='store_true', help='print the report as JSON')

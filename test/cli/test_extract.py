@@ -96,6 +96,30 @@ def test_a_voxel_size_of_zero_is_refused(tmp_path, capsys):
     assert 'voxel_size_m' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize('size', [['--voxel-size', '0.1'], ['--set', 'models.voxel_size_m=0.1']])
+def test_settings_are_options(tmp_path, capsys, size):
+    cloud, out = tmp_path / 'a.ply', tmp_path / 'out'
+    write_cloud(cloud, sheet(1.0, 1.0, 0.02).astype(np.float32))
+    arguments = [*size, '--set', 'models.kinds=gaussians']
+    assert main(['extract', str(cloud), '-o', str(out), '--json', *arguments]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert 10**2 <= figures['thinned'] <= 11**2  # a square of 1 m in voxels of 0.1 m
+    assert figures['planes'] == 0 < figures['gaussians']
+
+
+@pytest.mark.parametrize(
+    ('setting', 'message'),
+    [
+        ('models.kind=all', 'models.kind: no such setting'),
+        ('models.profile=best', "models.profile: 'best'"),
+    ],
+)
+def test_settings_are_checked_before_anything_is_read(tmp_path, capsys, setting, message):
+    out = str(tmp_path / 'out')
+    assert main(['extract', str(tmp_path / 'nothere.ply'), '-o', out, '--set', setting]) == 1
+    assert message in capsys.readouterr().err
+
+
 def test_a_file_that_does_not_exist_is_named_so(tmp_path, capsys):
     assert main(['extract', str(tmp_path / 'nothere'), '--output', str(tmp_path)]) == 1
     assert f'{tmp_path / "nothere"}: no such file' in capsys.readouterr().err
