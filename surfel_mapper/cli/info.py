@@ -32,6 +32,9 @@ SUMMARY = (
 
 EXAMPLE = 'surfel-mapper info street.mcap'
 
+CHOICE = ('poses_from', 'poses_reason', 'deskewed', 'deskew_reason')
+"""Names in the summary of a replay that state the source of its poses."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -129,7 +132,9 @@ def replay_line(replay: dict[str, Any]) -> str:
     """Return the source of poses that a replay takes, and why."""
     deskewed = ', deskewed' if replay['deskewed'] else ''
     why = f': {replay["poses_reason"]}' if replay['poses_reason'] else ''
-    return f'replay takes poses from {replay["poses_from"]}{deskewed}{why}'
+    line = f'replay takes poses from {replay["poses_from"]}{deskewed}{why}'
+    not_deskewed = replay['deskew_reason']
+    return f'{line}\nnot deskewed: {not_deskewed}' if not_deskewed else line
 
 
 def chosen(path: Path) -> dict[str, Any]:
@@ -144,7 +149,7 @@ def chosen(path: Path) -> dict[str, Any]:
             found = recording.describe()
     except BagError:  # several topics of clouds, or none: a topic has to be named
         return {}
-    return {name: found[name] for name in ('poses_from', 'poses_reason', 'deskewed')}
+    return {name: found[name] for name in CHOICE}
 
 
 def folder_content(path: Path) -> dict[str, Any]:
@@ -168,7 +173,7 @@ def folder_content(path: Path) -> dict[str, Any]:
         'points': len(first),
         'columns': sorted(first.columns),
         'damaged': [folder.first_error] if folder.first_error else [],
-        'replay': {name: found[name] for name in ('poses_from', 'poses_reason', 'deskewed')},
+        'replay': {name: found[name] for name in CHOICE},
     }
 
 

@@ -390,7 +390,7 @@ class OutputConfig(Stage):
 
 TIME_UNITS = ('auto', 's', 'ms', 'us', 'ns')
 
-TIME_REFERENCES = ('auto', 'stamp', 'epoch')
+TIME_REFERENCES = ('auto', 'stamp', 'epoch', 'first')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -403,17 +403,19 @@ class DeskewConfig(Stage):
     )
     field: str = setting(
         '',
-        'Field with the times of the points; empty: the first of t, time, timestamp, offset_time.',
+        'Field with the times of the points; empty: the first of t, time, timestamp, offset_time, '
+        'time_stamp, else the only one named like a time.',
     )
     unit: str = setting(
         'auto',
-        'Unit of these times; auto: s for floating point values of plausible size, else ns.',
+        'Unit of these times; auto: by the end of the name (_ns) or the length of the sweep.',
         choices=TIME_UNITS,
     )
 
     reference: str = setting(
         'auto',
-        'Times count from the stamp of the scan (stamp) or from 1970 (epoch).',
+        'Times count from the stamp of the scan (stamp), from 1970 (epoch), or from the first '
+        'point, measured at the stamp (first).',
         choices=TIME_REFERENCES,
     )
 

@@ -23,7 +23,12 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import raw_poses
-from surfel_mapper.offline.pose_choice import choose_for_bag, pose_summary
+from surfel_mapper.offline.pose_choice import (
+    choose_for_bag,
+    first_scans,
+    pose_summary,
+    why_not_deskewed,
+)
 from surfel_mapper.offline.pose_sources import pose_topics, PosePath, PoseTopics, static_topics
 from surfel_mapper.offline.request import part, Request, Span, WHOLE
 
@@ -66,6 +71,8 @@ class BagRecording:
         check_mounts(request, self.topics, config)
         choice = choose_for_bag(reader, self.topics, request, config)
         self.pose_reason, config = choice.reason, choice.config
+        scans = first_scans(reader, self.topics) if config.input.kind == 'cloud' else []
+        self.deskew_reason = why_not_deskewed(config, scans)
         if request.mounts:
             config = config.replace({'frames.base_to_sensor': ()})
         self.poses = self._poses(request, config, path)
@@ -141,7 +148,7 @@ class BagRecording:
             'topics': self.topics,
             'pose_topics': [*self.poses.kinds, *self.poses.static],
             'poses': None if path is None else str(path.path),
-            **pose_summary(self.config, path, self.pose_reason),
+            **pose_summary(self.config, path, self.pose_reason, self.deskew_reason),
         }
 
     def replay(

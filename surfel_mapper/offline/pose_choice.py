@@ -21,6 +21,7 @@ from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.offline.pose_sources import DEFAULTS, TYPES
 from surfel_mapper.offline.survey import mounting, Offer, offers, Survey, survey
 from surfel_mapper.poses import AUTO, choose_source, has_chain, PoseCandidate, without_chain
+from surfel_mapper.sensors.time_fields import time_fields
 
 if TYPE_CHECKING:
     from surfel_mapper.bags.reader import BagReader
@@ -47,11 +48,14 @@ class PoseChoice:
         The configuration given, with the ``pose.source`` chosen and the settings that it needs.
     reason : str
         Why it was chosen; empty if it was configured or asked for.
+    topic : str
+        The topic that was chosen; empty if the configuration decides.
 
     """
 
     config: Config
     reason: str = ''
+    topic: str = ''
 
 
 def choose_for_bag(
@@ -113,7 +117,8 @@ def choose_by_sample(
     if choice.topic:
         settings = best[choice.source].settings
         is_plain = wanted is not None and not changes(settings)
-        return PoseChoice(config.replace(settings), '' if is_plain else choice.reason)
+        reason = '' if is_plain else choice.reason
+        return PoseChoice(config.replace(settings), reason, choice.topic)
     if wanted is not None:
         return PoseChoice(config)
     return registered(reader, topics, config, choice.reason)
@@ -164,7 +169,8 @@ def choose_by_frames(
         candidates.append(PoseCandidate(source, topic, missing))
     choice = choose_source(candidates)
     if choice.topic:
-        return PoseChoice(config.replace({'pose.source': choice.source}), choice.reason)
+        settings = {'pose.source': choice.source}
+        return PoseChoice(config.replace(settings), choice.reason, choice.topic)
     if request.pose_topic is not None:
         return PoseChoice(config)  # pose_topics refuses its name
     return registered(reader, topics, config, choice.reason)
@@ -316,19 +322,39 @@ def is_default(config: Config) -> bool:
 
 def has_times(scan: Scan) -> bool:
     """Return whether the points of a scan carry times that differ."""
+    return not times_error(scan)
+
+
+def times_error(scan: Scan) -> str:
+    """Return why the points of a scan have no times to deskew with; empty if they have."""
     from surfel_mapper.sensors.deskew import point_times  # it loads the compiler
 
     try:
         times = point_times(scan)
-    except CloudFormatError:
-        return False
-    return times.last_ns > times.first_ns
+    except CloudFormatError as error:
+        return str(error)
+    return '' if times.last_ns > times.first_ns else 'all points have one time'
 
 
-def pose_summary(config: Config, path: object, reason: str) -> dict[str, Any]:
+def why_not_deskewed(config: Config, scans: Sequence[Scan]) -> str:
+    """Return why scans whose points have times are not deskewed; empty if they are."""
+    if config.deskew.enabled:
+        return ''
+    for scan in scans:
+        if names := time_fields(scan.columns):
+            reason = f'points have times ({", ".join(names)}), which deskew.enabled: true uses'
+            is_asked = config.pose.source == 'registration' and config.deskew == DEFAULT.deskew
+            return times_error(scan) or reason if is_asked else reason
+    return ''
+
+
+def pose_summary(
+    config: Config, path: object, reason: str, deskew_reason: str = ''
+) -> dict[str, Any]:
     """Return the source of the poses for the summary; why, if it was not configured."""
     return {
         'poses_from': 'file' if path is not None else config.pose.source,
         'poses_reason': reason,
         'deskewed': config.deskew.enabled,
+        'deskew_reason': deskew_reason,
     }

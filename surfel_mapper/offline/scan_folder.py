@@ -27,7 +27,12 @@ from surfel_mapper.files.scan_files import read_scan, scan_files, scan_suffix, S
 from surfel_mapper.offline import ouster_pcap
 from surfel_mapper.offline.datasets import Dataset, find_dataset
 from surfel_mapper.offline.ouster_pcap import OusterPcap
-from surfel_mapper.offline.pose_choice import choose_for_folder, is_default, pose_summary
+from surfel_mapper.offline.pose_choice import (
+    choose_for_folder,
+    is_default,
+    pose_summary,
+    why_not_deskewed,
+)
 from surfel_mapper.offline.pose_sources import PosePath
 from surfel_mapper.offline.request import part, Request, Span
 from surfel_mapper.offline.scan_times import (
@@ -102,6 +107,7 @@ class ScanFolder:
         first = self.first_scan()
         choice = choose_for_folder(request, config, poses is not None, first, missing)
         self.config, self.pose_reason = choice.config, choice.reason or rows_reason
+        self.deskew_reason = why_not_deskewed(self.config, [first] if first else [])
         self.span: Span = part(
             str(self.path),
             self.stamps[0],
@@ -137,7 +143,7 @@ class ScanFolder:
             'bag': str(self.path),
             'times_from': self.times_from,
             'poses': None if path is None else str(path),
-            **pose_summary(self.config, path, self.pose_reason),
+            **pose_summary(self.config, path, self.pose_reason, self.deskew_reason),
         }
 
     def first_scan(self) -> Scan | None:

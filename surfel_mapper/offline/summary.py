@@ -36,6 +36,8 @@ def as_text(summary: Mapping[str, Any], written: Sequence[str]) -> str:
         if summary.get('poses_reason')
         else ''
     )
+    if summary.get('deskew_reason'):
+        poses += f'not deskewed: {summary["deskew_reason"]}\n'
     return (
         f'{poses}'
         f'scans {scans["received"]}{out}'

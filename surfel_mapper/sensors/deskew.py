@@ -20,6 +20,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -29,16 +30,17 @@ from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.geometry import compose, inverse, q_xyzw, Transform
 from surfel_mapper.scan import LazyPoints, PointTimes, Scan
 from surfel_mapper.sensors.kernels.deskew import count_from_stamp, fill_times, move_points
+from surfel_mapper.sensors.time_fields import FIELDS, times_field
 
-FIELDS = ('t', 'time', 'timestamp', 'offset_time')
-"""Names under which drivers write the times of points: Ouster, Velodyne, Hesai, Livox."""
+NAMED_UNIT = re.compile(r'_([mun]?s)(?:ecs?)?$', re.IGNORECASE)
+"""Unit at the end of the name of a field: time_offset_ns."""
 
 READ_IN_PLACE = (np.float32, np.float64, np.uint32)
 """Types of the times of these drivers, read in the message itself; others are copied first."""
 
 UNITS_NS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
-REFERENCES = ('stamp', 'epoch')
+REFERENCES = ('stamp', 'epoch', 'first')
 
 UNTIMED = np.iinfo(np.int64).min
 """Offset of a point whose time is not finite; deskewing makes the point invalid."""
@@ -48,6 +50,12 @@ MAX_SWEEP_NS = 1_500_000_000
 Largest difference of a time from the stamp, ns; a larger one has another unit or clock. Seconds
 since 1970, read as nanoseconds since the stamp, are 1.7 s and more.
 """
+
+MIN_SWEEP_NS = 500_000
+"""Shortest sweep of which a unit is likely, ns: microseconds read as ns are shorter."""
+
+WRAPS_AT = 2**31
+"""Ouster's uint32 times from here on are negative ones that wrapped; 2.1 s is no sweep."""
 
 MAX_TURN_RAD = 0.005
 """Largest rotation of the sensor between two poses that are looked up, rad."""
@@ -64,13 +72,14 @@ def point_times(
     scan : Scan
         With a column of times.
     field : str
-        Name of the column; empty: the first of t, time, timestamp, offset_time.
+        Name of the column; empty: see ``times_field``.
     unit : str
-        s, ms, us, ns; auto: seconds for floating point numbers if that is within 1.5 s of the
-        stamp, else nanoseconds.
+        s, ms, us, ns; auto: the one that the name ends with, else the first with times within
+        1.5 s of the stamp and a sweep of 0.5 ms or more. Floating point numbers are tried as s,
+        ns, us, ms, integers as ns, us, ms.
     reference : str
-        stamp: times count from the stamp of the scan; epoch: they are like stamps; auto: the
-        one nearer to the stamp.
+        stamp: times count from the stamp of the scan; epoch: they are like stamps; first: the
+        first point was measured at the stamp; auto: stamp or epoch, the one nearer to the stamp.
 
     Raises
     ------
@@ -84,37 +93,45 @@ def point_times(
     for key, value, allowed in (('unit', unit, UNITS_NS), ('reference', reference, REFERENCES)):
         if value != 'auto' and value not in allowed:
             raise ValueError(f'{key}: {value!r}, expected one of auto, {", ".join(allowed)}')
-    name = field or next((name for name in FIELDS if name in scan.columns), '')
+    name = field or times_field(scan.columns)
     if name not in scan.columns:
         raise CloudFormatError(
             f'no field {field or " or ".join(FIELDS)} among {", ".join(scan.columns) or "none"}; '
             'name the times of points in deskew.field'
         )
     column = np.asarray(scan.columns[name])
+    if unit == 'auto' and (named := NAMED_UNIT.search(name)):
+        unit = named[1].lower()
     if column.dtype.kind not in 'iuf':
         raise CloudFormatError(f'field {name}: {column.dtype}, expected numbers')
     if column.ndim != 1:
         raise CloudFormatError(f'field {name}: {column.shape[1]} values a point, expected a time')
-    values = np.empty(len(scan), np.float64 if column.dtype.kind == 'f' else np.int64)
+    values: npt.NDArray[Any] = np.empty(
+        len(scan), np.float64 if column.dtype.kind == 'f' else np.int64
+    )
     is_any_timed, num_untimed, lowest, highest = fill_times(scan.xyz, readable(column), values)
     if num_untimed and not is_any_timed:
         raise CloudFormatError(f'field {name}: no finite time of {num_untimed} valid points')
     if not is_any_timed:
         return PointTimes(np.zeros(len(scan), np.int64), scan.stamp_ns, scan.stamp_ns)
+    if column.dtype == np.uint32 and highest >= WRAPS_AT:
+        values[values >= WRAPS_AT] -= 2**32
+        lowest, highest = values.min(), values.max()
     ends = np.array([lowest, highest], values.dtype)
-    low, high = ends.astype(column.dtype)
-    for unit_ns, is_epoch in _readings(column.dtype, unit, reference, low, scan.stamp_ns):
-        first, last = _offsets(ends, unit_ns, is_epoch, scan.stamp_ns).tolist()
-        if first >= -MAX_SWEEP_NS and last <= MAX_SWEEP_NS:
-            offsets = _offsets(values, unit_ns, is_epoch, scan.stamp_ns)
-            if num_untimed:
-                offsets[~np.isfinite(column)] = UNTIMED
-            return PointTimes(offsets, scan.stamp_ns + first, scan.stamp_ns + last)
-    raise CloudFormatError(
-        f'field {name}: times from {low} to {high} of type {column.dtype} are more than '
-        f'{MAX_SWEEP_NS / 1e9:g} s from the stamp {scan.stamp_ns / 1e9:.6f} s with deskew.unit '
-        f'{unit} and deskew.reference {reference}'
-    )
+    low, high = ends if values.dtype == np.int64 else ends.astype(column.dtype)
+    reading = _likely_reading(ends, column.dtype, unit, reference, scan.stamp_ns)
+    if reading is None:
+        raise CloudFormatError(
+            f'field {name}: times from {low} to {high} of type {column.dtype} are more than '
+            f'{MAX_SWEEP_NS / 1e9:g} s from the stamp {scan.stamp_ns / 1e9:.6f} s with '
+            f'deskew.unit {unit} and deskew.reference {reference}; deskew.reference first takes '
+            'the stamp for the time of the first point'
+        )
+    first, last = _offsets(ends, *reading, scan.stamp_ns).tolist()
+    offsets = _offsets(values, *reading, scan.stamp_ns)
+    if num_untimed:
+        offsets[~np.isfinite(column)] = UNTIMED
+    return PointTimes(offsets, scan.stamp_ns + first, scan.stamp_ns + last)
 
 
 def deskewed(
@@ -204,34 +221,45 @@ def readable(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return column.astype(np.float64 if column.dtype.kind == 'f' else np.int64)
 
 
-def _readings(
-    dtype: np.dtype[Any], unit: str, reference: str, low: Any, stamp_ns: int
-) -> list[tuple[int, bool]]:
-    """Return the ways to read times, as (unit in ns, whether since the epoch), likeliest first."""
-    floating = dtype.kind == 'f'
-    units = (['s', 'ns'] if floating else ['ns']) if unit == 'auto' else [unit]
-    readings = []
-    for unit_ns in (UNITS_NS[name] for name in units):
-        from_stamp, from_epoch = abs(int(low) * unit_ns), abs(int(low) * unit_ns - stamp_ns)
-        likely = [False, True] if from_stamp <= from_epoch else [True, False]
-        readings += [(unit_ns, is_epoch) for is_epoch in likely]
+def _likely_reading(
+    ends: npt.NDArray[Any], dtype: np.dtype[Any], unit: str, reference: str, stamp_ns: int
+) -> tuple[int, str, Any] | None:
+    """
+    Return unit in ns, reference, and origin of times in their unit; None if no reading fits.
+
+    A reading fits if the earliest and the latest time are near the stamp. If no other fits, a
+    sweep may be too short in the likeliest unit, or if its times count from 1970.
+    """
+    units = ['s', 'ns', 'us', 'ms'] if dtype.kind == 'f' else ['ns', 'us', 'ms']
+    units = units if unit == 'auto' else [unit]
     if reference == 'auto' and dtype == np.float32:
         reference = 'stamp'  # since the epoch it would count in steps of 128 s
-    return [way for way in readings if reference in ('auto', 'epoch' if way[1] else 'stamp')]
+    low, short = int(ends[0].astype(dtype)), None
+    for name in units:
+        unit_ns = UNITS_NS[name]
+        origins = {'stamp': 0, 'epoch': stamp_ns // unit_ns, 'first': ends[0]}
+        is_epoch = abs(low * unit_ns) > abs(low * unit_ns - stamp_ns)
+        likely = ['epoch', 'stamp'] if is_epoch else ['stamp', 'epoch']
+        for kind in likely if reference == 'auto' else [reference]:
+            reading = unit_ns, kind, origins[kind]
+            first, last = _offsets(ends, *reading, stamp_ns).tolist()
+            if first >= -MAX_SWEEP_NS and last <= MAX_SWEEP_NS:
+                if last - first >= MIN_SWEEP_NS:
+                    return reading
+                is_likely = kind == 'epoch' or name == units[0]
+                short = short or (reading if is_likely else None)
+    return short
 
 
 def _offsets(
-    values: npt.NDArray[Any], unit_ns: int, is_epoch: bool, stamp_ns: int
+    values: npt.NDArray[Any], unit_ns: int, kind: str, origin: Any, stamp_ns: int
 ) -> npt.NDArray[np.int64]:
     """Return times in nanoseconds after the stamp; the difference is taken before the factor."""
-    base = stamp_ns // unit_ns if is_epoch else 0
     limit = 4 * MAX_SWEEP_NS // unit_ns  # larger ones are refused, and must not overflow
     number = values.dtype.type
-    if number is np.float64:
-        base = int(float(base))
-    shift_ns = base * unit_ns - stamp_ns if is_epoch else 0
+    shift_ns = int(number(origin)) * unit_ns - stamp_ns if kind == 'epoch' else 0
     offsets = np.empty(len(values), np.int64)
-    count_from_stamp(values, number(base), number(limit), number(unit_ns), shift_ns, offsets)
+    count_from_stamp(values, number(origin), number(limit), number(unit_ns), shift_ns, offsets)
     return offsets
 
 

@@ -197,6 +197,19 @@ def test_scans_with_times_of_their_points_are_deskewed(tmp_path):
     assert found == [registered, registered, {**registered, 'deskew.enabled': True}]
 
 
+def test_replay_and_info_say_why_scans_with_times_are_not_deskewed(tmp_path, capsys):
+    folder = write_scans(tmp_path / 'ahead', np.linspace(37.0, 37.1, 100))
+    for arguments, reason in (
+        ([], 'not deskewed: field time: times from 37.0'),
+        (['--poses-from', 'identity'], 'not deskewed: points have times (time), which deskew.'),
+    ):
+        output = str(tmp_path / reason[-9:])
+        assert main(['replay', str(folder), *arguments, '-o', output]) in (0, 4)
+        assert reason in capsys.readouterr().out
+    assert main(['info', str(folder)]) == 0
+    assert 'not deskewed: field time: times from 37.0' in capsys.readouterr().out
+
+
 def test_a_folder_has_no_messages_with_poses(tmp_path):
     folder = write_scans(tmp_path / 'scans')
     with pytest.raises(BagError, match='--poses-from registration or identity'):

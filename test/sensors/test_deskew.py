@@ -14,8 +14,14 @@ from surfel_mapper.geometry import compose, inverse, pose_matrix, se3_exp
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import LazyPoints, PointTimes, Scan
-from surfel_mapper.sensors.deskew import deskewed, MAX_TURN_RAD, point_times, UNTIMED
+from surfel_mapper.sensors.deskew import (
+    deskewed,
+    MAX_TURN_RAD,
+    point_times,
+    UNTIMED,
+)
 from surfel_mapper.sensors.kernels.deskew import count_from_stamp, fill_times, move_points
+from surfel_mapper.sensors.time_fields import times_field
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.kernels.modes import both
 
@@ -45,6 +51,12 @@ EPOCH_S = START_NS / 1e9 + OFFSETS_MS / 1e3
         ((START_NS + OFFSETS_NS).astype(np.float64), {}, 256),
         ((OFFSETS_MS * 1000).astype(np.uint32), {'unit': 'us'}, 0),
         (OFFSETS_MS.astype(np.uint16), {'unit': 'ms'}, 0),
+        ((OFFSETS_MS * 1000).astype(np.uint32), {}, 0),
+        (OFFSETS_MS.astype(np.uint16), {}, 0),
+        ((OFFSETS_MS * 1.0).astype(np.float32), {}, 0),
+        (START_NS // 1000 + OFFSETS_MS * 1000, {}, 1000),
+        (OFFSETS_NS + START_NS + 37 * 10**9, {'reference': 'first'}, 0),
+        (EPOCH_S - 3600.0, {'reference': 'first'}, 240),
         (EPOCH_S, {'unit': 's', 'reference': 'epoch'}, 240),
     ],
 )
@@ -59,6 +71,13 @@ def test_times_before_the_stamp_are_negative_where_the_stamp_is_that_of_the_end(
     found = point_times(sweep(np.float32([-0.1, -0.05, 0.0]), 'time'))
     np.testing.assert_allclose(found.offsets, [-100 * MS, -50 * MS, 0], atol=8)
     assert found.last_ns == START_NS
+
+
+def test_negative_times_that_wrapped_are_negative():
+    times = np.array([2**32 - 300, 0, 99 * MS], np.uint32)
+    found = point_times(sweep(times))
+    assert found.offsets.tolist() == [-300, 0, 99 * MS]
+    assert (found.first_ns, found.last_ns) == (START_NS - 300, START_NS + 99 * MS)
 
 
 @pytest.mark.parametrize('offset', [16, 17])
@@ -88,11 +107,25 @@ def test_near_time_zero_the_reference_nearer_to_the_stamp_is_used():
     assert since_start.offsets.tolist() == since_stamp.offsets.tolist() == [0, 50 * MS]
 
 
-@pytest.mark.parametrize('name', ['t', 'time', 'timestamp', 'offset_time', 'when'])
+NAMES = ['t', 'time', 'timestamp', 'offset_time', 'time_stamp', 'timeStamp', 'times', 'ts']
+NAMES += ['t_offset', 'time_offset_ns', 'point_time_offset', 'relative_timestamp', 'when']
+
+
+@pytest.mark.parametrize('name', NAMES)
 def test_the_field_is_recognised_by_its_name_or_named(name):
-    times = np.array([0, 5], np.uint32)
+    times = np.array([0, 50 * MS], np.uint32)
     field = 'when' if name == 'when' else ''
-    assert point_times(sweep(times, name), field).offsets.tolist() == [0, 5]
+    assert point_times(sweep(times, name), field).offsets.tolist() == [0, 50 * MS]
+
+
+@pytest.mark.parametrize(('unit', 'ns'), [('us', 10**3), ('usec', 10**3), ('ms', MS)])
+def test_the_end_of_a_name_is_the_unit(unit, ns):
+    assert point_times(sweep(np.array([0, 3]), f'dt_{unit}')).offsets.tolist() == [0, 3 * ns]
+
+
+@pytest.mark.parametrize('columns', [['ring'], ['sec_time', 'nsec_time'], ['intensity', 'tag']])
+def test_no_field_is_guessed_among_several_or_none(columns):
+    assert times_field(columns) == ''
 
 
 def test_invalid_points_do_not_affect_the_times():
@@ -110,7 +143,7 @@ def test_invalid_points_do_not_affect_the_times():
 @pytest.mark.parametrize(
     ('scan', 'settings', 'message'),
     [
-        (sweep(np.zeros(2), 'ring'), {}, 'no field t or time or timestamp or offset_time among'),
+        (sweep(np.zeros(2), 'ring'), {}, 'no field t or .* or time_stamp among'),
         (sweep(np.zeros(2)), {'field': 'when'}, 'no field when among t'),
         (sweep(np.zeros((2, 3))), {}, 'field t: 3 values a point'),
         (sweep(np.array([0.0, 5.0])), {'unit': 's'}, 'times from 0.0 to 5.0 .* 1.5 s from'),
@@ -118,6 +151,8 @@ def test_invalid_points_do_not_affect_the_times():
         (sweep(np.full(2, 2**63 + 1, np.uint64)), {}, 'deskew.unit auto'),
         (sweep(OFFSETS_MS / 1e3), {'reference': 'epoch'}, 'deskew.reference epoch'),
         (sweep(np.float32(EPOCH_S)), {}, 'float32'),
+        (sweep(37.0 + OFFSETS_MS / 1e3), {}, '37.099 .* deskew.reference first takes'),
+        (sweep(EPOCH_S + 37.0), {}, 'deskew.reference first takes'),
         (sweep(np.full(2, 2**64 - 1, np.uint64)), {}, 'times from 9223372036854775807'),
         (sweep(np.full(2, np.nan)), {}, 'field t: no finite time of 2 valid points'),
         (sweep(np.array(['a', 'b'])), {}, 'field t: <U1, expected numbers'),
