@@ -46,14 +46,14 @@ class Nearest:
     distance_m: Floats
     off_m: Floats
     normal: Floats | None
-    place: Floats
+    point: Floats
 
 
 class Truth(Protocol):
     """Reference that a map is compared with."""
 
     def nearest(self, position: Floats) -> Nearest:
-        """Return the places of the truth nearest to positions (K, 3), m."""
+        """Return the points of the truth nearest to positions (K, 3), m."""
 
     def samples(self) -> Floats | None:
         """Return places (N, 3), m, where a complete map has surfels; None if unknown."""
@@ -75,17 +75,17 @@ class CloudTruth:
         self._tree = cKDTree(discs.position)
 
     def nearest(self, position: Floats) -> Nearest:
-        """Return the places of the truth nearest to positions (K, 3), m."""
+        """Return the points of the truth nearest to positions (K, 3), m."""
         distance_m, row = self._tree.query(position)
         if not len(self._discs):
             return Nearest(distance_m, distance_m, None, np.full((len(position), 3), np.nan))
-        place = self._discs.position[row]
+        point = self._discs.position[row]
         if self._discs.normal is None:
-            return Nearest(distance_m, distance_m, None, place)
+            return Nearest(distance_m, distance_m, None, point)
         normal = self._discs.normal[row]
-        off = np.einsum('ij,ij->i', position - place, normal)
+        off = np.einsum('ij,ij->i', position - point, normal)
         off_m = np.where(np.isfinite(off), np.abs(off), distance_m)
-        return Nearest(distance_m, off_m, normal, place)
+        return Nearest(distance_m, off_m, normal, point)
 
     def samples(self) -> Floats:
         """Return all points."""
@@ -107,7 +107,7 @@ def evaluate(
     max_distance_m : float
         Surfels farther than this from the truth are not compared.
     radius_m : float
-        A place of the truth counts as found if a surfel is this near; places are thinned to one
+        A sample of the truth counts as found if a surfel is this near. Samples are thinned to one
         in a cube of this edge.
 
     """
@@ -122,10 +122,10 @@ def evaluate(
         cosine = np.einsum('ij,ij->i', surfels.normal, nearest.normal)[near]
         sine = np.sqrt((np.cross(surfels.normal, nearest.normal)[near] ** 2).sum(axis=1))
         angle_deg = np.degrees(np.arctan2(sine, np.abs(cosine)))
-        known = np.isfinite(angle_deg)
-        result['normal_deg'] = spread(angle_deg[known])
-        result['normals_compared'] = int(known.sum())
-        result['normals_on_the_other_side'] = int((cosine[known] < 0.0).sum())
+        defined = np.isfinite(angle_deg)
+        result['normal_deg'] = spread(angle_deg[defined])
+        result['normals_compared'] = int(defined.sum())
+        result['normals_on_the_other_side'] = int((cosine[defined] < 0.0).sum())
     samples = truth.samples()
     if samples is not None:
         result['completeness'] = completeness(surfels.position, samples, radius_m)

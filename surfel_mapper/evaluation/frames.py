@@ -108,7 +108,7 @@ class FrameMotion:
 
 
 def find_motion(
-    surfels: Discs, truth: Truth, known: Mapping[str, Transform], width_m: float
+    surfels: Discs, truth: Truth, guesses: Mapping[str, Transform], width_m: float
 ) -> FrameMotion:
     """
     Return the motion that moves a map onto its truth.
@@ -119,7 +119,7 @@ def find_motion(
         The map.
     truth : Truth
         The reference.
-    known : mapping of str to (4, 4) float64
+    guesses : mapping of str to (4, 4) float64
         Approximate T_truth_map, by name, which are tried first.
     width_m : float
         Distance within which a surfel is near the truth.
@@ -142,15 +142,15 @@ def find_motion(
         return max(shares)
 
     tree = cKDTree(surfels.position)
-    found, tried = [], []
-    for name, start in starts(known, surfels.position, samples):
+    attempts, tried = [], []
+    for name, start in starts(guesses, surfels.position, samples):
         tried.append(name)
         for first in FIRST_WIDTHS:
             T_truth_map = refined(some, truth, start, width_m, first)
-            found.append((share_at(T_truth_map, LAST_WIDTH * width_m), name, T_truth_map))
-        if max(share for share, _, _ in found) > CLEAR_SHARE:
+            attempts.append((share_at(T_truth_map, LAST_WIDTH * width_m), name, T_truth_map))
+        if max(share for share, _, _ in attempts) > CLEAR_SHARE:
             break
-    _, name, T_truth_map = max(found, key=lambda each: each[0])
+    _, name, T_truth_map = max(attempts, key=lambda attempt: attempt[0])
     share = share_at(T_truth_map, width_m)
     if share < MIN_SHARE:
         hint = '' if 'features' in tried else f'; {KISS_MATCHER_HINT}'
@@ -162,21 +162,21 @@ def find_motion(
 
 
 def starts(
-    known: Mapping[str, Transform], position: Floats, samples: Floats | None
+    guesses: Mapping[str, Transform], position: Floats, samples: Floats | None
 ) -> Iterator[tuple[str, Transform]]:
-    """Yield names and approximate T_truth_map: known ones, the frames as they are, by features."""
-    yield from known.items()
+    """Yield names and approximate T_truth_map: guesses, the frames as they are, by features."""
+    yield from guesses.items()
     yield 'frames', np.eye(4)
     if samples is None or not has_kiss_matcher():
         return
     import kiss_matcher
 
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(FEATURE_VOXEL_M))
-    found = matcher.estimate(position.astype(np.float32), samples.astype(np.float32))
-    if found.valid:
+    solution = matcher.estimate(position.astype(np.float32), samples.astype(np.float32))
+    if solution.valid:
         T_truth_map = np.eye(4)
-        u, _, vt = np.linalg.svd(np.asarray(found.rotation, np.float64))
-        T_truth_map[:3, :3], T_truth_map[:3, 3] = u @ vt, found.translation
+        u, _, vt = np.linalg.svd(np.asarray(solution.rotation, np.float64))
+        T_truth_map[:3, :3], T_truth_map[:3, 3] = u @ vt, solution.translation
         yield 'features', T_truth_map
 
 
@@ -206,9 +206,9 @@ def looks_needed(surfels: Discs, truth: Truth, width_m: float) -> str:
     if share < FEW_NEAR:
         return f'{share:.0%} of the surfels are within {width_m:g} m of the truth'
     T_truth_map = refined(some, truth, np.eye(4), width_m, FIRST_WIDTHS[0])
-    after = moved(some, T_truth_map)
-    way_m = float(np.median(np.linalg.norm(after - some, axis=1)))
-    off_m, off_after_m = median_off(some, truth, width_m), median_off(after, truth, width_m)
+    aligned = moved(some, T_truth_map)
+    way_m = float(np.median(np.linalg.norm(aligned - some, axis=1)))
+    off_m, off_after_m = median_off(some, truth, width_m), median_off(aligned, truth, width_m)
     if way_m > width_m / 20.0 and off_after_m < 0.5 * off_m:
         return f'a motion of {way_m:.3g} m halves the median error'
     return ''
@@ -231,25 +231,25 @@ def known_starts(map_path: Path, truth_path: Path) -> dict[str, Transform]:
     try:
         if is_world(truth_path):
             directory = truth_path if truth_path.is_dir() else truth_path.parent
-            other_ns, others = true_poses(directory, stamps_ns)
+            other_ns, truth_poses = true_poses(directory, stamps_ns)
         else:
-            other = trajectory_beside(truth_path)
-            if other is None:
+            truth_file = trajectory_beside(truth_path)
+            if truth_file is None:
                 return {}
-            other_ns, others = read_poses(other)
+            other_ns, truth_poses = read_poses(truth_file)
     except FileFormatError:  # a world without its drive
         return {}
     rows, other_rows = common_stamps(stamps_ns, other_ns, SAME_NS)
-    return {'trajectories': mean_motion(poses[rows], others[other_rows])} if len(rows) else {}
+    return {'trajectories': mean_motion(poses[rows], truth_poses[other_rows])} if len(rows) else {}
 
 
-def mean_motion(poses: Floats, others: Floats) -> Transform:
+def mean_motion(poses: Floats, truth: Floats) -> Transform:
     """Return the mean T_other_mine of poses (S, 4, 4) at the same times, on a line too."""
-    u, _, vt = np.linalg.svd((others[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
+    u, _, vt = np.linalg.svd((truth[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     T_other_mine = np.eye(4)
     T_other_mine[:3, :3] = rotation
-    T_other_mine[:3, 3] = (others[:, :3, 3] - poses[:, :3, 3] @ rotation.T).mean(axis=0)
+    T_other_mine[:3, 3] = (truth[:, :3, 3] - poses[:, :3, 3] @ rotation.T).mean(axis=0)
     return T_other_mine
 
 
@@ -271,21 +271,21 @@ def refined(
 def gauss_newton_step(position: Floats, truth: Truth, width_m: float) -> Floats:
     """Return the step (6,), m and rad, that moves positions (K, 3) towards the truth."""
     nearest = truth.nearest(position)
-    known = np.isfinite(nearest.place).all(axis=1) & (nearest.distance_m < 3.0 * width_m)
+    valid = np.isfinite(nearest.point).all(axis=1) & (nearest.distance_m < 3.0 * width_m)
     if nearest.normal is not None:
-        known &= np.isfinite(nearest.normal).all(axis=1)
-    if known.sum() < 6:
+        valid &= np.isfinite(nearest.normal).all(axis=1)
+    if valid.sum() < 6:
         return np.zeros(6)
-    place = position[known]
-    gap = place - nearest.place[known]
+    xyz = position[valid]
+    gap = xyz - nearest.point[valid]
     if nearest.normal is None:
-        axes = np.broadcast_to(np.eye(3), (len(place), 3, 3))
+        axes = np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
     else:
-        axes = nearest.normal[known][:, None]
+        axes = nearest.normal[valid][:, None]
     off = np.einsum('kai,ki->ka', axes, gap)
     weight = (width_m**2 / ((off**2).sum(axis=1) + width_m**2)) ** 2
-    middle = place.mean(axis=0)  # lever arms about the middle keep the system well conditioned
-    turns = np.cross((place - middle)[:, None], axes)
+    middle = xyz.mean(axis=0)  # lever arms about the middle keep the system well conditioned
+    turns = np.cross((xyz - middle)[:, None], axes)
     jacobian = np.concatenate([axes, turns], axis=2)
     hessian = np.einsum('kai,k,kaj->ij', jacobian, weight, jacobian)
     gradient = np.einsum('kai,k,ka->i', jacobian, weight, off)
@@ -296,8 +296,8 @@ def gauss_newton_step(position: Floats, truth: Truth, width_m: float) -> Floats:
 
 def moved(position: Floats, T_truth_map: Transform) -> Floats:
     """Return positions (K, 3) of the map in the frame of the truth."""
-    there: Floats = position @ T_truth_map[:3, :3].T + T_truth_map[:3, 3]
-    return there
+    in_truth: Floats = position @ T_truth_map[:3, :3].T + T_truth_map[:3, 3]
+    return in_truth
 
 
 def moved_discs(surfels: Discs, T_truth_map: Transform) -> Discs:

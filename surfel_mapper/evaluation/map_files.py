@@ -74,15 +74,13 @@ def load_discs(path: str | Path, min_points: int) -> Discs:
         If there is no map, or it cannot be read.
 
     """
-    found = map_in(path, DRAWABLE) if Path(path).is_dir() else Path(path)
-    if found is None:
+    file = map_in(path, DRAWABLE) if Path(path).is_dir() else Path(path)
+    if file is None:
         raise FileFormatError(
             f'{path}: no map in this directory; expected map/tile_i=*/tile_j=*/ or one of '
             f'{", ".join(form for form in DRAWABLE if form != TILES)}'
         )
-    return (
-        of_map(read_tiles(found), min_points) if found.is_dir() else load_file(found, min_points)
-    )
+    return of_map(read_tiles(file), min_points) if file.is_dir() else load_file(file, min_points)
 
 
 def load_file(path: Path, min_points: int) -> Discs:

@@ -44,7 +44,7 @@ class PoseErrors:
 
     def summary(self) -> dict[str, dict[str, float]]:
         """Return rmse, mean, median and max of both, for reports."""
-        parts = {'translation_m': self.translation_m, 'rotation_deg': self.rotation_deg}
+        by_name = {'translation_m': self.translation_m, 'rotation_deg': self.rotation_deg}
         return {
             name: {
                 'rmse': float(np.sqrt(np.mean(np.square(errors)))),
@@ -52,7 +52,7 @@ class PoseErrors:
                 'median': float(np.median(errors)),
                 'max': float(np.max(errors)),
             }
-            for name, errors in parts.items()
+            for name, errors in by_name.items()
         }
 
 
@@ -221,11 +221,11 @@ def common_stamps(
     """
     if not len(other_ns) or not len(stamp_ns):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    after = np.clip(np.searchsorted(other_ns, stamp_ns), 1, max(len(other_ns) - 1, 1))
-    after = np.minimum(after, len(other_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    is_before = np.abs(other_ns[before] - stamp_ns) <= np.abs(other_ns[after] - stamp_ns)
-    nearest = np.where(is_before, before, after)
+    upper = np.clip(np.searchsorted(other_ns, stamp_ns), 1, max(len(other_ns) - 1, 1))
+    upper = np.minimum(upper, len(other_ns) - 1)
+    lower = np.maximum(upper - 1, 0)
+    is_lower = np.abs(other_ns[lower] - stamp_ns) <= np.abs(other_ns[upper] - stamp_ns)
+    nearest = np.where(is_lower, lower, upper)
     apart_ns = np.abs(other_ns[nearest] - stamp_ns)
     order = np.lexsort((apart_ns, nearest))
     is_first = np.diff(nearest[order], prepend=-1) > 0
@@ -249,9 +249,9 @@ def _motion_errors(
     estimated: Floats, true: Floats, first: npt.NDArray[np.int64], last: npt.NDArray[np.int64]
 ) -> PoseErrors:
     """Return the errors of the motions between rows."""
-    found = _inverse(estimated[first]) @ estimated[last]
+    measured = _inverse(estimated[first]) @ estimated[last]
     expected = _inverse(true[first]) @ true[last]
-    return _errors(_inverse(expected) @ found)
+    return _errors(_inverse(expected) @ measured)
 
 
 def _errors(off: Floats) -> PoseErrors:

@@ -49,13 +49,13 @@ class WorldTruth:
         self._simulation = simulation
 
     def nearest(self, position: Floats) -> Nearest:
-        """Return the places of the surfaces nearest to positions (K, 3), m."""
+        """Return the points of surfaces nearest to positions (K, 3), m."""
         _, distance_m, normal = self._world.surface_at(position)
         outside, inside = (position - side * distance_m[:, None] * normal for side in (1.0, -1.0))
         nearer = self._world.surface_at(outside)[1] <= self._world.surface_at(inside)[1]
-        place = np.where(nearer[:, None], outside, inside)
-        place[self._world.surface_at(place)[1] > ON_SURFACE_M] = np.nan  # nearest to an edge
-        return Nearest(distance_m, distance_m, normal, place)
+        point = np.where(nearer[:, None], outside, inside)
+        point[self._world.surface_at(point)[1] > ON_SURFACE_M] = np.nan  # nearest to an edge
+        return Nearest(distance_m, distance_m, normal, point)
 
     def samples(self) -> Floats | None:
         """Return the points (N, 3), m, that the drive sees without noise; None without a drive."""
@@ -63,13 +63,13 @@ class WorldTruth:
             return None
         lidar = replace(self._simulation.lidar, range_noise_m=0.0)
         again = replace(self._simulation, lidar=lidar)
-        seen = []
+        sampled = []
         for number in range(0, again.num_scans, -(-again.num_scans // SCANS)):
             scan = again.scan(number)
             pose = again.drive.T_odom_sensor(scan.stamp_ns)
             points = scan.points[scan.columns['surface'] >= 0].astype(np.float64)
-            seen.append(points @ pose[:3, :3].T + pose[:3, 3])
-        return np.concatenate(seen)
+            sampled.append(points @ pose[:3, :3].T + pose[:3, 3])
+        return np.concatenate(sampled)
 
 
 def is_world(path: Path) -> bool:

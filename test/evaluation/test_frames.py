@@ -121,11 +121,11 @@ def test_a_world_is_a_truth_on_both_sides_of_its_surfaces():
     rng = np.random.default_rng(2)
     position = rng.uniform([0.0, -10.0, -1.0], [30.0, 10.0, 6.0], (500, 3))
     nearest = WorldTruth(world).nearest(position)
-    known = np.isfinite(nearest.place).all(axis=1)
+    known = np.isfinite(nearest.point).all(axis=1)
     assert known.mean() > 0.7  # the others are nearest to an edge
-    distance_m = np.linalg.norm(position - nearest.place, axis=1)[known]
+    distance_m = np.linalg.norm(position - nearest.point, axis=1)[known]
     np.testing.assert_allclose(distance_m, nearest.distance_m[known], atol=1e-9)
-    np.testing.assert_allclose(world.surface_at(nearest.place[known])[1], 0.0, atol=1e-6)
+    np.testing.assert_allclose(world.surface_at(nearest.point[known])[1], 0.0, atol=1e-6)
 
 
 def test_only_maps_in_different_frames_look_as_if_they_need_it():
