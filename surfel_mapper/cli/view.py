@@ -188,7 +188,7 @@ def show_all(
         scene,
         found,
         colouring=args.color,
-        place=args.at,
+        target=args.at,
         most_discs=args.discs,
         min_points=args.min_points,
     )

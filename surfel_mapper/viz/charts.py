@@ -102,9 +102,9 @@ def lines(x: Array, series: Mapping[str, Array], x_label: str, y_label: str) -> 
         return NO_DATA
     top = max(highest(y[np.isfinite(y)]) for _, y in drawn.values())
     with _axes(HEIGHT, with_numbers=True) as (figure, axes):
-        for number, (name, (places, values)) in enumerate(drawn.items()):
+        for number, (name, (xs, values)) in enumerate(drawn.items()):
             color = LINES[number % len(LINES)]
-            axes.plot(places, values, color=color, linewidth=1.6, label=_visible(name))
+            axes.plot(xs, values, color=color, linewidth=1.6, label=_visible(name))
         axes.set(ylim=(0.0, top * 1.2 or 1.0), xlabel=x_label, ylabel=y_label)
         if x[-1] > x[0]:
             axes.set_xlim(x[0], x[-1])
@@ -122,8 +122,8 @@ def histogram(values: Array, low: float, high: float, x_label: str, y_label: str
         return NO_DATA
     clipped = np.clip(finite, low, high)
     counts, edges = np.histogram(clipped, bins=NUM_BINS, range=(low, high))
-    left, right, bottom, top = edges[:-1], edges[1:], np.zeros(NUM_BINS), counts
-    corners = [(left, bottom), (left, top), (right, top), (right, bottom)]
+    starts, ends, bottom, top = edges[:-1], edges[1:], np.zeros(NUM_BINS), counts
+    corners = [(starts, bottom), (starts, top), (ends, top), (ends, bottom)]
     bars = list(np.transpose(corners, (2, 0, 1)))
     with _axes(HEIGHT, with_numbers=True) as (figure, axes):
         # two thirds of the time of as many single bars
@@ -161,12 +161,12 @@ def thinned(x: Array, y: Array) -> tuple[Array, Array]:
     if len(x) <= POINTS:
         return x, y
     bounds = np.linspace(0, len(x), POINTS + 1).astype(np.int64)
-    parts = [slice(a, b) for a, b in itertools.pairwise(bounds)]
+    stretches = [slice(a, b) for a, b in itertools.pairwise(bounds)]
     medians = [
-        np.median(y[part][np.isfinite(y[part])]) if np.isfinite(y[part]).any() else np.nan
-        for part in parts
+        np.median(y[stretch][np.isfinite(y[stretch])]) if np.isfinite(y[stretch]).any() else np.nan
+        for stretch in stretches
     ]
-    return np.array([x[part].mean() for part in parts]), np.array(medians)
+    return np.array([x[stretch].mean() for stretch in stretches]), np.array(medians)
 
 
 def highest(values: Array) -> float:

@@ -162,32 +162,32 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
 def in_directory(path: Path, name: str) -> Iterator[Content]:
     """Yield the latest map in a directory and the meshes, models and trajectories beside it."""
     prefix = f'{name}/' if name else ''
-    found = map_in(path, DRAWABLE)
-    if found is not None and found.is_dir():
-        yield tiles(found, f'{prefix}surfels')
-    elif found is not None:
-        yield from contents(found, f'{prefix}surfels')
-    for each in BESIDE:
-        if (path / each).is_file():
-            yield from contents(path / each, f'{prefix}{Path(each).stem}')
-    for place in sorted(path.glob('apart_*.npz')):
-        yield from contents(place, f'{prefix}{place.stem}')
+    map_path = map_in(path, DRAWABLE)
+    if map_path is not None and map_path.is_dir():
+        yield tiles(map_path, f'{prefix}surfels')
+    elif map_path is not None:
+        yield from contents(map_path, f'{prefix}surfels')
+    for file_name in BESIDE:
+        if (path / file_name).is_file():
+            yield from contents(path / file_name, f'{prefix}{Path(file_name).stem}')
+    for apart in sorted(path.glob('apart_*.npz')):
+        yield from contents(apart, f'{prefix}{apart.stem}')
 
 
 def tiles(directory: Path, name: str) -> ExactMap:
     """Return the map in a dataset of tiles."""
-    kinds, parts = set(), []
+    kinds, shards = set(), []
     for path in tiles_in(directory).values():
         moments, empty = parquet.read_moments(path)
         kinds.add((empty.voxel_size_m, empty.level, empty.columns, *empty.origin_m.tolist()))
-        parts.append(moments)
+        shards.append(moments)
     if len(kinds) > 1:
         raise FileFormatError(
             f'{directory}: tiles of several maps: voxel size, level, columns and origin '
             f'{" and ".join(map(str, sorted(kinds)))}'
         )
     try:
-        return ExactMap(name, joined_moments(parts), empty.origin_m)
+        return ExactMap(name, joined_moments(shards), empty.origin_m)
     except MapError as error:
         raise FileFormatError(f'{directory}: {error}') from error
 
@@ -221,28 +221,28 @@ def discs_of(position: Array, columns: Mapping[str, npt.NDArray[Any]]) -> DrawnD
     """
     names = normal_names(columns)
     assert names is not None, 'the caller has found normals'
-    normal = np.stack([columns[each].astype(np.float64) for each in names], axis=1)
+    normal = np.stack([columns[name].astype(np.float64) for name in names], axis=1)
     length = np.sqrt((normal * normal).sum(axis=1))
     is_known = np.isfinite(position).all(axis=1) & (length > 0.0)
     normal = normal[is_known] / length[is_known, None]
     position = position[is_known]
     radius_m = np.full(len(position), 0.75 * spacing_m(position))
-    values = {each: column for each, column in columns.items() if each not in COORDINATES}
-    shown = {each: value[is_known] for each, value in unpacked(values).items()}
+    values = {name: column for name, column in columns.items() if name not in COORDINATES}
+    shown = {name: value[is_known] for name, value in unpacked(values).items()}
     return DrawnDiscs(position, normal, radius_m, shown)
 
 
 def unpacked(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
     """Return the columns of numbers, and a colour as red, green and blue."""
-    found = {each: values for each, values in columns.items() if values.ndim == 1}
+    numbers = {name: values for name, values in columns.items() if values.ndim == 1}
     colour = columns.get('rgb')
     if colour is not None and colour.ndim == 1:
-        del found['rgb']
+        del numbers['rgb']
         bits = colour.view(np.uint32) if colour.dtype == np.float32 else colour.astype(np.uint32)
         colour = np.stack([bits >> shift & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
     if colour is not None:
-        found.update(zip(RGB, colour.T, strict=True))
-    return found
+        numbers.update(zip(RGB, colour.T, strict=True))
+    return numbers
 
 
 def spacing_m(position: Array) -> float:

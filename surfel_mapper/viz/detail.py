@@ -68,10 +68,10 @@ class DetailedMap:
         self._moments, self._min_points = moments, min_points
         last = min(LEVELS, MOST_LEVEL - moments.level)
         begin, columns = column_runs(moments.key, last)
-        places = unpack_keys(columns)[:, :2].astype(np.int64) >> last
-        self.bits, self.tiles = tiles_of(places, last)
+        indices = unpack_keys(columns)[:, :2].astype(np.int64) >> last
+        self.bits, self.tiles = tiles_of(indices, last)
         self.edge_m = moments.voxel_size_m * 2.0**self.bits
-        tile = np.searchsorted(packed(self.tiles), packed(places >> (self.bits - last)))
+        tile = np.searchsorted(packed(self.tiles), packed(indices >> (self.bits - last)))
         order = np.argsort(tile, kind='stable')
         self._begin = begin[order]  # of the runs, in the order of their tiles
         self._length = np.diff(begin, append=len(moments))[order]
@@ -79,9 +79,9 @@ class DetailedMap:
         self.counts: npt.NDArray[np.int64] = np.zeros((last + 1, len(self.tiles)), np.int64)
         fits = np.ones((last + 1, len(self.tiles)), bool)
 
-        def count(part: slice) -> None:
-            for each in range(part.start, part.stop):
-                self._count(each, fits)
+        def count(chunk: slice) -> None:
+            for number in range(chunk.start, chunk.stop):
+                self._count(number, fits)
 
         share(count, len(self.tiles), usable_cores())
         self.counts = self.counts[fits.all(axis=1)]
@@ -90,25 +90,25 @@ class DetailedMap:
         """Return the number of tiles."""
         return len(self.tiles)
 
-    def choose(self, place: npt.ArrayLike, at_most: int) -> npt.NDArray[np.int64]:
+    def choose(self, target: npt.ArrayLike, at_most: int) -> npt.NDArray[np.int64]:
         """
         Return the level at which each tile is drawn, (T,).
 
         Parameters
         ----------
-        place : (3,) float, m
-            The place looked at, in the frame of the map.
+        target : (3,) float, m
+            The position looked at, in the frame of the map.
         at_most : int
             Limit of the number of discs; exceeded only if the coarsest level of all tiles does.
 
         """
-        distance = self._distances(np.asarray(place, np.float64))
+        distance = self._distances(np.asarray(target, np.float64))
         last = len(self.counts) - 1
         tiles = np.arange(len(self.tiles))
         if self.counts[0].sum() <= at_most:
             return np.zeros(len(tiles), np.int64)
         chosen = np.full(len(tiles), last)
-        for least in range(last, -1, -1):  # level at the place itself
+        for least in range(last, -1, -1):  # level at the target itself
             for begin_m in np.geomspace(0.25 * self.edge_m, distance.max() + self.edge_m, STEPS):
                 farther = np.log2(np.maximum(distance / begin_m, 0.5)) + 1.0
                 level = np.clip(np.floor(farther).astype(np.int64) + least, least, last)
@@ -126,28 +126,28 @@ class DetailedMap:
     ) -> list[Surfels]:
         """Return the surfels of some tiles (K,), by default of all, each at its level (T,)."""
         chosen = np.arange(len(self.tiles)) if tiles is None else tiles
-        found: dict[int, Surfels] = {}
+        by_tile: dict[int, Surfels] = {}
 
-        def sum_up(part: slice) -> None:
-            for tile in chosen[part].tolist():
-                found[tile] = self.surfels(tile, int(level[tile]))
+        def sum_up(chunk: slice) -> None:
+            for tile in chosen[chunk].tolist():
+                by_tile[tile] = self.surfels(tile, int(level[tile]))
 
         share(sum_up, len(chosen), usable_cores())
-        return [found[tile] for tile in chosen.tolist()]
+        return [by_tile[tile] for tile in chosen.tolist()]
 
     def nearest_first(
-        self, tiles: npt.NDArray[np.int64], place: npt.ArrayLike
+        self, tiles: npt.NDArray[np.int64], target: npt.ArrayLike
     ) -> npt.NDArray[np.int64]:
-        """Return tiles (K,) in the order of their distance from a place, (3,) m."""
-        distance = self._distances(np.asarray(place, np.float64))
+        """Return tiles (K,) in the order of their distance from a target, (3,) m."""
+        distance = self._distances(np.asarray(target, np.float64))
         return np.asarray(tiles[np.argsort(distance[tiles], kind='stable')])
 
     def _voxels(self, tile: int) -> npt.NDArray[np.int64]:
         """Return the rows of the moments in a tile."""
         runs = slice(self._ends[tile - 1] if tile else 0, self._ends[tile])
         length = self._length[runs]
-        before = np.cumsum(length) - length
-        return np.repeat(self._begin[runs] - before, length) + np.arange(length.sum())
+        offsets = np.cumsum(length) - length
+        return np.repeat(self._begin[runs] - offsets, length) + np.arange(length.sum())
 
     def _count(self, tile: int, fits: npt.NDArray[np.bool_]) -> None:
         """Count the surfels of a tile at each level; note the levels whose sums may overflow."""
@@ -162,15 +162,15 @@ class DetailedMap:
                 fits[level:, tile] &= count.max() <= limit
             self.counts[level, tile] = np.count_nonzero(count >= self._min_points)
 
-    def _distances(self, place: Array) -> Array:
-        """Return the horizontal distance of each tile from a place, (T,) m; 0 inside."""
+    def _distances(self, target: Array) -> Array:
+        """Return the horizontal distance of each tile from a target, (T,) m; 0 inside."""
         low = self.tiles * self.edge_m
-        away = np.maximum(np.maximum(low - place[:2], place[:2] - low - self.edge_m), 0.0)
+        away = np.maximum(np.maximum(low - target[:2], target[:2] - low - self.edge_m), 0.0)
         return np.asarray(np.sqrt((away * away).sum(axis=1)))
 
 
 def drawn_surfels(
-    surfel_map: SurfelMap, min_points: int, place: npt.ArrayLike, at_most: int
+    surfel_map: SurfelMap, min_points: int, target: npt.ArrayLike, at_most: int
 ) -> Surfels:
     """
     Return the surfels of a map by which it is drawn, of several levels if there are many.
@@ -181,8 +181,8 @@ def drawn_surfels(
         The map.
     min_points : int
         Voxels with fewer points are no surfels.
-    place : (3,) float, m
-        The place around which the map has its full detail, in the frame of the map.
+    target : (3,) float, m
+        The position around which the map has its full detail, in the frame of the map.
     at_most : int
         Limit of their number.
 
@@ -190,19 +190,19 @@ def drawn_surfels(
     surfels = surfel_map.surfels(min_points)
     if len(surfels) <= at_most:
         return surfels
-    found = DetailedMap(surfel_map.moments(), min_points)
-    level = found.choose(place, at_most)
-    return concatenated(found.all_surfels(level))
+    detailed = DetailedMap(surfel_map.moments(), min_points)
+    level = detailed.choose(target, at_most)
+    return concatenated(detailed.all_surfels(level))
 
 
 def tiles_of(columns: npt.NDArray[np.int64], level: int) -> tuple[int, npt.NDArray[np.int64]]:
     """Return the bits of a tile and the sorted tiles that hold some columns of a level, (T, 2)."""
-    bits, found = level, columns
+    bits, tiles = level, columns
     while True:  # of one number each: np.unique of rows takes 50 times as long
-        found = found[np.unique(packed(found), return_index=True)[1]]
-        if len(found) <= MOST_TILES:
-            return bits, found
-        bits, found = bits + 1, found >> 1
+        tiles = tiles[np.unique(packed(tiles), return_index=True)[1]]
+        if len(tiles) <= MOST_TILES:
+            return bits, tiles
+        bits, tiles = bits + 1, tiles >> 1
 
 
 def column_runs(
@@ -216,13 +216,13 @@ def column_runs(
     """
     beyond = (np.int64(1) << level) - 1
     mask = ~(beyond << 2 * layout.INDEX_BITS | (beyond + 1 << layout.INDEX_BITS) - 1)
-    begin, columns, before = [], [], np.int64(-1)
+    begin, columns, previous = [], [], np.int64(-1)
     for start in range(0, len(key), BLOCK):
         column = key[start : start + BLOCK] & mask
-        found = np.flatnonzero(np.diff(column, prepend=before))
-        begin.append(found + start)
-        columns.append(column[found])
-        before = column[-1]
+        changes = np.flatnonzero(np.diff(column, prepend=previous))
+        begin.append(changes + start)
+        columns.append(column[changes])
+        previous = column[-1]
     if not begin:
         return np.empty(0, np.int64), np.empty(0, np.int64)
     return np.concatenate(begin), np.concatenate(columns)

@@ -148,7 +148,7 @@ class Colouring:
     high: float = 1.0
 
     @classmethod
-    def over(cls, kind: str, parts: Sequence[DrawnDiscs]) -> Colouring:
+    def over(cls, kind: str, drawn: Sequence[DrawnDiscs]) -> Colouring:
         """
         Return a colouring whose ends fit the values of some discs.
 
@@ -162,15 +162,15 @@ class Colouring:
             raise ConfigError(f'colouring {kind!r}, expected one of {", ".join(COLOURINGS)}')
         if kind in ('normal', 'planarity'):
             return cls(kind)
-        found = [part for part in parts if has_value(part, kind)]
-        if not found and any(map(len, parts)):
-            names = sorted({name for part in parts for name in part.values})
+        valued = [discs for discs in drawn if has_value(discs, kind)]
+        if not valued and any(map(len, drawn)):
+            names = sorted({name for discs in drawn for name in discs.values})
             raise ConfigError(
                 f'colouring {kind!r}: nothing shown has it; its values: {", ".join(names)}'
             )
-        if kind in ('rgb', 'label') or not found:
+        if kind in ('rgb', 'label') or not valued:
             return cls(kind)
-        values = np.concatenate([value_of(part, kind) for part in found])
+        values = np.concatenate([value_of(discs, kind) for discs in valued])
         values = values[np.isfinite(values)]
         if not len(values):
             return cls(kind)

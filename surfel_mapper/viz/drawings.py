@@ -64,8 +64,8 @@ def draw_points(path: str | Path, picture: PointsPicture) -> None:
         depth = panel.points @ R[2]
         colors = depth_colors(depth) if panel.colors is None else panel.colors
         order = np.argsort(-depth)
-        seen = panel.points[order] @ R[:2].T
-        ax.scatter(seen[:, 0], seen[:, 1], s=1.5, c=colors[order], linewidths=0)
+        projected = panel.points[order] @ R[:2].T
+        ax.scatter(projected[:, 0], projected[:, 1], s=1.5, c=colors[order], linewidths=0)
         ax.set_title(panel.title)
         ax.set_aspect('equal')
         ax.set_axis_off()
@@ -90,14 +90,14 @@ def page_meshes(drawings: Iterable[Drawing]) -> dict[str, Mesh]:
 
 def page_mesh(drawings: Sequence[Drawing], max_triangles: int) -> Mesh:
     """Return the meshes among some drawings, and their ellipsoids as icosahedra, as one mesh."""
-    parts = [d.mesh for d in drawings if isinstance(d, MeshDrawing) and len(d.mesh)]
-    room = max(max_triangles - sum(map(len, parts)), 0)
+    meshes = [d.mesh for d in drawings if isinstance(d, MeshDrawing) and len(d.mesh)]
+    room = max(max_triangles - sum(map(len, meshes)), 0)
     for drawing in drawings:
         if isinstance(drawing, EllipsoidsDrawing):
             mesh = ellipsoids_mesh(drawing, room // len(FACES))
             room -= len(mesh)
-            parts += [mesh] if len(mesh) else []
-    return joined_mesh(parts)
+            meshes += [mesh] if len(mesh) else []
+    return joined_mesh(meshes)
 
 
 def ellipsoids_mesh(drawing: EllipsoidsDrawing, most: int) -> Mesh:
@@ -170,18 +170,18 @@ def section_html(section: Section, picture: str | Path | None = None) -> str:
         f'<div><dt>{as_html(k)}</dt><dd>{as_html(v)}</dd></div>'
         for k, v in section.figures.items()
     )
-    parts = [f'<h2>{as_html(section.title)}</h2>']
+    elements = [f'<h2>{as_html(section.title)}</h2>']
     if cells:
-        parts.append(f'<dl class="figures">{cells}</dl>')
+        elements.append(f'<dl class="figures">{cells}</dl>')
     if picture is not None:
         png = base64.b64encode(Path(picture).read_bytes()).decode()
         alt = f'picture: {as_html(section.title)}'
-        parts.append(f'<img class="wide" alt="{alt}" src="data:image/png;base64,{png}">')
+        elements.append(f'<img class="wide" alt="{alt}" src="data:image/png;base64,{png}">')
     if section.table is not None:
-        parts.append(table_html(section.table))
+        elements.append(table_html(section.table))
     if section.note:
-        parts.append(f'<p class="none">{as_html(section.note)}</p>')
-    return ''.join(parts)
+        elements.append(f'<p class="none">{as_html(section.note)}</p>')
+    return ''.join(elements)
 
 
 def table_html(table: Table) -> str:

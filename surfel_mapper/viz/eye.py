@@ -42,27 +42,27 @@ def followed(scene: Scene, shown: Shown) -> None:
     except (ImportError, AttributeError):
         logger.warning('this rerun reports no camera position (0.41 does): the detail stays fixed')
         return
-    before: npt.NDArray[np.float64] | None = None
+    previous: npt.NDArray[np.float64] | None = None
     deadline = time.monotonic() + STARTING_S
     while True:
         try:
-            place = target(ask().blueprint)
+            looked_at = target(ask().blueprint)
         except (ConnectionError, RuntimeError, TimeoutError) as error:
-            if before is None and time.monotonic() < deadline:
+            if previous is None and time.monotonic() < deadline:
                 time.sleep(EVERY_S)
                 continue
             logger.info('the window has closed: %s', error)
             return
-        if place is not None and (before is None or (place != before).any()):
-            shown.look(scene, place)
-            before = place
+        if looked_at is not None and (previous is None or (looked_at != previous).any()):
+            shown.look(scene, looked_at)
+            previous = looked_at
         time.sleep(EVERY_S)
 
 
 def target(blueprint: dict[str, Any]) -> npt.NDArray[np.float64] | None:
     """Return the place that the first 3D view of a blueprint looks at, (3,) m; None without."""
     for path, archetypes in blueprint.items():
-        found = archetypes.get('EyeControls3D', {}).get('look_target')
-        if path.endswith('/EyeControls3D') and found is not None:
-            return np.asarray(found, np.float64)
+        look_target = archetypes.get('EyeControls3D', {}).get('look_target')
+        if path.endswith('/EyeControls3D') and look_target is not None:
+            return np.asarray(look_target, np.float64)
     return None

@@ -58,7 +58,7 @@ class GltfScene:
         """State the place of the frame of the map in the fixed frame, (3,) m, in ``extras``."""
         self._scene.metadata['origin_m'] = np.asarray(origin_m, np.float64).tolist()
 
-    def look(self, low: Array, high: Array, place: Array, hidden: Sequence[str] = ()) -> None:
+    def look(self, low: Array, high: Array, target: Array, hidden: Sequence[str] = ()) -> None:
         """Leave the eye to the program that opens the file."""
 
     def discs(self, path: str, discs: DrawnDiscs, *, static: bool = True) -> None:
@@ -89,8 +89,8 @@ class GltfScene:
     ) -> None:
         """Add points (N, 3), m; glTF has no size of points."""
         colours = np.broadcast_to(linear(np.array(GREY if colour is None else colour)), (1, 3))
-        found = self._trimesh.PointCloud(points, np.repeat(colours, len(points), axis=0))
-        self._place(path, found)
+        geometry = self._trimesh.PointCloud(points, np.repeat(colours, len(points), axis=0))
+        self._add_geometry(path, geometry)
 
     def lines(
         self,
@@ -111,7 +111,7 @@ class GltfScene:
         ]
         if strips:
             vertices = np.concatenate([np.asarray(line, np.float64) for line in lines])
-            self._place(path, path_of.Path3D(strips, vertices, process=False))
+            self._add_geometry(path, path_of.Path3D(strips, vertices, process=False))
 
     def poses(self, path: str, stamp_ns: npt.NDArray[np.int64], xyz: Array, turns: Array) -> None:
         """Leave out poses over time."""
@@ -143,9 +143,9 @@ class GltfScene:
             vertex_colors=linear(colours),
             process=False,
         )
-        self._place(path, mesh)
+        self._add_geometry(path, mesh)
 
-    def _place(self, path: str, geometry: Any) -> None:
+    def _add_geometry(self, path: str, geometry: Any) -> None:
         self._scene.add_geometry(geometry, node_name=path, geom_name=path, transform=Y_UP)
 
 
@@ -153,5 +153,5 @@ def linear(colours: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     """Return colours of the screen (sRGB), 0 to 255, as the linear ones of glTF."""
     shares = colours / 255.0
     low = shares <= 0.04045
-    found = np.where(low, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
-    return np.rint(255.0 * found).astype(np.uint8)
+    values = np.where(low, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    return np.rint(255.0 * values).astype(np.uint8)

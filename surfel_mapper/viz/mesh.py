@@ -36,8 +36,8 @@ def vertex_normals(mesh: Mesh) -> npt.NDArray[np.float32]:
     across = face_normals(corners)
     normals = np.zeros_like(mesh.vertices)
     for corner, axis in np.ndindex(3, 3):
-        place = mesh.triangles[:, corner]
-        normals[:, axis] += np.bincount(place, across[:, axis], len(normals))
+        vertex = mesh.triangles[:, corner]
+        normals[:, axis] += np.bincount(vertex, across[:, axis], len(normals))
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     np.divide(normals, length, out=normals, where=length > 0.0)
     return normals.astype(np.float32)
@@ -49,11 +49,11 @@ def reduced(mesh: Mesh, max_triangles: int = MAX_TRIANGLES) -> Mesh:
         return mesh
     corners = mesh.vertices[mesh.triangles[:: max(len(mesh) // 10_000, 1)]]
     cell_m = float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
-    found = mesh
-    while len(found) > max_triangles:
-        cell_m *= max((len(found) / max_triangles) ** 0.5, 1.1)
-        found = merged(mesh, cell_m)
-    return found
+    smaller = mesh
+    while len(smaller) > max_triangles:
+        cell_m *= max((len(smaller) / max_triangles) ** 0.5, 1.1)
+        smaller = merged(mesh, cell_m)
+    return smaller
 
 
 def merged(mesh: Mesh, cell_m: float) -> Mesh:
@@ -61,13 +61,13 @@ def merged(mesh: Mesh, cell_m: float) -> Mesh:
     index = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell_m).astype(np.int64)
     sides = index.max(axis=0) + 1
     key = (index[:, 2] * sides[1] + index[:, 1]) * sides[0] + index[:, 0]
-    _, place, count = np.unique(key, return_inverse=True, return_counts=True)
-    triangles = place[mesh.triangles].astype(np.int32)
+    _, cell, count = np.unique(key, return_inverse=True, return_counts=True)
+    triangles = cell[mesh.triangles].astype(np.int32)
     a, b, c = triangles.T
     triangles = triangles[(a != b) & (b != c) & (c != a)]
 
     def mean(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-        sums = [np.bincount(place, column, len(count)) for column in values.T]
+        sums = [np.bincount(cell, column, len(count)) for column in values.T]
         means: npt.NDArray[np.float64] = np.stack(sums, axis=1) / count[:, None]
         return means
 
@@ -100,7 +100,7 @@ def mesh_data(
     triangles = mesh.triangles[near[mesh.triangles].min(axis=1)]
     near_mesh = Mesh(vertices=mesh.vertices, triangles=triangles, colors=mesh.colors)
     mesh = reduced(near_mesh, max_triangles)
-    used, places = np.unique(mesh.triangles, return_inverse=True)
+    used, indices = np.unique(mesh.triangles, return_inverse=True)
     packed = np.zeros(len(used), VERTEX)
     within = (mesh.vertices[used] - middle + reach) / (2.0 * reach)
     packed['place'] = np.rint(np.clip(within, 0.0, 1.0) * 65535.0)
@@ -108,6 +108,6 @@ def mesh_data(
     packed['color'][:, :3] = mesh.colors[used] if len(mesh.colors) else GREY
     return {
         'vertices': base64.b64encode(packed.tobytes()).decode(),
-        'triangles': base64.b64encode(places.astype('<u4').tobytes()).decode(),
+        'triangles': base64.b64encode(indices.astype('<u4').tobytes()).decode(),
         'reach': [float(side) for side in reach],
     }

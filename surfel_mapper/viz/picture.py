@@ -70,24 +70,24 @@ class View:
     signs: tuple[int, int, int]
     """-1 for an axis that runs the other way."""
 
-    def seen(self, vectors: Array) -> Array:
+    def projected(self, vectors: Array) -> Array:
         """Return the components of (K, 3) vectors to the right, up and towards the viewer."""
         columns = vectors.T[[self.right, self.up, self.near]]
-        seen: Array = columns * np.array(self.signs, np.float64)[:, None]
-        return seen
+        components: Array = columns * np.array(self.signs, np.float64)[:, None]
+        return components
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
     """
-    A view of the map in pixels; left and top are its upper left corner as in ``View.seen``.
+    A view of the map in pixels; left_m and top_m are its upper left corner, as ``View.projected``.
 
     ``origin_m`` holds what is added to the coordinates along both axes at the ticks.
     """
 
     view: View
-    left: float
-    top: float
+    left_m: float
+    top_m: float
     width: int
     height: int
     px_per_m: float
@@ -102,44 +102,44 @@ class Frame:
         origin_m: npt.ArrayLike = (0.0, 0.0, 0.0),
     ) -> Frame:
         """Return the frame that shows a box of a map with an origin."""
-        low, high = (view.seen(corner[None])[:2, 0] for corner in box)
+        low, high = (view.projected(corner[None])[:2, 0] for corner in box)
         width, height = (max(round(abs(side) * px_per_m), 1) for side in high - low)
-        place = np.asarray(origin_m, np.float64)
-        at = (float(place[view.right]), float(place[view.up]))
+        origin = np.asarray(origin_m, np.float64)
+        at = (float(origin[view.right]), float(origin[view.up]))
         return cls(view, low[0], max(low[1], high[1]), width, height, px_per_m, at)
 
     def placed(self, positions: Array) -> Array:
         """Return the columns and rows of (K, 3) positions, (K, 2) px."""
-        right, up, _ = self.view.seen(positions)
-        return np.column_stack([right - self.left, self.top - up]) * self.px_per_m - 0.5
+        right, up, _ = self.view.projected(positions)
+        return np.column_stack([right - self.left_m, self.top_m - up]) * self.px_per_m - 0.5
 
     @property
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Limits of the axes, m: left and right, bottom and top."""
-        right = self.left + self.width / self.px_per_m
-        bottom = self.top - self.height / self.px_per_m
+        right = self.left_m + self.width / self.px_per_m
+        bottom = self.top_m - self.height / self.px_per_m
         across, up, _ = self.view.signs
-        return (across * self.left, across * right), (up * bottom, up * self.top)
+        return (across * self.left_m, across * right), (up * bottom, up * self.top_m)
 
     def ticks(self) -> tuple[Array, Array]:
         """Return the ticks along both axes, which are round numbers once the origin is added."""
         from matplotlib.ticker import MaxNLocator
 
-        found = []
+        ticks = []
         rooms = (self.width // TICK_COLUMNS, self.height // TICK_ROWS)
         for ends, number, origin_m in zip(self.bounds, rooms, self.origin_m, strict=True):
             low, high = min(ends), max(ends)
             locator = MaxNLocator(max(number, 1))
             values = np.asarray(locator.tick_values(low + origin_m, high + origin_m)) - origin_m
-            found.append(values[(values >= low) & (values <= high)])
-        return found[0], found[1]
+            ticks.append(values[(values >= low) & (values <= high)])
+        return ticks[0], ticks[1]
 
     def gridded(self) -> npt.NDArray[np.float32]:
         """Return a white image with lines at the ticks, (H, W, 3)."""
         image = np.full((self.height, self.width, 3), 255.0, np.float32)
         (along, up), (across, upwards, _) = self.ticks(), self.view.signs
-        columns = np.rint((across * along - self.left) * self.px_per_m - 0.5).astype(np.int64)
-        rows = np.rint((self.top - upwards * up) * self.px_per_m - 0.5).astype(np.int64)
+        columns = np.rint((across * along - self.left_m) * self.px_per_m - 0.5).astype(np.int64)
+        rows = np.rint((self.top_m - upwards * up) * self.px_per_m - 0.5).astype(np.int64)
         image[:, columns.clip(0, self.width - 1)] = GRID
         image[rows.clip(0, self.height - 1)] = GRID
         return image
@@ -158,8 +158,8 @@ class Frame:
             Red, green and blue, 0 to 1.
 
         """
-        normal_right, normal_up, facing = self.view.seen(surfels.normal)
-        order = np.argsort(self.view.seen(surfels.position)[2], kind='stable')
+        normal_right, normal_up, facing = self.view.projected(surfels.normal)
+        order = np.argsort(self.view.projected(surfels.position)[2], kind='stable')
         order = order[facing[order] > FACING_AWAY]
         half = self.px_per_m * half_m[order]
         thin = half * np.maximum(np.abs(facing[order]), EDGE_ON)
@@ -171,12 +171,12 @@ class Frame:
 
     def line(self, positions: Array) -> Discs:
         """Return a line through (S, 3) positions as discs, one for each pixel of its length."""
-        places = self.placed(positions)
-        steps = np.hypot(*np.diff(places, axis=0).T)
-        way = np.concatenate([[0.0], np.cumsum(steps)])[: len(places)]
+        pixels = self.placed(positions)
+        steps = np.hypot(*np.diff(pixels, axis=0).T)
+        way = np.concatenate([[0.0], np.cumsum(steps)])[: len(pixels)]
         at = np.linspace(0.0, way[-1], min(round(way[-1]) + 1, MOST_DOTS)) if len(way) else way
         discs = np.zeros((len(at), 5))
-        discs[:, 0], discs[:, 1] = (np.interp(at, way, axis) for axis in places.T)
+        discs[:, 0], discs[:, 1] = (np.interp(at, way, axis) for axis in pixels.T)
         discs[:, 2:4] = 0.5 * LINE_PX
         return discs, np.tile(np.array(LINE, np.float32), (len(at), 1))
 
@@ -282,8 +282,8 @@ def draw_map(
             paint_discs(*frame.line(trajectory), image)
         height, width = image.shape[:2]
         inside = image[FRAME_PX : height - FRAME_PX, FRAME_PX : width - FRAME_PX]
-        top, left = row + FRAME_PX, column + FRAME_PX
-        pixels[top : top + inside.shape[0], left : left + inside.shape[1]] = np.rint(inside)
+        y, x = row + FRAME_PX, column + FRAME_PX
+        pixels[y : y + inside.shape[0], x : x + inside.shape[1]] = np.rint(inside)
     with replace_file(path) as file:
         imsave(file, pixels, format='png', dpi=DPI, pil_kwargs={'compress_level': 3})
 
@@ -323,8 +323,8 @@ def framed(
         (len(f'{tick + frame.origin_m[1]:.10g}') for frame in frames for tick in frame.ticks()[1]),
         default=0,
     )
-    left = max(LEFT, BESIDE + DIGIT_PX * digits)
-    width = max(left + across + (RIGHT if colouring == 'planarity' else RIGHT // 3), SMALLEST_PX)
+    margin = max(LEFT, BESIDE + DIGIT_PX * digits)
+    width = max(margin + across + (RIGHT if colouring == 'planarity' else RIGHT // 3), SMALLEST_PX)
     height = ABOVE + sum(frame.height + BELOW for frame in frames)
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     canvas = FigureCanvasAgg(figure)
@@ -335,11 +335,11 @@ def framed(
 
     corners, row = [], ABOVE
     for frame in frames:
-        label(axes_at(row, left, frame.height, across), frame)
-        corners.append((row, left))
+        label(axes_at(row, margin, frame.height, across), frame)
+        corners.append((row, margin))
         row += frame.height + BELOW
     if colouring == 'planarity':
-        bar = axes_at(ABOVE, left + across + 30, height - ABOVE - BELOW, 25)
+        bar = axes_at(ABOVE, margin + across + 30, height - ABOVE - BELOW, 25)
         figure.colorbar(ScalarMappable(cmap='viridis'), cax=bar).set_label(colouring)
     title = escaped(title)  # a name of a file may be no text, or hold dollar signs
     points = 72.0 * (width - 40) / DPI / (LETTER * max(len(title), 1))

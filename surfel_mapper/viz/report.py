@@ -86,7 +86,7 @@ def write_report(
     history = history or History()
     valid = surfels.select(np.isfinite(surfels.planarity))
     shown = valid if drawn is None else drawn.select(np.isfinite(drawn.planarity))
-    parts = [
+    blocks = [
         f'<h1>{as_html(title)}</h1><p class="about">{as_html(about(summary))}</p>',
         figures(summary, history),
         turning_view(shown, history.trajectory, summary, picture, layers or {}),
@@ -98,7 +98,7 @@ def write_report(
         settings_table(summary.get('settings', {})),
     ]
     with replace_file(path) as file:
-        file.write(page(title, ''.join(parts)).encode('utf-8', 'replace'))
+        file.write(page(title, ''.join(blocks)).encode('utf-8', 'replace'))
 
 
 def page(title: str, body: str) -> str:
@@ -177,16 +177,16 @@ def tracking_table(registration: Mapping[str, Any]) -> str:
     if 'tracking' not in registration:
         return ''
     states = ''.join(
-        f'<tr><td>{as_html(state)}</td><td>{found["scans"]}</td><td>{found["seconds"]:.1f}</td></tr>'
-        for state, found in registration['tracking'].items()
+        f'<tr><td>{as_html(state)}</td><td>{spent["scans"]}</td><td>{spent["seconds"]:.1f}</td></tr>'
+        for state, spent in registration['tracking'].items()
     )
-    parts = ''.join(
-        f'<p>apart_{number}: {part["scans"]} scans from {part["first_s"]:.3f} to '
-        f'{part["last_s"]:.3f} s have no certain place on the map: {as_html(part["reason"])}</p>'
-        for number, part in enumerate(registration['apart'], start=1)
+    paragraphs = ''.join(
+        f'<p>apart_{number}: {track["scans"]} scans from {track["first_s"]:.3f} to '
+        f'{track["last_s"]:.3f} s have no certain place on the map: {as_html(track["reason"])}</p>'
+        for number, track in enumerate(registration['apart'], start=1)
     )
     head = '<tr><th>state</th><th>scans</th><th>s</th></tr>'
-    return f'<h2>Tracking</h2><table>{head}{states}</table>{parts}'
+    return f'<h2>Tracking</h2><table>{head}{states}</table>{paragraphs}'
 
 
 def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str:
@@ -242,9 +242,9 @@ def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
     rows = ''
     for kind in ('absolute', 'relative'):
         for name, unit, factor in (('translation_m', 'mm', 1e3), ('rotation_deg', 'deg', 1.0)):
-            found = errors[kind][name]
+            error = errors[kind][name]
             cells = ''.join(
-                f'<td class="number">{decimals(found[figure], factor)}</td>'
+                f'<td class="number">{decimals(error[figure], factor)}</td>'
                 for figure in ('rmse', 'mean', 'median', 'max')
             )
             rows += f'<tr><td>{kind}, {unit}</td>{cells}</tr>'
@@ -282,7 +282,7 @@ def settings_table(settings: Mapping[str, Any]) -> str:
     """Return a table of all settings, those that differ from their defaults first."""
     default = Config().to_mapping()
     ours = {name: value for name, value in settings.items() if value != default.get(name)}
-    rest = {name: value for name, value in settings.items() if name not in ours}
+    usual = {name: value for name, value in settings.items() if name not in ours}
 
     def table(values: Mapping[str, Any]) -> str:
         rows = ''.join(
@@ -294,5 +294,5 @@ def settings_table(settings: Mapping[str, Any]) -> str:
     changed = table(ours) if ours else '<p class="none">All settings are at their defaults.</p>'
     return (
         f'<h2>Settings</h2>{changed}'
-        f'<details><summary>{len(rest)} at their defaults</summary>{table(rest)}</details>'
+        f'<details><summary>{len(usual)} at their defaults</summary>{table(usual)}</details>'
     )

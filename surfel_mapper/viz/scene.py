@@ -189,9 +189,9 @@ class Scene:
             about = self._rerun.AnyValues(origin_m=self.origin_m)
             self._stream.log('map', about, static=True)
 
-    def look(self, low: Array, high: Array, place: Array, hidden: Sequence[str] = ()) -> None:
+    def look(self, low: Array, high: Array, target: Array, hidden: Sequence[str] = ()) -> None:
         """
-        Look at a place from obliquely above, as far away as a box, (3,) m each, needs.
+        Look at a target from obliquely above, as far away as a box, (3,) m each, needs.
 
         Hidden paths are shown once their eye in the panel is clicked.
         """
@@ -201,8 +201,8 @@ class Scene:
         across = 1 if high[0] - low[0] > high[1] - low[1] else 0
         back = np.array([0.0, 0.0, 0.55])
         back[across] = -0.75
-        eye = place + back * max(size, 2.0) * 0.6
-        controls = blueprint.EyeControls3D(position=eye, look_target=place, eye_up=[0, 0, 1])
+        eye = target + back * max(size, 2.0) * 0.6
+        controls = blueprint.EyeControls3D(position=eye, look_target=target, eye_up=[0, 0, 1])
         name = 'map'
         if self.origin_m.any():
             name = 'map, m from ' + ' '.join(f'{value:.10g}' for value in self.origin_m)

@@ -44,14 +44,14 @@ def started_server(port: int, data_port: int, memory: str) -> Server:
         *('--port', str(data_port), '--web-viewer-port', str(port)),
         *('--server-memory-limit', memory),
     ]
-    for each in (data_port, port):
-        check_free(each)
+    for number in (data_port, port):
+        check_free(number)
     server = subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     )
     try:
-        for each in (data_port, port):
-            wait_for(each, server)
+        for number in (data_port, port):
+            wait_for(number, server)
     except BaseException:
         end_group(server)
         raise
@@ -72,13 +72,13 @@ def import_rerun() -> Any:
 
 def rerun_program() -> str:
     """Return the path of the program rerun, beside this Python or on the PATH."""
-    found = shutil.which('rerun', path=str(Path(sys.executable).parent)) or shutil.which('rerun')
-    if found is None:
+    program = shutil.which('rerun', path=str(Path(sys.executable).parent)) or shutil.which('rerun')
+    if program is None:
         raise DependencyError(
             'the program rerun, which the package rerun-sdk installs, is neither beside '
             f'{sys.executable} nor on the PATH'
         )
-    return found
+    return program
 
 
 def end_group(server: Server) -> None:

@@ -45,7 +45,7 @@ def show_contents(
     contents: Sequence[Content],
     *,
     colouring: str = 'normal',
-    place: npt.ArrayLike | None = None,
+    target: npt.ArrayLike | None = None,
     most_discs: int = MOST_DISCS,
     min_points: int = 5,
 ) -> Shown:
@@ -60,8 +60,8 @@ def show_contents(
         As ``contents`` of contents.py yields them.
     colouring : str
         One of discs.COLOURINGS.
-    place : (3,) float, m, optional
-        The place looked at, in the fixed frame; around it maps have their full detail. Default:
+    target : (3,) float, m, optional
+        The position looked at, in the fixed frame. Maps have their full detail around it. Default:
         the end of the first trajectory, else the middle of the first map.
     most_discs : int
         Limit of the discs of all maps together.
@@ -76,37 +76,39 @@ def show_contents(
     """
     origin_m = shared_origin(contents)
     scene.set_origin(origin_m)
-    looked_at = np.asarray(place_of(contents) if place is None else place, np.float64) - origin_m
-    maps = [each for each in contents if isinstance(each, ExactMap)]
+    looked_at = np.asarray(place_of(contents) if target is None else target, np.float64) - origin_m
+    maps = [content for content in contents if isinstance(content, ExactMap)]
     shares = most_discs // max(len(maps), 1)
-    tiled = [RefinedMap(each, min_points, origin_m, shares) for each in maps]
-    tiles = [each.refine(looked_at) for each in tiled]
-    clouds = [shifted_cloud(each, origin_m) for each in contents if isinstance(each, Cloud)]
-    parts = [part for found in tiles for part in found.values()]
-    parts += [each.discs for each in clouds if each.discs is not None]
-    if any(map(len, parts)):
-        scene.colouring = Colouring.over(colouring, parts)
-    places = [part.position for part in parts] + [each.position for each in clouds]
-    box = box_of(places if any(map(len, places)) else vertices(contents, origin_m))
-    meshes = [f'map/{each.name}' for each in contents if isinstance(each, ShownMesh)]
-    hidden = meshes if any(map(len, parts)) and isinstance(scene, Scene) else []
+    tiled = [RefinedMap(content, min_points, origin_m, shares) for content in maps]
+    tiles = [refined.refine(looked_at) for refined in tiled]
+    clouds = [
+        shifted_cloud(content, origin_m) for content in contents if isinstance(content, Cloud)
+    ]
+    drawn = [discs for by_path in tiles for discs in by_path.values()]
+    drawn += [cloud.discs for cloud in clouds if cloud.discs is not None]
+    if any(map(len, drawn)):
+        scene.colouring = Colouring.over(colouring, drawn)
+    positions = [discs.position for discs in drawn] + [cloud.position for cloud in clouds]
+    box = box_of(positions if any(map(len, positions)) else vertices(contents, origin_m))
+    meshes = [f'map/{content.name}' for content in contents if isinstance(content, ShownMesh)]
+    hidden = meshes if any(map(len, drawn)) and isinstance(scene, Scene) else []
     scene.look(*box, looked_at, hidden)
     if scene.is_watched:  # a first picture, while the rest is on its way
-        log([each.coarsest() for each in tiled], scene)
+        log([refined.coarsest() for refined in tiled], scene)
         scene.flush()
     log(tiles, scene)
-    about = {each.name: each.about() for each in tiled}
-    for each in clouds:
-        about[each.name] = show_cloud(scene, each)
-    for other in contents:
-        if isinstance(other, ShownMesh):
-            path = f'map/{other.name}'
-            scene.mesh(path, shifted_mesh(other.mesh, origin_m), static=True)
-            about[other.name] = f'{len(other.mesh):,} triangles'
+    about = {refined.name: refined.about() for refined in tiled}
+    for cloud in clouds:
+        about[cloud.name] = show_cloud(scene, cloud)
+    for content in contents:
+        if isinstance(content, ShownMesh):
+            path = f'map/{content.name}'
+            scene.mesh(path, shifted_mesh(content.mesh, origin_m), static=True)
+            about[content.name] = f'{len(content.mesh):,} triangles'
             if path in hidden:  # it would flicker through the discs on the same surfaces
-                about[other.name] += ', hidden: its eye in the panel of the viewer shows them'
-        elif isinstance(other, Way):
-            about[other.name] = show_way(scene, other, origin_m)
+                about[content.name] += ', hidden: its eye in the panel of the viewer shows them'
+        elif isinstance(content, Way):
+            about[content.name] = show_way(scene, content, origin_m)
     scene.flush()
     return Shown(about, tiled)
 
@@ -129,24 +131,24 @@ class Shown:
     @property
     def is_coarse(self) -> bool:
         """Whether some tiles are shown by larger voxels, so that another place has other ones."""
-        return any(each.level.any() for each in self._tiled)
+        return any(refined.level.any() for refined in self._tiled)
 
-    def look(self, scene: Scene, place: npt.ArrayLike) -> int:
+    def look(self, scene: Scene, target: npt.ArrayLike) -> int:
         """
-        Give another place the full detail; return the number of tiles whose level changed.
+        Give another target the full detail; return the number of tiles of a changed level.
 
         Parameters
         ----------
         scene : Scene
             Where the contents are shown.
-        place : (3,) float, m
+        target : (3,) float, m
             In the frame of the scene.
 
         """
-        found = [each.refine(np.asarray(place, np.float64)) for each in self._tiled]
-        log(found, scene)
+        changed = [refined.refine(np.asarray(target, np.float64)) for refined in self._tiled]
+        log(changed, scene)
         scene.flush()
-        return sum(map(len, found))
+        return sum(map(len, changed))
 
 
 class RefinedMap:
@@ -173,11 +175,11 @@ class RefinedMap:
         self._whole = DetailedMap(shown.moments, min_points)
         self.level: npt.NDArray[np.int64] = np.full(len(self._whole), -1)
 
-    def refine(self, place: Array) -> dict[str, DrawnDiscs]:
-        """Return the discs of tiles whose level changes for a place, nearest first, by path."""
+    def refine(self, target: Array) -> dict[str, DrawnDiscs]:
+        """Return the discs of tiles of a changed level for a target, nearest first, by path."""
         whole = self._whole
-        level = whole.choose(place - self._shift, self._most_discs)
-        tiles = whole.nearest_first(np.flatnonzero(level != self.level), place - self._shift)
+        level = whole.choose(target - self._shift, self._most_discs)
+        tiles = whole.nearest_first(np.flatnonzero(level != self.level), target - self._shift)
         self.level = level
         return self._discs(tiles)
 
@@ -189,17 +191,17 @@ class RefinedMap:
         self, tiles: npt.NDArray[np.int64], level: int | None = None
     ) -> dict[str, DrawnDiscs]:
         """Return the discs of tiles by path, at one level or each at its own."""
-        whole, found = self._whole, {}
+        whole, by_path = self._whole, {}
         levels = self.level if level is None else np.full_like(self.level, level)
         for tile, surfels in zip(tiles, whole.all_surfels(levels, tiles), strict=True):
             i, j = whole.tiles[tile]
             discs = with_age(surfels, self._shown, int(levels[tile]))
             values = {**discs.values, 'level': np.full(len(discs), levels[tile])}
             name = f'tile_{i}_{j}'.replace('-', 'm')
-            found[f'map/{self.name}/{name}'] = DrawnDiscs(
+            by_path[f'map/{self.name}/{name}'] = DrawnDiscs(
                 discs.position + self._shift, discs.normal, discs.radius_m, values
             )
-        return found
+        return by_path
 
     def about(self) -> str:
         """Return a sentence about the map."""
@@ -213,8 +215,8 @@ class RefinedMap:
 
 def log(tiles: Sequence[Mapping[str, DrawnDiscs]], scene: Scene | GltfScene) -> None:
     """Show tiles of maps, each in place of its earlier discs."""
-    for found in tiles:
-        for path, discs in found.items():
+    for by_path in tiles:
+        for path, discs in by_path.items():
             scene.discs(path, discs, static=True)
 
 
@@ -252,9 +254,9 @@ def show_way(scene: Scene | GltfScene, way: Way, origin_m: Array) -> str:
 
 def shared_origin(contents: Sequence[Content]) -> Array:
     """Return the origin of the shared frame in the fixed frame, (3,) m."""
-    for each in contents:
-        if isinstance(each, ExactMap):
-            return each.origin_m
+    for content in contents:
+        if isinstance(content, ExactMap):
+            return content.origin_m
     middle = place_of(contents)
     if np.abs(middle).max() < FAR_M:
         return np.zeros(3)
@@ -263,14 +265,14 @@ def shared_origin(contents: Sequence[Content]) -> Array:
 
 def place_of(contents: Sequence[Content]) -> Array:
     """Return a place worth looking at in the fixed frame, (3,) m."""
-    ways = [each.trajectory.xyz for each in contents if isinstance(each, Way)]
+    ways = [content.trajectory.xyz for content in contents if isinstance(content, Way)]
     if ways and len(ways[0]):
         return np.asarray(ways[0][-1], np.float64)
-    for each in contents:
-        if isinstance(each, ExactMap) and len(each.moments):
-            return each.middle()
-        points = each.position if isinstance(each, Cloud) else None
-        points = each.mesh.vertices if isinstance(each, ShownMesh) else points
+    for content in contents:
+        if isinstance(content, ExactMap) and len(content.moments):
+            return content.middle()
+        points = content.position if isinstance(content, Cloud) else None
+        points = content.mesh.vertices if isinstance(content, ShownMesh) else points
         if points is not None and len(points):
             return np.asarray(np.median(points, axis=0), np.float64)
     return np.zeros(3)
@@ -278,14 +280,14 @@ def place_of(contents: Sequence[Content]) -> Array:
 
 def vertices(contents: Sequence[Content], origin_m: Array) -> list[Array]:
     """Return the vertices of meshes and the positions of trajectories, (N, 3) m each."""
-    meshes = [each.mesh.vertices for each in contents if isinstance(each, ShownMesh)]
-    ways = [each.trajectory.xyz for each in contents if isinstance(each, Way)]
-    return [found - origin_m for found in (*meshes, *ways)]
+    meshes = [content.mesh.vertices for content in contents if isinstance(content, ShownMesh)]
+    ways = [content.trajectory.xyz for content in contents if isinstance(content, Way)]
+    return [xyz - origin_m for xyz in (*meshes, *ways)]
 
 
-def box_of(places: Sequence[Array]) -> tuple[Array, Array]:
-    """Return the box with all but the farthest of some places, (3,) m each."""
-    every = np.concatenate(places) if places else np.empty((0, 3))
+def box_of(positions: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the box with all but the farthest of some positions, (3,) m each."""
+    every = np.concatenate(positions) if positions else np.empty((0, 3))
     if not len(every):
         return np.full(3, -10.0), np.full(3, 10.0)
     low, high = np.percentile(every, [1.0, 99.0], axis=0)

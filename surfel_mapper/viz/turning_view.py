@@ -134,10 +134,10 @@ def view_data(
     from matplotlib import colormaps
 
     low, high = np.zeros(3), np.ones(3)
-    places = [surfels.position] if len(surfels) else [mesh.vertices for mesh in layers.values()]
-    if places:
-        seen = np.concatenate(places)
-        low, high = seen.min(axis=0), seen.max(axis=0)
+    positions = [surfels.position] if len(surfels) else [mesh.vertices for mesh in layers.values()]
+    if positions:
+        xyz = np.concatenate(positions)
+        low, high = xyz.min(axis=0), xyz.max(axis=0)
     size = np.maximum(high - low, 1e-3)
     radius = 0.5 * SPREAD * sides_m(surfels)
     largest = float(radius.max(initial=1e-3))
@@ -158,7 +158,7 @@ def view_data(
         'layers': [
             mesh_data(mesh, low, size, MAX_TRIANGLES // len(layers)) for mesh in layers.values()
         ],
-        'middle': [float(place) for place in low + 0.5 * size + origin_m],
+        'middle': [float(value) for value in low + 0.5 * size + origin_m],
         'heights': [f'{origin_m[2] + end:.{decimals}f} m' for end in (low[2], high[2])],
     }
 

@@ -151,7 +151,7 @@ class Viewer:
         if whole or change > NEW * num_voxels:
             self._shown_voxels, self._removed = num_voxels, 0
             surfels = self._discs(mapper.map.surfels(mapper.config.map.min_points))
-            drawings = [each for layer in mapper.layers.values() for each in layer.drawings()]
+            drawings = [drawn for layer in mapper.layers.values() for drawn in layer.drawings()]
         window = np.array([scan.T_map_sensor[:3, 3] for scan in mapper.window])
         return Snapshot(
             stamp_ns=update.stamp_ns,

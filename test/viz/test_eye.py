@@ -106,7 +106,7 @@ def test_detail_follows_the_eye_until_the_window_closes(tmp_path):
     with window(port) as (client, process):
         scene = Scene.to_window(port)
         shown = show_contents(
-            scene, list(contents(Path(tmp_path / 'map.npz'))), place=[-20, -10, 0], most_discs=600
+            scene, list(contents(Path(tmp_path / 'map.npz'))), target=[-20, -10, 0], most_discs=600
         )
         assert shown.is_coarse
         watched = Watched(shown, Quitting(client, process))
