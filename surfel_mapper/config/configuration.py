@@ -91,11 +91,11 @@ class Config:
 
     def __post_init__(self) -> None:
         """Check the settings of no stage, and conditions on several stages."""
-        for each in dataclasses.fields(self):
-            kind, value = each.default_factory, getattr(self, each.name)
+        for entry in dataclasses.fields(self):
+            kind, value = entry.default_factory, getattr(self, entry.name)
             if isinstance(kind, type) and not isinstance(value, Mapping if kind is dict else kind):
                 raise ConfigError(
-                    f'{each.name}: a {type(value).__name__}, expected a {kind.__name__}'
+                    f'{entry.name}: a {type(value).__name__}, expected a {kind.__name__}'
                 )
         for declared in settings_of(type(self)):
             checked(declared.name, getattr(self, declared.key), declared)
@@ -130,8 +130,8 @@ class Config:
         """
         stages, of_no_stage = by_stage(mapping)
         made = {
-            part.name: part.default_factory(**stages.get(stage, {}))  # type: ignore[operator]
-            for stage, part in stage_fields().items()
+            entry.name: entry.default_factory(**stages.get(stage, {}))  # type: ignore[operator]
+            for stage, entry in stage_fields().items()
         }
         more = {name: stage(**stages.get(name, {})) for name, stage in layer_stages().items()}
         return cls(**made, **of_no_stage, more=more)
@@ -143,11 +143,11 @@ class Config:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all settings as ``stage.name`` to value, in the order they are declared."""
-        places: dict[str, Any] = {'': self}
-        places.update((stage, getattr(self, f.name)) for stage, f in stage_fields().items())
-        places.update((stage, self.stage(stage)) for stage in layer_stages())
+        owners: dict[str, Any] = {'': self}
+        owners.update((stage, getattr(self, f.name)) for stage, f in stage_fields().items())
+        owners.update((stage, self.stage(stage)) for stage in layer_stages())
         return {
-            declared.name: getattr(places[declared.stage], declared.key)
+            declared.name: getattr(owners[declared.stage], declared.key)
             for declared in declarations()
         }
 
@@ -162,9 +162,9 @@ class Config:
 
         """
         if not isinstance(name, str) or name not in {**self.more, **layer_stages()}:
-            known = ', '.join(sorted(layer_stages())) or 'none is registered'
+            names = ', '.join(sorted(layer_stages())) or 'none is registered'
             raise ConfigError(
-                f'{name!r:.60}: no stage of a layer of another package ({known}); the others are '
+                f'{name!r:.60}: no stage of a layer of another package ({names}); the others are '
                 'attributes, as config.map'
             )
         return self.more[name] if name in self.more else layer_stages()[name]()
@@ -172,7 +172,7 @@ class Config:
     def replace(self, mapping: Mapping[str, Any]) -> Config:
         """Return a copy with some settings changed; see from_mapping."""
         stages, of_no_stage = by_stage(mapping)
-        fields = {stage: part.name for stage, part in stage_fields().items()}
+        fields = {stage: entry.name for stage, entry in stage_fields().items()}
         changed = {
             fields[stage]: dataclasses.replace(getattr(self, fields[stage]), **values)
             for stage, values in stages.items()
@@ -189,11 +189,11 @@ def by_stage(mapping: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dic
     """Return settings by stage and key, and those of no stage; refuse unknown names."""
     stages: dict[str, dict[str, Any]] = {}
     of_no_stage: dict[str, Any] = {}
-    known = {declared.name: declared for declared in declarations()}
+    by_name = {declared.name: declared for declared in declarations()}
     for name, value in flatten(mapping):
-        if name not in known:
-            raise ConfigError(f'{name}: no such setting{near(name, known)}')
-        declared = known[name]
+        if name not in by_name:
+            raise ConfigError(f'{name}: no such setting{near(name, by_name)}')
+        declared = by_name[name]
         values = stages.setdefault(declared.stage, {}) if declared.stage else of_no_stage
         values[declared.key] = value
     return stages, of_no_stage
@@ -219,8 +219,8 @@ def register_stage(stage: type[Stage]) -> type[Stage]:
 
     """
     name = stage_name(stage)
-    other = _LAYER_STAGES.get(name, stage)
-    if name in stage_fields() or other.__qualname__ != stage.__qualname__:
+    registered = _LAYER_STAGES.get(name, stage)
+    if name in stage_fields() or registered.__qualname__ != stage.__qualname__:
         raise ConfigError(f'stage {name!r} of {stage.__module__}: another stage has this name')
     _LAYER_STAGES[name] = stage
     return stage

@@ -29,8 +29,8 @@ def ros_parameters(content: Any) -> dict[str, Any]:
     """
     if not isinstance(content, Mapping):
         raise ConfigError(f'a {type(content).__name__}, expected a mapping of settings')
-    parts = list(parts_of(content))
-    nodes = [node for node, _ in parts if node and not node.endswith('*')]
+    sections = list(parts_of(content))
+    nodes = [node for node, _ in sections if node and not node.endswith('*')]
     own = [node for node in nodes if len(nodes) == 1 or node.split('/')[-1] == NODE]
     if nodes and len(own) != 1:
         raise ConfigError(
@@ -38,7 +38,7 @@ def ros_parameters(content: Any) -> dict[str, Any]:
             f'is named {NODE}'
         )
     settings: dict[str, Any] = {}
-    for node, values in parts:
+    for node, values in sections:
         if not node or node.endswith('*') or node in own:
             settings.update(flatten(values))
     for_node = ('use_sim_time', 'qos_overrides.')

@@ -173,9 +173,9 @@ def stage_name(cls: type[Stage]) -> str:
 def settings_of(cls: type, stage: str = '') -> list[Declaration]:
     """Return the settings of a dataclass, in order; fields not made by ``setting`` are skipped."""
     return [
-        Declaration(stage, each.name, each.default, **each.metadata)
-        for each in dataclasses.fields(cls)
-        if 'meaning' in each.metadata
+        Declaration(stage, field.name, field.default, **field.metadata)
+        for field in dataclasses.fields(cls)
+        if 'meaning' in field.metadata
     ]
 
 
@@ -190,10 +190,10 @@ def flatten(mapping: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str,
             yield f'{prefix}{name}', value
 
 
-def near(name: str, known: Mapping[str, Any] | list[str]) -> str:
-    """Return '; did you mean ...?' for the most similar known name, or an empty string."""
-    found = difflib.get_close_matches(name, list(known), n=1)
-    return f'; did you mean {found[0]}?' if found else ''
+def near(name: str, names: Mapping[str, Any] | list[str]) -> str:
+    """Return '; did you mean ...?' for the most similar name, or an empty string."""
+    matches = difflib.get_close_matches(name, list(names), n=1)
+    return f'; did you mean {matches[0]}?' if matches else ''
 
 
 def checked(name: str, value: Any, declared: Declaration, *, takes_text: bool = False) -> Any:

@@ -92,13 +92,13 @@ class MapConfig(Stage):
         if self.origin in ('', AUTO):
             return ()
         words = self.origin.strip('[]() ').replace(',', ' ').split()
-        found = tuple(value for word in words if (value := read_number(word, float)) is not None)
-        if not len(words) == len(found) == 3 or any(not abs(v) < MAX_ORIGIN_M for v in found):
+        numbers = tuple(value for word in words if (value := read_number(word, float)) is not None)
+        if not len(words) == len(numbers) == 3 or any(not abs(v) < MAX_ORIGIN_M for v in numbers):
             raise ConfigError(
                 f'map.origin: {self.origin!r}, expected nothing, {AUTO}, or a text of x y z in m, '
                 "each below 1e9, such as '400000 5400000 0'"
             )
-        return found
+        return numbers
 
     @property
     def columns(self) -> tuple[str, ...]:

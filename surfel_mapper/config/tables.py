@@ -31,21 +31,21 @@ LARGE = 1e6
 
 def first_ones() -> list[Declaration]:
     """Return the declarations of the settings that matter most, in order."""
-    known = {declared.name: declared for declared in declarations()}
-    return [known[name] for name in FIRST]
+    by_name = {declared.name: declared for declared in declarations()}
+    return [by_name[name] for name in FIRST]
 
 
 def settings_table() -> str:
     """Return the tables in Markdown; * marks settings that can change while the node runs."""
-    others = [declared for declared in declarations() if declared.name not in FIRST]
-    return f'{table_of(first_ones())}\nAll others:\n\n{table_of(others)}'
+    further = [declared for declared in declarations() if declared.name not in FIRST]
+    return f'{table_of(first_ones())}\nAll others:\n\n{table_of(further)}'
 
 
 def table_of(declared_ones: Iterable[Declaration]) -> str:
     """Return a table of settings."""
     rows = ['| setting | default | meaning |', '|---|---|---|']
     for declared in declared_ones:
-        meaning = ' '.join(part for part in (declared.meaning, allowed(declared)) if part)
+        meaning = ' '.join(text for text in (declared.meaning, allowed(declared)) if text)
         name = f'`{declared.name}`{" *" if declared.live else ""}'
         rows.append(f'| {name} | `{yaml_value(declared.default)}` | {meaning} |')
     return '\n'.join(rows) + '\n'
