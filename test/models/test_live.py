@@ -19,7 +19,7 @@ from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.kernels.layout import INDEX_OFFSET
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models.live import LiveModels
-from surfel_mapper.models.surfel_joining import BLOCK_BITS, SurfelJoining
+from surfel_mapper.models.surfel_joining import BLOCK_BITS
 from test.models.live_scenes import (
     groups,
     id_at,
@@ -123,19 +123,6 @@ def test_incremental_models_equal_a_batch_after_random_changes(noisy, seed):
         assert known == ids(models) == set(models.versions)
         assumed = replace(settings, noise_m=models.noise_m or 1e-9)  # not to be estimated again
         assert groups(models) == groups(live(surfel_map.copy(), assumed))
-
-
-def test_result_is_independent_of_scan_order(noisy):
-    parts = np.array_split(np.random.default_rng(2).permutation(noisy), 5)
-    found = []
-    for order in ([0, 1, 2, 3, 4], [4, 2, 0, 3, 1]):
-        surfel_map = SurfelMap(VOXEL_M)
-        models = LiveModels(SETTINGS, surfel_map)
-        for number in order:
-            surfel_map.add(parts[number], origin=VIEW)
-            models.update()
-        found.append(groups(models))
-    assert found[0] == found[1]
 
 
 def test_two_runs_give_the_same_ids_and_numbers(noisy):
@@ -246,36 +233,6 @@ def test_a_plane_that_leaves_is_removed_and_its_id_does_not_come_back():
     surfel_map.insert(moments)
     (third,) = models.update().created
     assert len({first, second, third}) == 3
-
-
-def test_a_surface_that_leaves_is_removed_and_a_far_one_stays():
-    x, y = np.meshgrid(np.arange(-0.6, 0.6, 0.02), np.arange(-0.6, 0.6, 0.02))
-    bowl = np.stack([x, y, 0.4 * (x**2 + y**2)], -1).reshape(-1, 3)
-    surfel_map = SurfelMap(VOXEL_M)
-    surfel_map.add(bowl, origin=(0, 0, 5))
-    moments = surfel_map.add(bowl + np.array((9.0, 0.0, 0.0)), origin=(9, 0, 5))
-    models = live(surfel_map)
-    stays, leaves = (surface.id for surface in models.model.surfaces)
-    surfel_map.remove(moments)
-    update = models.update()
-    assert (update.created, update.updated, update.removed) == ((), (), (leaves,))
-    assert [surface.id for surface in models.model.surfaces] == [stays]
-
-
-def test_a_patch_keeps_no_arrays_of_patches_fitted_with_it():
-    x, y = np.meshgrid(np.arange(0.0, 1.2, 0.02), np.arange(0.0, 1.2, 0.02))
-    bowl = np.stack([x, y, 0.4 * ((x - 0.6) ** 2 + (y - 0.6) ** 2) + 2.0], -1).reshape(-1, 3)
-    _, models = of_points(
-        np.concatenate([cells((0, 6), (0, 6)), bowl, bowl + np.array((3.0, 0.0, 0.0))])
-    )
-    assert len(models.model.surfaces) == 2
-    kept = [rows for charts in models._charts.values() for rows in charts]
-    for tracked in models._patches.values():
-        grid = tracked.patch.grid
-        kept += [tracked.rows, grid.filled, grid.rim, grid.corner, grid.cuts]
-        if tracked.fitted is not None:
-            kept += [tracked.fitted.heights, tracked.fitted.field.control]
-    assert all(array.base is None for array in kept)
 
 
 @pytest.mark.parametrize('at_once', [True, False])
@@ -399,28 +356,6 @@ def test_a_ramp_over_itself_is_cut(radius_m, middle_m):
         for place in np.unique(column, axis=0)[::10]:
             heights = local[(column == place).all(axis=1), 2]
             assert heights.max() - heights.min() < 0.9  # the next turn is 1.57 m higher
-
-
-def test_patches_have_fewer_names_than_voxels(monkeypatch):
-    """Also if most patches are single voxels, and one across blocks is cut into its charts."""
-    found, update = [], SurfelJoining.update
-
-    def joined(*arguments):
-        found.append(update(*arguments))
-        return found[-1]
-
-    monkeypatch.setattr(SurfelJoining, 'update', joined)
-    x, y = np.meshgrid(np.arange(200), np.arange(100), indexing='ij')
-    middle = np.stack([x + 0.1, y + 100.1, np.full(x.shape, 20.1)], -1).reshape(-1, 1, 3)
-    alone = (middle + cells((-0.08, 0.08), (-0.08, 0.08), spacing=0.05)).reshape(-1, 3)
-    ramp = spiral(12.0, ACROSS_BLOCKS_M)
-    settings = ModelsLayerConfig(min_points=4, noise_m=0.005, min_voxels=1)
-    surfel_map, models = of_points(
-        np.concatenate([alone, ramp]), (ACROSS_BLOCKS_M, 0, 30), settings, 0.2
-    )
-    (names,) = found
-    assert len(models.model.patches) > x.size
-    assert len(models.model.patches) <= names.max() + 1 <= surfel_map.num_voxels
 
 
 @pytest.mark.parametrize('axis', range(3))

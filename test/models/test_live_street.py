@@ -9,7 +9,7 @@ from collections import deque
 import numpy as np
 import pytest
 
-from surfel_mapper.config import MapConfig, ModelsLayerConfig
+from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models.live import LiveModels
 from surfel_mapper.simulation import Lidar, Simulation, World
@@ -46,14 +46,6 @@ def pieces(models, chosen):
     owner = models.model.labels[chosen]
     ids = [patch.id for patch in models.model.patches]
     return np.sort(np.unique(owner[np.isin(owner, ids)], return_counts=True)[1])[::-1]
-
-
-def test_ground_surfels_are_in_few_pieces(street):
-    models, label = street
-    published = (label == 'ground') & (models.surfels.num_points >= MapConfig().min_points)
-    found = pieces(models, published)
-    assert len(found) <= 6
-    assert found.sum() > 0.95 * published.sum()
 
 
 def test_the_ground_is_in_few_pieces(street):

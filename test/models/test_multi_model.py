@@ -10,7 +10,6 @@ from scipy.spatial.distance import cdist
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
-from surfel_mapper.models.evaluation import p95, rms
 from surfel_mapper.models.multi_model import Gaussians, MultiModel
 from test.models.live_scenes import of_points
 from test.models.scenes import A, room, VIEW
@@ -103,13 +102,3 @@ def test_precision_is_that_of_a_sample_for_each_point():
     assert precision == pytest.approx(np.mean(distance**2) ** 0.5, rel=0.01)
     far = np.mean([figure.precision_p95_m for figure in figures])
     assert far == pytest.approx(np.percentile(distance, 95.0), rel=0.02)
-
-
-def test_weights_are_repetitions():
-    rng = np.random.default_rng(6)
-    values, weight = rng.uniform(0.0, 1.0, 200), rng.integers(1, 9, 200)
-    every = np.repeat(values, weight)
-    assert rms(values, weight) == pytest.approx(rms(every), rel=1e-12)
-    assert p95(values, weight) == np.percentile(every, 95.0, method='inverted_cdf')
-    assert p95(values, np.full(200, 2.0)) == p95(values)
-    assert np.isnan([rms(values[:0], weight[:0]), p95(values[:0], weight[:0])]).all()

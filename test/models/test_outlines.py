@@ -5,18 +5,12 @@
 from __future__ import annotations
 
 import math
-import tracemalloc
 
 import numpy as np
 import pytest
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
-from surfel_mapper.models.kernels.outlines import (
-    mark_sides,
-    simplify_loop,
-    trace_loops,
-)
 from surfel_mapper.models.outlines import (
     areas,
     bridged,
@@ -28,7 +22,6 @@ from surfel_mapper.models.outlines import (
     triangles,
     triangulated,
 )
-from test.kernels.modes import both
 from test.models.scenes import A, room, sheet, VIEW
 
 
@@ -101,32 +94,6 @@ def slow_simplified(ring):
     return chosen if len(chosen) >= 3 else ring
 
 
-def test_square_is_one_counter_clockwise_ring():
-    (ring,) = rings(np.ones((1, 1), bool))
-    assert area(ring) == 1.0
-    assert {tuple(corner) for corner in ring} == {(0, 0), (1, 0), (1, 1), (0, 1)}
-
-
-def test_hole_is_a_clockwise_ring():
-    mask = np.ones((5, 4), bool)
-    mask[2, 1:3] = False
-    assert sorted(area(ring) for ring in rings(mask)) == [-2.0, 20.0]
-
-
-@pytest.mark.parametrize('flip', [False, True])
-def test_squares_that_touch_at_a_corner_are_two_rings(flip):
-    mask = np.eye(2, dtype=bool)
-    assert [area(ring) for ring in rings(np.array(mask[::-1] if flip else mask))] == [1.0, 1.0]
-
-
-def test_rings_of_random_masks_enclose_the_covered_area():
-    rng = np.random.default_rng(9)
-    for _ in range(50):
-        mask = rng.random((7, 9)) < 0.6
-        assert sum(area(ring) for ring in rings(mask)) == mask.sum()
-    assert rings(np.zeros((3, 3), bool)) == []
-
-
 @pytest.mark.parametrize('seed', range(40))
 def test_rings_and_simplification_equal_the_slow_twins(seed):
     rng = np.random.default_rng(seed)
@@ -140,34 +107,6 @@ def test_rings_and_simplification_equal_the_slow_twins(seed):
 
 def assert_same(found, expected):
     assert [part.tolist() for part in found] == [part.tolist() for part in expected]
-
-
-@both
-def test_kernels_trace_an_eight_and_drop_collinear_corners(call):
-    mask = np.array([[1, 1, 0], [0, 0, 1]], bool)
-    ways = np.zeros((3, 4), np.uint8)
-    assert call(mark_sides, mask, ways) == 10
-    corners, ends = np.empty((10, 2)), np.empty(10, np.int64)
-    assert call(trace_loops, mask, ways, corners, ends) == 2
-    assert ends[:2].tolist() == [6, 10]
-    assert not ways.any()
-    kept = np.zeros(6, bool)
-    call(simplify_loop, corners[:6], 0.75, kept)
-    assert corners[:6][kept].tolist() == [[0, 0], [1, 0], [1, 2], [0, 2]]
-
-
-def test_simplification_keeps_corners_and_drops_side_points():
-    side = np.arange(10.0)
-    square = np.concatenate(
-        [
-            np.stack([side, 0 * side], 1),
-            np.stack([0 * side + 10, side], 1),
-            np.stack([10 - side, 0 * side + 10], 1),
-            np.stack([0 * side, 10 - side], 1),
-        ]
-    )
-    assert area(simplified(square)) == 100.0
-    assert len(simplified(square)) == 4
 
 
 def test_outlines_and_triangles_of_a_plane_with_a_hole_have_its_area_and_direction():
@@ -264,19 +203,6 @@ def test_points_lie_in_one_triangle_if_inside_and_in_none_outside(seed):
     assert set(found) == {0, 1}
 
 
-def test_triangles_of_random_masks_have_the_covered_area():
-    rng = np.random.default_rng(4)
-    for _ in range(30):
-        mask = rng.random((8, 6)) < 0.6
-        assert areas(triangulated(rings(mask))).sum() == pytest.approx(mask.sum(), rel=1e-12)
-
-
-def test_triangulation_of_a_concave_ring_and_a_second_one():
-    arrow = np.array([[0.0, 0], [4, 0], [4, 4], [2, 1], [0, 3]])
-    found = triangulated([arrow, HOLE[::-1] + 9.0])
-    assert sorted(areas(found)) == [2.0, 2.0, 2.0, 2.0, 2.0, 3.0]
-
-
 def test_rectangle_is_two_triangles_beside_other_rings():
     ladder = [np.array([[9.0, y], [10, y], [10, y + 0.3], [9, y + 0.3]]) for y in (0.1, 1.2, 2.5)]
     assert len(triangulated([SQUARE])) == 2
@@ -296,25 +222,3 @@ def test_bridged_ring_encloses_the_same_area_and_points():
     assert len(whole) == 30 + 9 + 5 + 4  # there and back: two corners more for each ring bridged
     points = np.random.default_rng(3).uniform(-4.0, 4.0, (3000, 2))
     assert np.array_equal(crossings(points, [whole]) % 2, crossings(points, around) % 2)
-
-
-def test_bridges_of_many_rings_are_short():
-    holes = [0.1 * HOLE + 2.0 * place for place in np.argwhere(np.ones((20, 20)))]
-    around = [np.array([[-1.0, -1], [41, -1], [41, 41], [-1, 41]]), *holes]
-    whole = bridged(around)
-    assert len(whole) == 4 + 400 * 4 + 400 * 2
-    assert area(whole) == pytest.approx(42.0**2 - 400 * 0.2**2, rel=1e-9)
-    side = np.linalg.norm(whole - np.roll(whole, 1, axis=0), axis=1)
-    bridges_m = 0.5 * (side.sum() - 4 * 42.0 - 400 * 4 * 0.2)
-    assert bridges_m < 2.0 * 400 * 1.8  # the nearest hole is 1.8 away
-
-
-def test_memory_of_bridges_follows_the_corners_and_not_their_pairs():
-    around = [polygon(4000, 9.0), polygon(3000, 8.0)[::-1]]
-    bridged(around[:1])
-    tracemalloc.start()
-    whole = bridged(around)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert len(whole) == 7002
-    assert peak < 500 * len(whole)  # a table of all pairs: 192 MB

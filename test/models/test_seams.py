@@ -134,36 +134,6 @@ def test_coverage_is_that_of_own_points():
         assert (local.min(axis=0) - surface.grid.origin < surface.grid.pitch_m).all()
 
 
-def sheet(normal, start, num=2000):
-    """Return points of a half plane that starts at x = 0 or 0.01, and their normals."""
-    rng = np.random.default_rng(2)
-    x_axis = np.cross([0.0, 1.0, 0.0], normal)
-    along = rng.uniform(0.0, 0.5, (num, 1)) * x_axis + start
-    return along + rng.uniform(0.0, 0.5, (num, 1)) * [0.0, 1.0, 0.0], np.tile(normal, (num, 1))
-
-
-@pytest.mark.parametrize(
-    ('tilt_deg', 'start', 'expected'),
-    [
-        (180.0, [0.0, 0.0, 0.0], True),  # flat: on to negative x
-        (160.0, [0.0, 0.0, 0.0], True),
-        (120.0, [0.0, 0.0, 0.0], False),  # a crease
-        (0.0, [0.0, 0.0, -0.06], False),  # the other side of a thin wall
-    ],
-)
-def test_points_beyond_a_smooth_seam_continue_a_surface(tilt_deg, start, expected):
-    tilt = np.radians(tilt_deg)
-    own, normal = sheet(np.array([0.0, 0.0, 1.0]), np.zeros(3))
-    other, others = sheet(np.array([np.sin(tilt), 0.0, np.cos(tilt)]), np.array(start))
-    points, normals = np.concatenate([own, other]), np.concatenate([normal, others])
-    owner, axes = np.repeat([0, 1], len(own)), np.array([normal[0], others[0]])
-    found = points[continuations(points, normals, owner, axes, 0.03)[0]]
-    assert bool(len(found)) == expected
-    if expected:
-        assert cKDTree(own).query(found)[0].max() < 0.09
-        assert len(found) > 0.5 * (np.abs(other[:, 0]) < 0.08).sum()
-
-
 def test_continuations_equal_those_of_every_pair():
     rng = np.random.default_rng(3)
     points = rng.uniform(0.0, 1.0, (400, 3)) * [1.0, 1.0, 0.1]

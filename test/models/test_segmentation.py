@@ -13,8 +13,6 @@ from scipy.spatial.distance import cdist
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
-from surfel_mapper.models.frames import means_and_scatters
-from surfel_mapper.models.kernels.frames import eigen_frame, orient
 from surfel_mapper.models.kernels.region_merging import gap, same_surface
 from surfel_mapper.models.segmentation import merge_clusters, segment_cloud
 from surfel_mapper.models.thinning import thin
@@ -127,21 +125,6 @@ def test_noisy_room_is_mostly_flat_if_the_noise_is_known():
     assert flat_share(clustered(points, VIEW, noise_per_range_sq=1.425e-3)[0]) >= 0.8
 
 
-def test_frames_are_right_handed_ascending_and_face_the_viewpoint():
-    rng = np.random.default_rng(6)
-    for _ in range(50):
-        points = rng.standard_normal((30, 3)) * rng.uniform(0.01, 3.0, 3) + 100.0
-        _, (mean,), (scatter,) = means_and_scatters(points, np.ones(30), np.array([0, 30]))
-        values, frame = np.empty(3), np.empty((3, 3))
-        expected = np.linalg.eigvalsh(np.cov(points.T) * 29)
-        eigen_frame(scatter, values, frame)
-        orient(frame, mean, np.zeros(3))
-        np.testing.assert_allclose(values, expected, rtol=1e-9)
-        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(frame) > 0.0
-        assert frame[2] @ -mean >= 0.0
-
-
 def pairs(clusters):
     return itertools.combinations(np.flatnonzero(clusters.flat), 2)
 
@@ -235,16 +218,3 @@ def test_voxel_means_equal_numpy_sums_in_point_order(reach, dtype):
     labels = thinned.point_labels(np.arange(len(voxels), dtype=np.int32))
     np.testing.assert_array_equal(labels[finite], which)
     assert (labels[~finite] == -1).all()
-
-
-def test_strided_points_are_thinned_like_a_copy():
-    points = cloud(1.0, np.float32)
-    strided, copied = thin(points[::2], SIZE), thin(points[::2].copy(), SIZE)
-    np.testing.assert_array_equal(strided.means, copied.means)
-
-
-@pytest.mark.parametrize('points', [np.empty((0, 3)), np.full((4, 3), np.nan)])
-def test_thinning_no_points_gives_no_means(points):
-    thinned = thin(points, SIZE)
-    assert thinned.means.shape == (0, 3)
-    assert (thinned.point_labels(np.empty(0, np.int32)) == [-1] * len(points)).all()

@@ -11,10 +11,8 @@ from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
 from surfel_mapper.models.multi_model import Gaussians
 from surfel_mapper.models.shapes import (
-    CORNERS,
     ellipsoid_corners,
     ellipsoid_frames,
-    FACES,
     shape_of,
     Shapes,
     SIGMAS,
@@ -59,15 +57,6 @@ def test_no_triangle_of_a_plane_is_in_its_hole_or_beyond_its_rim(frame):
     assert np.abs(middles[:, :2]).max(axis=1).min() > 0.5 - 2 * A
     assert np.abs(corners[:, :2]).max() < 1.0 + 2 * A
     assert np.abs(corners[:, 2]).max() < 1e-3 + A / 10
-
-
-def test_mask_equals_coverage_of_square_centres(frame):
-    grid = frame[0].grid
-    mask = grid.mask(3)
-    assert mask.shape == (3 * grid.filled.shape[0], 3 * grid.filled.shape[1])
-    for (x, y), covered in np.ndenumerate(mask):
-        middle = grid.origin + (np.array([[x, y]]) + 0.5) * grid.pitch_m / 3
-        assert grid.contains(middle)[0] == covered
 
 
 def test_box_of_a_plane_encloses_it(frame):
@@ -131,16 +120,6 @@ def test_shapes_can_be_computed_in_portions():
     found = shapes.of(model, versions)
     assert [shape.patch.id for shape in found] == [patch.id for patch in model.patches]
     assert all(a is b for a, b in zip(found, shapes.of(model, versions), strict=True))
-
-
-def test_the_icosahedron_has_twenty_equal_faces_that_face_out():
-    corners = CORNERS[FACES]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert FACES.shape == (20, 3)
-    assert len({frozenset(face) for face in FACES.tolist()}) == 20
-    assert np.allclose(np.linalg.norm(CORNERS, axis=1), 1.0)
-    assert np.allclose(np.linalg.norm(cross, axis=1), np.linalg.norm(cross[0]))
-    assert (np.einsum('ij,ij->i', cross, corners.mean(axis=1)) > 0).all()
 
 
 def gaussians(*covariances):

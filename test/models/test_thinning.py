@@ -5,9 +5,7 @@
 import numpy as np
 import pytest
 
-from surfel_mapper.models.kernels.voxel_means import average_voxels, finite_ends, voxel_keys
 from surfel_mapper.models.thinning import thin
-from test.kernels.modes import both
 
 EDGE_M = 0.5
 
@@ -56,22 +54,3 @@ def test_means_and_rows_are_those_of_a_dictionary(number, dtype, spread_m):
 def test_no_finite_point_gives_no_voxel(points):
     thinned = thin(points, EDGE_M)
     assert (len(thinned.means), len(thinned.rows), thinned.starts.tolist()) == (0, 0, [0])
-
-
-@both
-def test_kernels_agree_with_numpy_on_two_voxels(call):
-    points = np.array([[0.9, 0.1, 0.1], [np.inf, 0.0, 0.0], [0.1, 0.1, 0.1], [0.7, 0.3, 0.1]])
-    ends = np.empty((2, 3))
-    assert call(finite_ends, points, ends) == 3
-    assert ends.tolist() == [[0.1, 0.1, 0.1], [0.9, 0.3, 0.1]]
-    keys, rows = np.empty(3, np.int64), np.empty(3, np.int64)
-    axes = np.stack([np.full(3, EDGE_M), np.zeros(3), np.zeros(3)])
-    call(voxel_keys, points, (axes, np.array([1, 0, 0])), keys, rows)
-    assert (keys.tolist(), rows.tolist()) == ([1, 0, 1], [0, 2, 3])
-
-    ordered = np.sort(keys << 3 | rows)
-    outputs = np.empty(3, np.int32), np.empty(4, np.int64), keys, np.empty((3, 3))
-    assert call(average_voxels, points, ordered, 3, *outputs) == 2
-    assert outputs[0].tolist() == [2, 0, 3]
-    assert outputs[1][:3].tolist() == [0, 1, 3]
-    np.testing.assert_allclose(outputs[3][:2], [[0.1, 0.1, 0.1], [0.8, 0.2, 0.1]])

@@ -48,16 +48,6 @@ def test_fan_of_normals_is_bisected_in_its_middle(call):
 
 
 @both
-def test_two_bundles_of_normals_are_bisected_at_the_gap(call):
-    normals = np.concatenate([fan(-90.0, -70.0, 9), fan(50.0, 90.0, 15)])
-    side = bisected(call, normals, np.array([0.0, 0.0, 1.0]))
-    assert side is not None
-    assert len(set(side[:9])) == 1
-    assert len(set(side[9:])) == 1
-    assert side[0] != side[9]
-
-
-@both
 @pytest.mark.parametrize(
     'normals', [fan(-50.0, 50.0, 30), fan(80.0, 80.0, 1), np.repeat(fan(80.0, 80.0, 1), 5, 0)]
 )
@@ -82,17 +72,6 @@ def test_chart_is_bisected_if_folded_or_overlapping():
     side = halved(bent, np.concatenate([level, np.add(level, [6.0, 0.0, 0.0])]))
     assert len(set(side[:24])) == len(set(side[24:])) == 1
     assert side[0] != side[-1]
-
-
-def test_normals_equal_up_to_sign_are_no_fold():
-    normals = np.tile([0.0, 0.0, 1.0], (24, 1))
-    normals[::3] *= -1.0
-    level = np.stack([*np.mgrid[0:6, 0:4].reshape(2, -1) + 0.5, np.zeros(24)], axis=1)
-    assert halved(normals, level) is None
-    assert halved(normals, level + np.arange(24.0)[:, None] * [0.0, 0.0, 1.0]) is None
-    stacked = np.concatenate([level, np.add(level, [0.0, 0.0, 5.0])])
-    side = halved(np.tile(normals, (2, 1)), stacked)
-    assert set(np.flatnonzero(side)) in ({*range(24)}, {*range(24, 48)})
 
 
 @both

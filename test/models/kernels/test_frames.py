@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.models.frames import means_and_scatters
-from surfel_mapper.models.kernels.frames import eigen_frame, group_moments, NOISE
+from surfel_mapper.models.kernels.frames import eigen_frame, group_moments
 from test.kernels.modes import both
 
 
@@ -33,22 +33,6 @@ def test_a_frame_holds_all_eigenvectors_of_one_matrix(call, axes, scale):
         np.testing.assert_allclose(vectors @ vectors.T, np.eye(3), atol=1e-12)
         np.testing.assert_allclose((vectors.T * values) @ vectors, matrix, atol=1e-12 * values[2])
         assert (vectors[range(3), np.abs(vectors).argmax(axis=1)] > 0).all()
-
-
-@both
-def test_the_frame_of_the_zero_matrix_is_the_identity(call):
-    values, vectors = np.empty(3), np.empty((3, 3))
-    call(eigen_frame, np.zeros((3, 3)), values, vectors)
-    assert not values.any()
-    np.testing.assert_array_equal(vectors, np.eye(3))
-
-
-@both
-def test_a_diagonal_matrix_has_the_axes_as_frame_and_no_noise(call):
-    values, vectors = np.empty(3), np.empty((3, 3))
-    call(eigen_frame, np.diag([2.0, 0.1 * NOISE, 1.0]), values, vectors)
-    assert values.tolist() == [0.0, 1.0, 2.0]
-    np.testing.assert_array_equal(vectors, np.eye(3)[[1, 2, 0]])
 
 
 @both

@@ -12,11 +12,9 @@ import pytest
 from surfel_mapper.models.cloud_noise import (
     block_noise,
     estimate_noise,
-    line_above_zero,
     neighbourhoods,
 )
 from surfel_mapper.models.growth import free_surfels
-from surfel_mapper.models.kernels import growth
 from surfel_mapper.models.kernels.growth import (
     assign_points,
     find_facets,
@@ -28,7 +26,7 @@ from surfel_mapper.models.kernels.voxel_points import (
     owner_means,
 )
 from surfel_mapper.models.thinning import thin
-from test.kernels.modes import both, interpreted
+from test.kernels.modes import both
 
 SIZE = 0.1
 
@@ -69,19 +67,6 @@ def test_neighbours_equal_brute_force(extent):
     for i in range(len(index)):
         near = np.abs(index - index[i]).max(axis=1) == 1
         assert sorted(rows[first[i] : first[i + 1]].tolist()) == np.flatnonzero(near).tolist()
-
-
-@pytest.mark.parametrize('reach', [1.0, 1e4])  # with 1e4 m keys are ranks
-def test_points_by_voxel_are_all_finite_points(reach):
-    points = np.random.default_rng(3).uniform(-reach, reach, (400, 3)).astype(np.float32)
-    points[::7] = np.nan
-    thinned, voxels = by_voxel(points, 0.02)
-    finite = np.isfinite(points).all(axis=1)
-    assert sorted(voxels.rows.tolist()) == np.flatnonzero(finite).tolist()
-    np.testing.assert_array_equal(voxels.points, points[voxels.rows])
-    which = np.repeat(np.arange(len(thinned.means)), np.diff(voxels.starts))
-    means = [voxels.points[which == k].astype(float).mean(axis=0) for k in range(5)]
-    np.testing.assert_allclose(thinned.means[:5], means, rtol=1e-12)
 
 
 @both
@@ -151,20 +136,6 @@ def test_noise_grows_with_the_square_of_the_range():
         assert n0 + n2 * far**2 == pytest.approx(1.5e-3 * far**2, rel=0.4)
 
 
-def test_line_above_zero_is_clamped():
-    x = np.array([1.0, 2.0, 3.0])
-    assert line_above_zero(x, 2.0 + 3.0 * x) == pytest.approx((2.0, 3.0))
-    assert line_above_zero(x, 3.0 - 0.5 * x)[1] == 0.0
-    assert line_above_zero(x, 2.0 * x - 0.5)[0] == 0.0
-
-
-@pytest.mark.parametrize('number', [1, 4])
-def test_noise_at_one_range_is_constant(number):
-    for unit in (1.0, 1e3):  # of length: x is its square
-        x, y = np.full(number, 9.0 * unit**2), np.full(number, 0.02 * unit)
-        assert line_above_zero(x, y) == pytest.approx((0.02 * unit, 0.0))
-
-
 @both
 def test_points_of_a_corner_go_to_the_face_that_they_lie_on(call):
     points, face = corner()
@@ -218,24 +189,3 @@ def test_facets_of_a_corner_are_its_faces(call):
         assert (own == side).mean() > 0.95
         assert abs(planes[k, side]) > 0.999
     assert (owner >= 0).mean() > 0.97
-
-
-@pytest.mark.parametrize(('width_m', 'least_points'), [(0.06, 30), (0.09, 100_000)])
-def test_a_long_region_that_is_no_facet_is_grown_once(monkeypatch, width_m, least_points):
-    along, across = np.meshgrid(np.arange(0.005, 15.0, 0.01), np.linspace(0.0, width_m, 4))
-    points = np.stack([along, across + 0.005, np.full_like(along, 0.05)], -1).reshape(-1, 3)
-    _, voxels = by_voxel(points)
-    number, owner = len(voxels.starts) - 1, np.full(len(points), -1, np.int32)
-    assert number == 150
-    free = free_surfels(voxels, owner, SIZE, 0.02)
-    assert free[1].all()
-    calls, grow_facet = [], growth.grow_facet
-    monkeypatch.setattr(
-        growth, 'grow_facet', lambda *args: calls.append(grow_facet(*args)) or calls[-1]
-    )
-    state = voxels.points, voxels.starts, voxels.adjacent
-    rules = (0.005, 3, least_points, 0.9, 0.08)
-    order = np.arange(number)
-    assert interpreted(find_facets, *state, free, order, rules, owner, np.empty((10, 4)), 0) == 0
-    assert calls == [number]
-    assert (owner == -1).all()

@@ -9,11 +9,9 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.models.frames import plane_frames
-from surfel_mapper.models.growth import owner_table, renamed, sorted_table
+from surfel_mapper.models.growth import owner_table, sorted_table
 from surfel_mapper.models.kernels.joining import (
     height_errors,
-    sort_owners,
     touching_patches,
 )
 from surfel_mapper.models.thinning import thin
@@ -29,25 +27,6 @@ def scattered(number=400):
     voxels = thin(points, SIZE).by_voxel()
     owner = rng.integers(-2, 4, number).astype(np.int32)
     return voxels, owner, owner_table(voxels, owner)
-
-
-@both
-def test_means_are_sorted_by_owner(call):
-    _, _, (owners, means, counts, first) = scattered()
-    number = int((owners >= -1).sum())
-    out = (
-        np.empty(6, np.int64),
-        np.empty(number, np.int32),
-        np.empty((number, 3)),
-        np.empty(number),
-    )
-    call(sort_owners, first, owners, means, counts, -1, out)
-    order = np.argsort(owners, kind='stable')[-number:]
-    voxel = np.repeat(np.arange(len(first) - 1), np.diff(first))
-    np.testing.assert_array_equal(out[0], np.searchsorted(owners[order], np.arange(-1, 5)))
-    np.testing.assert_array_equal(out[1], voxel[order])
-    np.testing.assert_array_equal(out[2], means[order])
-    np.testing.assert_array_equal(out[3], counts[order])
 
 
 @both
@@ -72,27 +51,6 @@ def test_touching_patches_equal_brute_force(call):
     ) == (
         num  # pairs that do not fit are counted
     )
-
-
-def test_free_owners_become_their_groups():
-    voxels, owner, _ = scattered()
-    group = np.arange(len(voxels.starts) - 1, dtype=np.int32)
-    index = np.array([2, 0, 1, 0], np.int32)
-    voxel = np.repeat(group, np.diff(voxels.starts))
-    expected = np.where(owner >= 0, index[owner], -1 - voxel)
-    np.testing.assert_array_equal(renamed(voxels.starts, group, index, owner), expected)
-
-
-def test_frames_equal_numpy():
-    rng = np.random.default_rng(2)
-    points, weights = rng.normal(size=(40, 3)) * [3.0, 2.0, 0.1], rng.uniform(1.0, 3.0, 40)
-    means, normals, values = plane_frames(points, weights, np.array([0, 40, 40]))
-    covariance = np.cov(points.T, aweights=weights, bias=True)
-    np.testing.assert_allclose(means[0], np.average(points, axis=0, weights=weights))
-    np.testing.assert_allclose(values[0], np.linalg.eigvalsh(covariance))
-    assert abs(normals[0] @ np.linalg.eigh(covariance)[1][:, 0]) == pytest.approx(1.0)
-    assert not means[1].any()  # a patch without points
-    assert not normals[1].any()
 
 
 @both

@@ -96,27 +96,6 @@ def test_layers_of_a_noisy_wall_join_the_largest(call):
 
 
 @both
-def test_joined_regions_are_chains_of_their_patches(call):
-    given = pieces(*scene(0.005))
-    regions = single_regions(given, VIEW, (0.005, 0.0), SIZE_M)
-    members = {k: [k] for k in range(len(SURFACES))}
-    for small, large in ((1, 0), (3, 2), (2, 0), (5, 4)):
-        normals = regions.normal.copy()
-        call(join_pair, small, large, regions)
-        members[large] += members.pop(small)
-        np.testing.assert_allclose(regions.normal[large], normals[small] + normals[large])
-    for region, patches in members.items():
-        chain = [region]
-        while regions.after[chain[-1]] >= 0:
-            chain.append(int(regions.after[chain[-1]]))
-        assert chain == patches
-        assert regions.last[region] == patches[-1]
-        assert regions.patches[region] == len(patches)
-        assert regions.rows[region] == np.diff(given.starts)[patches].sum()
-        assert (regions.root[patches] == region).all()
-
-
-@both
 def test_rows_near_a_small_region_are_all_within_reach(call):
     given = pieces(*scene(0.005))
     regions = single_regions(given, VIEW, (0.005, 0.0), SIZE_M)
@@ -175,20 +154,3 @@ def test_joins_that_are_much_worse_planes_than_their_patches_are_undone():
     assert index.tolist() == [0, 1, 2, 3, 4, 5, 6, 6]
     np.testing.assert_allclose(normals[:6], single.patch_normal[:6], atol=1e-12)
     assert not is_worse.any()
-
-
-def test_pairs_of_a_large_region_are_compared_a_few_times_each(monkeypatch):
-    rng, side = np.random.default_rng(8), 20
-    x, y = rng.uniform(0.0, 0.25 * side, (2, 60 * side * side))
-    owner = (np.floor(x / 0.25) * side + np.floor(y / 0.25)).astype(np.int32)  # tiles of a floor
-    given = pieces(np.column_stack([x, y, 3e-3 * rng.standard_normal(len(x))]), owner)
-    regions = single_regions(given, VIEW, (3e-3, 0.0), SIZE_M)
-    edges, adjacent = touching_regions(given.touching(), regions.root)
-    calls, push = [], region_joining.push.py_func
-    monkeypatch.setattr(region_joining, 'push', lambda *args: calls.append(1) or push(*args))
-    state, floor = (given.means, given.weights, given.starts), (0.02 * SIZE_M) ** 2
-    state = *state, chunk_boxes(given.means)
-    interpreted(join_smooth, edges, adjacent, *state, floor, regions)
-    assert (regions.root == regions.root[0]).all()
-    assert regions.patches[regions.root[0]] == side * side
-    assert len(calls) < 10 * len(edges)  # 19 with all neighbours after every join
