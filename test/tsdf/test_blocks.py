@@ -11,8 +11,7 @@ import pytest
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.tsdf.blocks import block_index, block_keys, BlockMap
-from surfel_mapper.tsdf.kernels.blocks import VERSION
+from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.sensors import LidarModel
 from test.tsdf.scenes import image_of, integrator
 
@@ -27,12 +26,6 @@ def indices(count, seed=1, size=40):
     rng = np.random.default_rng(seed)
     numbers = rng.permutation(size**3)[:count]
     return np.stack(np.unravel_index(numbers, (size, size, size)), axis=1) - size // 2
-
-
-def test_keys_and_indices_are_inverse_up_to_the_limit():
-    index = np.array([[0, 0, 0], [-1, 1, -1], [-(1 << 20), (1 << 20) - 1, 7]])
-    assert np.array_equal(block_index(block_keys(index)), index)
-    assert (block_keys(np.array([[1 << 20, 0, 0], [0, 0, -(1 << 20) - 1]])) == -1).all()
 
 
 def test_blocks_are_found_after_any_growth_and_removal():
@@ -119,26 +112,6 @@ def test_index_beyond_20_bits_is_refused():
     with pytest.raises(MapLimitError, match='local frame'):
         blocks.place([[0, 0, 0], [0, 1 << 20, 0]])
     assert blocks.num_blocks == 0
-
-
-def test_neighbours_are_found_by_their_offsets():
-    blocks = every_channel()
-    corner = np.array([[-1, -1, -1]])
-    cube = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]) - 1
-    rows = blocks.place(cube[:-1])
-    found = blocks.neighbours(blocks.find(corner))
-    assert np.array_equal(found[0, :-1], rows)
-    assert found[0, -1] == -1
-    assert np.array_equal(blocks.neighbours(rows[:1], [[0, 0, 0], [0, 0, 5]]), [[rows[0], -1]])
-
-
-def test_rows_not_in_use_are_never_changed():
-    blocks = every_channel()
-    rows = blocks.place(indices(20))
-    blocks.touch(rows, 1)
-    blocks.remove(rows[:5])
-    assert np.array_equal(blocks.changed_since(0), np.sort(rows[5:]))
-    assert (blocks.head[rows[5:], VERSION] == 1).all()
 
 
 SENSOR = LidarModel(rows=8, columns=90, vertical_fov_deg=40.0, max_range_m=3.0)

@@ -69,22 +69,6 @@ def test_distances_after_changes_equal_the_transform_of_the_whole(rng, share):
     assert field.update() == 0
 
 
-def test_a_wall_that_goes_leaves_the_distances_to_the_rest(rng):
-    distance = scenery(rng, share=0.0)
-    blocks = blocks_of(distance, FIRST)
-    field = EuclideanField(blocks, max_m=MAX_M)
-    field.update()
-    distance[20, :, 4:] = 0.2
-    distance[5:12, 5:12, 8:15] = -0.2
-    write(blocks, distance, FIRST)
-    field.update()
-    np.testing.assert_allclose(sampled(field), expected(distance), atol=1e-6)
-    distance[5:12, 5:12, 8:15] = 0.2
-    write(blocks, distance, FIRST)
-    field.update()
-    np.testing.assert_allclose(sampled(field), expected(distance), atol=1e-6)
-
-
 def test_blocks_that_leave_and_come_are_followed(rng):
     distance = scenery(rng, share=0.02)
     blocks = blocks_of(distance, FIRST)
@@ -144,21 +128,6 @@ def test_places_outside_of_the_map_are_unknown():
 def test_reaches_below_a_voxel_or_beyond_127_are_refused(max_m):
     with pytest.raises(ConfigError, match=r'esdf.max_m: .*1 to 127 voxels'):
         EuclideanField(BlockMap(TsdfConfig()), max_m=max_m)
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_distances_do_not_depend_on_the_order_in_which_blocks_came(seed, rng):
-    distance, weight = scenery(rng), np.zeros(SHAPE)
-    blocks = BlockMap(TsdfConfig(voxel_size_m=VOXEL_M, voxels_per_side=SIDE))
-    places = list(np.ndindex(*np.array(SHAPE) // SIDE))
-    some = np.random.default_rng(seed).permutation(len(places))[: len(places) // 3]
-    for place in (places[number] for number in some):
-        part = tuple(slice(SIDE * p, SIDE * (p + 1)) for p in place)
-        write(blocks, distance[part], np.add(place, FIRST))
-        weight[part] = 1.0
-    field = EuclideanField(blocks, max_m=MAX_M)
-    field.update()
-    np.testing.assert_allclose(sampled(field), expected(distance, weight), atol=1e-6)
 
 
 def test_a_block_far_below_the_one_before_it_is_looked_up_anew():

@@ -88,12 +88,6 @@ def test_beams_without_rings_are_the_clusters_of_elevations():
     assert np.abs(np.subtract(found.beam_elevations_deg, beams)).max() <= 1e-4
 
 
-def test_part_of_a_revolution_gives_the_columns_of_all():
-    points, ring = points_of(LidarModel(rows=16, columns=1024, vertical_fov_deg=30.0))
-    part = np.arctan2(points[:, 1], points[:, 0]) > 2.0
-    assert fitted_lidar(points[part], ring[part], **RANGES).columns == 1024
-
-
 @pytest.mark.parametrize('share', [-0.4, 0.0, 0.3])
 @pytest.mark.parametrize('rows', [0, 16])
 def test_columns_go_through_the_points(share, rows):
@@ -109,22 +103,6 @@ def test_columns_go_through_the_points(share, rows):
     part = np.arctan2(points[:, 1], points[:, 0]) > 2.0
     found = fitted_lidar(points[part], None if rows else ring[part], rows=rows, **RANGES)
     assert found.first_azimuth_deg == pytest.approx(first, abs=1e-3 * step)
-
-
-def test_two_very_different_steps_give_the_columns_of_the_smaller():
-    azimuth, elevation = np.radians([[0.0, 1.0, 0.0, 3.0], [10.0, 10.0, -10.0, -10.0]])
-    flat = np.cos(elevation)
-    unit = np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], axis=1)
-    assert fitted_lidar(5.0 * unit, **RANGES).columns == 360
-
-
-def test_rings_of_missing_points_do_not_count():
-    points, ring = points_of(LidarModel(rows=16, columns=1024, vertical_fov_deg=30.0))
-    missing = np.full((50_000, 3), np.nan, np.float32)
-    found = fitted_lidar(
-        np.concatenate([points, missing]), np.r_[ring, np.zeros(50_000, int)], **RANGES
-    )
-    assert (found.rows, found.columns) == (16, 1024)
 
 
 def wall_around(lidar, radius_m=8.0):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from surfel_mapper.config import TsdfConfig, WEIGHT_MODES
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import ConfigError, MapLimitError, PoseError
 from surfel_mapper.tsdf.measurements import warn_of_skew
 from surfel_mapper.tsdf.sensors import LidarModel
@@ -26,43 +26,6 @@ def field(one):
     """Return blocks by index: distances and weights."""
     blocks, rows = one.blocks, one.blocks.rows()
     return dict(zip(map(tuple, blocks.index(rows)), blocks.field[rows].copy(), strict=True))
-
-
-@pytest.mark.parametrize('sensor', [SMALL, LIDAR], ids=['camera', 'lidar'])
-@pytest.mark.parametrize('mode', WEIGHT_MODES)
-def test_weights_have_their_closed_form(sensor, mode):
-    blocks = fused(wall(sensor, 3.0), **SIZES, weight_mode=mode)
-    points, D, W = voxels(blocks)
-    depth = points[:, 2] if sensor is SMALL else np.linalg.norm(points, axis=1)
-    density = {
-        SMALL: 65.0 * 65.0,
-        LIDAR: (256 * 90 / 360 / 2) * (32 * 90 / 60 / 2),
-    }[sensor] * 0.01
-    full = {
-        'constant': 1.0,
-        'inverse_square': depth**-2.0,
-        'ray_density': density * depth**-2.0,
-        'ray_density_inv_sq': density * depth**-4.0,
-    }[mode]
-    # 1 down to one voxel behind the surface, from there linearly to 0 at the truncation.
-    expected = full * np.clip((0.3 + D) / (0.3 - 0.1), None, 1.0)
-    assert len(W) > 1000
-    assert {-1, 0, 1} <= set(np.sign(np.round(D / 0.1)))
-    np.testing.assert_allclose(W, np.maximum(expected, 1e-4), rtol=2e-4, atol=2e-6)
-
-
-@pytest.mark.parametrize(
-    ('signed', 'share'), [(0.3, 1.0), (0.0, 1.0), (-0.1, 1.0), (-0.2, 0.5), (-0.3, 0.0)]
-)
-def test_the_weight_drops_off_behind_the_surface(signed, share):
-    # One voxel straight ahead of a camera, its range chosen to be `signed` from the surface.
-    one = integrator(**SIZES, weight_mode='constant', interpolation='nearest')
-    centre = np.array([0.05, 0.05, 2.05])
-    one.integrate(wall(SMALL, np.linalg.norm(centre) + signed + 1e-6), np.eye(4))
-    row = one.blocks.find([0, 0, 2])
-    n = 4 * 64
-    assert one.blocks.distance[row, n] == pytest.approx(signed, abs=1e-5)
-    assert one.blocks.weight[row, n] == pytest.approx(max(share, 1e-4), abs=2e-5)
 
 
 def test_a_scan_again_changes_nothing_but_the_weight_up_to_its_cap(monkeypatch):
@@ -105,35 +68,6 @@ def test_the_order_of_measurements_does_not_matter():
         np.testing.assert_allclose(states[1][block], expected, atol=1e-6, rtol=1e-6)
 
 
-@pytest.mark.parametrize('sensor', [SMALL, LIDAR], ids=['camera', 'lidar'])
-@pytest.mark.parametrize('value', [np.nan, 0.0, -1.0, -np.inf, 0.01])
-def test_unknown_pixels_change_nothing(sensor, value):
-    for allocation in ('band', 'frustum'):
-        one = integrator(**SIZES, allocation=allocation)
-        result = one.integrate(wall(sensor, value), np.eye(4))
-        assert (result.num_blocks, result.num_voxels, one.blocks.num_blocks) == (0, 0, 0)
-
-
-@pytest.mark.parametrize('sensor', [SMALL, LIDAR], ids=['camera', 'lidar'])
-@pytest.mark.parametrize('value', [np.inf, 50.0])
-def test_pixels_beyond_the_range_free_space_up_to_it_and_no_surface(sensor, value):
-    blocks = fused(wall(sensor, value), voxel_size_m=0.2, truncation_m=0.6)
-    points, D, _ = voxels(blocks)
-    d = np.linalg.norm(points, axis=1)
-    assert set(D) == {np.float32(0.6)}
-    assert d.max() <= sensor.max_range_m
-    assert d.max() > sensor.max_range_m - 0.3
-    assert d.min() >= sensor.min_range_m
-
-
-def test_without_carving_only_the_band_is_touched():
-    points, D, _ = voxels(fused(wall(SMALL, 4.0), **SIZES, carve=False))
-    assert np.linalg.norm(points, axis=1).min() > 4.0 - 0.3 - np.sqrt(3.0) * 0.8
-    assert (D < 0).any()
-    carved, _, _ = voxels(fused(wall(SMALL, 4.0), **SIZES))
-    assert np.linalg.norm(carved, axis=1).min() < 0.3
-
-
 def test_new_unobserved_blocks_are_removed_and_earlier_ones_stay():
     one = integrator(**SIZES)
     one.integrate(wall(SMALL, 2.0), np.eye(4))
@@ -159,40 +93,6 @@ def test_without_allocation_only_existing_blocks_change():
     one.integrate(wall(SMALL, 2.0), turned, allocate_blocks=False)
     assert one.integrate(wall(SMALL, 2.0), np.eye(4), allocate_blocks=False).num_updated > 0
     assert set(field(one)) == there
-
-
-@pytest.mark.parametrize('by', ['dynamic_labels', 'invalid_labels', 'mask'])
-def test_masked_pixels_free_space_and_leave_no_surface(by):
-    half = np.arange(80) * np.ones((60, 1)) < 40
-    images = {'mask': half} if by == 'mask' else {'label': np.where(half, 7, 2)}
-    settings = {} if by == 'mask' else {by: [7.0]}
-    one = integrator(**SIZES, **settings)
-    one.integrate(wall(SMALL, 2.0, **images), np.eye(4))
-    points, D, _ = voxels(one.blocks)
-    left = points[:, 0] < -0.05 * points[:, 2]
-    assert (D[left] == np.float32(0.3)).all()
-    assert (abs(D[~left]) < 0.3).any()
-    assert (points[left, 2] > 1.0).any()
-
-    one.integrate(wall(SMALL, 2.0), np.eye(4))
-    points, D, _ = voxels(one.blocks)
-    assert (abs(D[points[:, 0] < -0.05 * points[:, 2]]) < 0.05).any()
-
-
-def test_one_hit_gives_its_colour_and_two_their_mean():
-    first = np.zeros((60, 80, 3), np.uint8) + np.array([10, 100, 250], np.uint8)
-    second = np.zeros((60, 80, 3), np.uint8) + np.array([30, 0, 251], np.uint8)
-    one = integrator(**SIZES, color=True)
-    one.integrate(wall(SMALL, 2.0), np.eye(4))  # without a colour: must not count as black
-    assert not one.blocks.color.any()
-    for image, expected in ((first, [10, 100, 250]), (second, [20, 50, 250.5])):
-        one.integrate(wall(SMALL, 2.0, color=image), np.eye(4))
-        blocks, rows = one.blocks, one.blocks.rows()
-        in_band = (abs(blocks.distance[rows]) < 0.299) & (blocks.weight[rows] > 0)
-        assert in_band.sum() > 300
-        colors = blocks.color[rows].transpose(0, 2, 1)
-        np.testing.assert_allclose(colors[in_band][:, :3], [expected] * in_band.sum(), atol=1e-3)
-        assert not colors[blocks.distance[rows] > 0.2999].any()
 
 
 def test_stamps_are_the_first_and_the_last():

@@ -7,21 +7,15 @@ What a mesh has to be follows from the field: a vertex for every lattice edge on
 changes, every side of a triangle shared by two, in opposite directions.
 """
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
-from surfel_mapper.tsdf.kernels.marching_cubes import CASES, edge_between, FACES
 from surfel_mapper.tsdf.mesh import Mesher
-from test.tsdf.scenes import fused, image_of, VGA
 
 VOXEL_M = 0.1
 SIDE = 4
-
-FACE_EDGES = [{edge_between(face[i], face[i - 1]) for i in range(4)} for face in FACES]
 
 
 def blocks_of(distance, first=(0, 0, 0), weight=1.0, color=None, **settings):
@@ -135,14 +129,6 @@ def test_any_field_gives_a_closed_mesh_with_a_vertex_for_every_change_of_sign(se
     assert np.abs(mesh.vertices[order] - expected[wanted]).max() <= 1e-12
 
 
-def test_no_side_within_a_loop_lies_on_a_face_of_its_cube():
-    for triangles in CASES:
-        sides_of = [{frozenset(pair) for pair in combinations(t, 2)} for t in triangles]
-        for first, second in combinations(sides_of, 2):
-            for side in first & second:  # within a loop
-                assert not any(side <= edges for edges in FACE_EDGES)
-
-
 def test_a_mesh_made_bit_by_bit_is_the_one_made_at_once():
     rng = np.random.default_rng(3)
     distance, _ = sphere((16, 16, 16), 0.55)
@@ -208,24 +194,6 @@ def test_free_space_beside_a_shadow_has_no_surface_between_them():
     )
 
 
-def test_a_board_before_a_wall_leaves_no_mesh_along_its_shadow():
-    u, v = np.arange(VGA.columns) - VGA.cx, np.arange(VGA.rows)[:, None] - VGA.cy
-    board = (abs(u) < 80) & (abs(v) < 80)  # 0.61 m
-    image = image_of(VGA, np.where(board, 2.0, 3.0) * VGA.ray_length)
-    sizes = dict(voxel_size_m=0.05, truncation_m=0.15, distance='to_plane')
-    meshes = [
-        mesh_of(fused(image, **sizes, mesh_max_step_voxels=most)).vertices for most in (0.0, 4.25)
-    ]
-    behind = [((z > 2.01) & (z < 2.99)).sum() for z in (mesh[:, 2] for mesh in meshes)]
-    deepest = [mesh[mesh[:, 2] < 2.5, 2].max() for mesh in meshes]
-    assert behind[0] > 100
-    assert behind[1] < behind[0] / 2
-    assert deepest[0] > 2.1
-    assert deepest[1] < 2.05  # half a voxel
-    on_board = [(abs(mesh[:, 2] - 2.0) < 0.001).sum() for mesh in meshes]
-    assert on_board[0] == on_board[1] > 100
-
-
 def test_without_blocks_there_is_no_mesh():
     mesh = mesh_of(BlockMap(TsdfConfig()))
     assert (len(mesh), mesh.vertices.shape, mesh.triangles.shape) == (0, (0, 3), (0, 3))
@@ -240,20 +208,3 @@ def test_colours_are_mixed_along_the_edge():
     # a quarter of the way from voxel 3 to 4
     assert np.abs(mesh.vertices[:, 0] - 0.375).max() <= 1e-7
     assert set(map(tuple, mesh.colors.tolist())) == {(160, 100, 20)}
-
-
-def test_vertex_beside_a_voxel_without_colour_takes_that_of_the_other_end():
-    distance = np.broadcast_to(np.arange(8.0)[:, None, None] - 3.25, (8, 8, 8)) * 0.1
-    color = np.full((8, 8, 8, 3), 90.0)
-    blocks = blocks_of(distance.astype(np.float32), color=color)
-    rows = blocks.find([[1, y, z] for y in range(2) for z in range(2)])
-    blocks.color[rows] = 0.0
-    mesh = mesh_of(blocks)
-    assert set(map(tuple, mesh.colors.tolist())) == {(90, 90, 90)}
-
-
-def test_equal_distances_on_both_sides_of_zero_meet_in_the_middle():
-    distance = np.full((8, 8, 8), 1e-7, np.float32)
-    distance[:4] = -1e-7
-    mesh = mesh_of(blocks_of(distance))
-    assert np.abs(mesh.vertices[:, 0] - 0.4).max() <= 1e-12

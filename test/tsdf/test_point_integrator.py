@@ -116,16 +116,6 @@ def test_every_point_of_a_sparse_cloud_lies_on_the_mesh():
     assert distance.max() < 1.5 * VOXEL_M
 
 
-def test_dense_wall_has_its_surface_where_the_points_are():
-    y, z = np.meshgrid(np.arange(-2.0, 2.0, 0.05), np.arange(-1.0, 1.0, 0.05))
-    wall = np.stack([np.full(y.size, 5.03), y.ravel(), z.ravel()], axis=1)
-    blocks = fused(wall, np.eye(4))
-    places = wall[(np.abs(wall[:, 1]) < 1.5) & (np.abs(wall[:, 2]) < 0.6)]
-    found = sample(blocks, places)
-    assert np.abs(found.distance).max() < 0.1 * VOXEL_M
-    assert (found.gradient[:, 0] < -0.8).all()
-
-
 def test_rays_beside_a_thin_pole_do_not_erase_it():
     azimuth, up = np.meshgrid(np.deg2rad(np.arange(-20.0, 20.0, 0.2)), np.arange(-1.0, 1.0, 0.1))
     pole = np.abs(azimuth) < np.deg2rad(0.3)
@@ -147,23 +137,6 @@ def test_points_that_are_no_measurements_change_nothing():
     blocks = fused(points)
     assert blocks.num_blocks == 0
     assert fused(np.empty((0, 3))).num_blocks == 0
-
-
-def test_points_beyond_the_range_only_free_space():
-    blocks = fused(np.array([[30.0, 0.0, 0.0]]), np.eye(4))
-    found = voxels_of(blocks)
-    assert all(distance == pytest.approx(TAU_M) for distance, _ in found.values())
-    assert 99 <= max(i for i, _, _ in found) <= 100  # 20 m is between these voxels of 0.2 m
-
-
-def test_order_of_points_does_not_matter_near_surfaces():
-    rng = np.random.default_rng(3)
-    points = rng.normal(size=(200, 3)) * 3.0
-    first = voxels_of(fused(points, carve=False))
-    second = voxels_of(fused(points[::-1], carve=False))
-    assert first.keys() == second.keys()
-    for voxel, values in first.items():
-        np.testing.assert_allclose(values, second[voxel], atol=1e-5)
 
 
 def test_colours_labels_and_stamps_are_kept():

@@ -74,13 +74,6 @@ def test_states_are_those_of_the_voxel_that_a_point_is_in():
     assert states(blocks, [[0, 0, 1.85]], occupied_up_to_m=0.25).tolist() == [OCCUPIED]
 
 
-def test_the_gradient_points_to_the_sensor():
-    blocks = fused(image_of(SMALL, 2.0 * SMALL.ray_length), voxel_size_m=0.05, truncation_m=0.15)
-    found = sample(blocks, [[0.01, 0.02, 1.97], [0.3, 0.1, 2.03]])
-    np.testing.assert_allclose(found.distance, [0.03, -0.03], atol=1e-3)
-    assert (found.gradient[:, 2] < -0.99).all()
-
-
 def test_points_of_another_shape_are_refused():
     with pytest.raises(ValueError, match=r'expected \(P, 3\)'):
         sample(linear_field(), [1.0, 2.0, 3.0])
@@ -164,21 +157,6 @@ def test_binary_counts_label_zero_against_all_others_and_not_unknown():
 @pytest.mark.parametrize('semantics', ['majority', 'first_k', 'single', 'binary'])
 def test_a_voxel_never_labelled_has_no_label(semantics):
     assert labels_of(semantics, np.zeros((4, 5), np.float32))[0].tolist() == [-1] * 5
-
-
-@pytest.mark.parametrize('semantics', ['majority', 'first_k', 'single'])
-def test_labels_of_images_reach_the_voxels_of_the_surface(semantics):
-    one = integrator(voxel_size_m=0.1, truncation_m=0.3, semantics=semantics, num_labels=6)
-    wall = image_of(SMALL, np.full((60, 80), 2.0))
-    half = np.arange(80) * np.ones((60, 1)) < 40
-    for label in (np.where(half, 5, 2), np.where(half, 5, -1), np.where(half, 0, 2)):
-        one.integrate(wall.with_images(label=label), np.eye(4))
-    blocks, rows = one.blocks, one.blocks.rows()
-    labels, _ = labels_of(semantics, blocks.votes[rows].transpose(1, 0, 2))
-    seen = blocks.weight[rows] > 0
-    in_band = seen & (abs(blocks.distance[rows]) < 0.29)
-    assert {*np.unique(labels[in_band])} == {2, 5}
-    assert (labels[blocks.distance[rows] > 0.2999] == -1).all()
 
 
 @pytest.mark.parametrize('semantics', ['majority', 'first_k', 'single', 'binary'])

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import CloudFormatError, ConfigError
-from surfel_mapper.kernels.projection import LIDAR_TABLE, OUTSIDE, project
-from surfel_mapper.tsdf.integrator import paired
-from surfel_mapper.tsdf.kernels import lookup as kernels
+from surfel_mapper.kernels.projection import OUTSIDE, project
 from surfel_mapper.tsdf.range_image import from_depth, from_points, from_ranges
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 from test.tsdf import twin
@@ -192,62 +190,3 @@ def blank():
 def test_sensors_that_cannot_be_are_refused(make, message):
     with pytest.raises(ConfigError, match=message):
         make()
-
-
-def looked_up(image, u, v, method, allowed):
-    """Return the range at places in an image, negative where the nearest pixel was taken."""
-    padded = np.pad(np.asarray(image, np.float32), kernels.BORDER)
-    found = np.zeros(kernels.NUM_SETTINGS, np.float32)
-    found[kernels.LIMIT] = found[kernels.MAX_RANGE] = 100.0
-    found[kernels.MAX_DIFFERENCE] = allowed
-    u, v = np.asarray(u, np.float32), np.asarray(v, np.float32)
-    place, value = np.empty(len(u), np.int32), np.empty(len(u), np.float32)
-    upper, lower = np.empty(len(u), np.int64), np.empty(len(u), np.int64)
-    kernels.locate(np.ones(len(u), np.float32), u, v, padded.shape[1], found, place)
-    kernels.gather(paired(padded).ravel(), padded.shape[1], place, upper, lower)
-    pixels = upper.view(np.float32), lower.view(np.float32)
-    kernels.mix(*pixels, u, v, method, found, value)
-    return value
-
-
-def test_pixels_are_mixed_where_they_differ_little():
-    image = [[1.0, 2.0], [3.0, 4.0]]
-    u, v = [0.25, 0.5, 0.75, 0.1], [0.25, 0.25, 0.5, 0.9]
-    mixed = [1 + a + 2 * b for a, b in zip(u, v, strict=True)]
-    nearest = [1.0, 2.0, 4.0, 3.0]
-    for method, allowed, expected in (
-        (kernels.ADAPTIVE, 3.5, mixed),
-        (kernels.ADAPTIVE, 0.2, np.negative(nearest)),
-        (kernels.BILINEAR, 0.2, mixed),
-        (kernels.NEAREST, 9.0, np.negative(nearest)),
-    ):
-        np.testing.assert_allclose(looked_up(image, u, v, method, allowed), expected, rtol=1e-6)
-    # Beyond the last row or column, and above the first, only the nearest pixel is left.
-    edges = looked_up(image, [1.9, 1.4, -0.4, 0.2], [0.9, 0.9, 0.0, -0.4], kernels.ADAPTIVE, 3.5)
-    np.testing.assert_allclose(edges, [0.0, -4.0, -1.0, -1.0])
-
-
-@pytest.mark.parametrize('last', [3.0, 12.0, 70.0])
-def test_the_gap_at_a_voxel_is_that_of_the_rows_about_it(last):
-    gaps = np.random.default_rng(1).uniform(0.001, 0.01, 63).astype(np.float32)
-    v = np.random.default_rng(2).uniform(-1.0, last, 512).astype(np.float32)
-    found = np.empty_like(v)
-    kernels.row_gaps(LIDAR_TABLE, gaps, v, found)
-    np.testing.assert_array_equal(found, gaps[np.clip(v.astype(int), 0, 62)])
-
-
-def test_a_pixel_that_says_nothing_is_never_mixed():
-    image = [[1.0, 0.0], [1.0, 1.0]]
-    found = looked_up(image, [0.3, 0.8], [0.3, 0.2], kernels.BILINEAR, 9.0)
-    assert found.tolist() == [-1.0, 0.0]
-    clearing = [[1.0, 2100.0], [1.0, 1.0]]
-    found = looked_up(clearing, [0.3, 0.8], [0.3, 0.2], kernels.BILINEAR, 9.0)
-    assert found.tolist() == [-1.0, -2100.0]
-
-
-def test_across_the_seam_pixels_are_mixed():
-    range_m = np.full((16, 360), 5.0)
-    range_m[:, 0], range_m[:, -1] = 5.0, 5.1
-    image = from_ranges(VLP16, range_m)
-    found = looked_up(image.range_m, [359.25, 359.75], [3.0, 3.5], kernels.ADAPTIVE, 0.2)
-    np.testing.assert_allclose(found, [5.075, 5.025], rtol=1e-6)

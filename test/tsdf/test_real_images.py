@@ -12,14 +12,6 @@ from surfel_mapper.geometry import q_xyzw
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import DepthImage, Scan
 from surfel_mapper.sensors.depth import depth_points, PinholeCamera, SceneImage
-from surfel_mapper.tsdf.queries import FREE, sample, states
-from surfel_mapper.tsdf.range_image import from_depth
-from surfel_mapper.tsdf.sensors import CameraModel
-from test.tsdf.scenes import integrator
-
-KINECT = CameraModel(
-    columns=640, rows=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, min_range_m=0.4, max_range_m=4.0
-)
 
 
 def frames(data_folder, numbers):
@@ -37,39 +29,6 @@ def frames(data_folder, numbers):
         u, _, vt = np.linalg.svd(pose[:3, :3])  # stored with three digits too few
         pose[:3, :3] = u @ vt
         yield depth, pyplot.imread(f'{name}.color.jpg'), pose
-
-
-def test_images_between_those_fused_lie_on_the_surface_and_have_its_colour(data_folder):
-    one = integrator(voxel_size_m=0.02, truncation_m=0.08, color=True, carve=False)
-    for depth, color, pose in frames(data_folder, range(0, 200, 20)):
-        image = from_depth(KINECT, depth, unknown=65535).with_images(color=color)
-        assert one.integrate(image, pose).num_voxels > 50_000
-    for depth, color, pose in frames(data_folder, range(10, 190, 60)):
-        image = from_depth(KINECT, depth, unknown=65535)
-        seen = (image.range_m > 0) & (image.range_m < 3.5)
-        seen[np.arange(480) % 7 > 0] = False
-        rays = KINECT.directions[seen] * image.range_m[seen, None]
-        points = rays @ pose[:3, :3].T + pose[:3, 3]
-        distance = sample(one.blocks, points).distance
-        known = np.isfinite(distance)
-        assert known.mean() > 0.8
-        # All images together make walls 18 mm thick: the error of the poses.
-        assert np.median(abs(distance[known])) < 0.018
-        before = (0.97 * rays) @ pose[:3, :3].T + pose[:3, 3]
-        found = states(one.blocks, before)
-        assert (found[found > 0] == FREE).mean() > 0.8
-
-        # The voxel that a point is in, and its colour beside that of the pixel.
-        voxel = np.floor(points / 0.02).astype(int)
-        block, local = np.divmod(voxel, 8)
-        rows = one.blocks.find(block)
-        there = rows >= 0
-        number = local @ [1, 8, 64]
-        fused = one.blocks.color[rows[there], :, number[there]]
-        has = fused[:, 3] > 0
-        off = abs(fused[has, :3] - color[seen][there][has].astype(float))
-        assert has.mean() > 0.8
-        assert np.median(off) < 20.0
 
 
 def fused(data_folder, numbers):
