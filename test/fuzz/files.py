@@ -4,12 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import contextlib
 from functools import cache
 from pathlib import Path
 import tempfile
-import time
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.files.tsdf_state import load_tsdf
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.chain import example as example_scan
-from test.fuzz.memory import reset_peak, resident
 
 MOST_MESSAGES = 5000
 """Number of messages read of a bag."""
@@ -37,27 +35,11 @@ def folder() -> tempfile.TemporaryDirectory:
     return tempfile.TemporaryDirectory(prefix='surfel_mapper-fuzz-')
 
 
-READS: list[tuple[float, int, int]] = []
-"""Processor time, s, bytes and memory of each read of an input, for harnesses that build files."""
-
-
-@contextlib.contextmanager
-def timed_read(num_bytes: int) -> Iterator[None]:
-    """Measure the reading in a block, apart from the building of its file."""
-    reset_peak()
-    before, start_s = resident('VmRSS'), time.process_time()
-    try:
-        yield
-    finally:
-        seconds = time.process_time() - start_s
-        READS.append((seconds, num_bytes, resident('VmHWM') - before))
-
-
 def refused(function: Callable[..., object], name: str, data: bytes) -> None:
     """Pass bytes to a function as a file; accept our own errors."""
     path = Path(folder().name, name)
     path.write_bytes(data)
-    with timed_read(len(data)), contextlib.suppress(SurfelMapperError):
+    with contextlib.suppress(SurfelMapperError):
         function(path)
 
 
@@ -129,7 +111,7 @@ def parquet(data: bytes) -> None:
 def read_state(path: Path) -> None:
     """Read a file as every kind of state."""
     for read in (load_map, lambda p: load_tsdf(p, TsdfConfig())):
-        with timed_read(path.stat().st_size), contextlib.suppress(SurfelMapperError):
+        with contextlib.suppress(SurfelMapperError):
             read(path)
 
 

@@ -8,11 +8,7 @@ from dataclasses import replace
 import hashlib
 import io
 import json
-from pathlib import Path
 import struct
-import subprocess
-import sys
-import threading
 import time
 from types import SimpleNamespace
 import zipfile
@@ -22,39 +18,24 @@ from PIL import Image
 import pytest
 import yaml
 
-from surfel_mapper.bags import reader as bag_reader
-from surfel_mapper.bags.paths import files_of, stated_counts
 from surfel_mapper.cli.main import main
-from surfel_mapper.config import Config, load_config, parse_yaml, TsdfConfig
+from surfel_mapper.config import parse_yaml
 from surfel_mapper.counters import Counters, OTHERS
 from surfel_mapper.errors import (
-    BagError,
     CloudFormatError,
-    ConfigError,
     FileFormatError,
     MapError,
-    MAX_LINE,
-    one_line,
     PoseError,
     refusing,
 )
-from surfel_mapper.files.atomic import by_number
 from surfel_mapper.files.map_state import load_map, load_moments, save_map, window_stamps_ns
 from surfel_mapper.files.scan_files import read_scan
-from surfel_mapper.files.tsdf_state import load_tsdf
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.cdr import MAX_FRAME_NAME
 from surfel_mapper.messages.compressed_image import unpacked
 from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns, parse_cloud
 from surfel_mapper.messages.poses import raw_poses
-from surfel_mapper.offline.datasets import nuscenes
-from surfel_mapper.simulation.world import World
-from test import extras
-from test.bags.records import record, text
-from test.fuzz import corpus
-
-TIMEOUT_S = 120
 
 
 @pytest.fixture
@@ -70,16 +51,15 @@ def saved(tmp_path):
     return path
 
 
-def changed(path, *, arrays=None, attributes=None, header=None):
-    """Write a map again with other arrays, attributes or header of the keys, and its hash."""
+def changed(path, arrays):
+    """Write a map again with other arrays, and its hash."""
     with zipfile.ZipFile(path) as archive:
         manifest = json.loads(archive.read('manifest.json'))
         found = {
             entry['name']: np.load(io.BytesIO(archive.read(f'{entry["name"]}.npy')))
             for entry in manifest['arrays']
         }
-    found.update(arrays or {})
-    manifest['attributes'].update(attributes or {})
+    found.update(arrays)
     manifest['arrays'] = [
         {'name': name, 'dtype': array.dtype.str, 'shape': array.shape}
         for name, array in found.items()
@@ -92,38 +72,8 @@ def changed(path, *, arrays=None, attributes=None, header=None):
     with zipfile.ZipFile(path, 'w') as archive:
         archive.writestr('manifest.json', json.dumps(manifest))
         for name, array in found.items():
-            stream = io.BytesIO()
-            np.lib.format.write_array(stream, array)
-            data = stream.getvalue()
-            if header and name == 'map.key':
-                text = header.encode() + b' ' * (-(len(header) + 11) % 64) + b'\n'
-                data = b'\x93NUMPY\x01\x00' + struct.pack('<H', len(text)) + text + data[128:]
-            archive.writestr(f'{name}.npy', data)
-
-
-@pytest.mark.parametrize(
-    'header',
-    [
-        "{'descr': ('<i8', 'fortran",
-        '(' * 5000,
-        '-' * 9000 + '1',
-        "{'descr': '<i8', 'fortran_order': False, 'shape': (1" + '0' * 4000 + ',)}',
-        "{'descr': '|O', 'fortran_order': False, 'shape': (5,), }",
-        "{'descr': [('a','<i8')], 'fortran_order': False, 'shape': (5,), }",
-        "{'descr': '<i8', 'fortran_order': False, 'shape': (-5,), }",
-        "{'descr': '<i8', 'fortran_order': True, 'shape': (5,), }",
-    ],
-    ids=['cut', 'brackets', 'signs', 'digits', 'objects', 'fields', 'negative', 'columns'],
-)
-def test_headers_of_arrays_are_not_evaluated(saved, header):
-    """NumPy parses them as Python: TokenError, MemoryError and a fifth of a second came of it."""
-    changed(saved, header=header)
-    for read in (load_map, load_moments, window_stamps_ns):
-        start_s = time.thread_time()
-        with pytest.raises(FileFormatError, match=r'map\.npz: damaged') as caught:
-            read(saved)
-        assert time.thread_time() - start_s < 0.1
-        assert len(str(caught.value)) <= MAX_LINE
+            with archive.open(f'{name}.npy', 'w') as stream:
+                np.lib.format.write_array(stream, array)
 
 
 @pytest.mark.parametrize(
@@ -142,53 +92,16 @@ def test_headers_of_arrays_are_not_evaluated(saved, header):
     ids=['inf', 'nan', 'fraction', 'table', 'number', 'negative', 'unsigned', 'three', 'float32'],
 )
 def test_stamps_and_poses_of_a_window_are_checked(saved, arrays):
-    changed(saved, arrays=arrays)
+    changed(saved, arrays)
     for read in (load_map, load_moments, window_stamps_ns):
         with pytest.raises(FileFormatError, match=r'map\.npz: damaged'):
             read(saved)
 
 
-@pytest.mark.parametrize(
-    'points',
-    [
-        np.ones((5, 7), bool),
-        np.ones((5, 3), np.int64),
-        np.zeros((5, 3), np.float16),
-        np.full((5, 3), np.nan),
-        np.array(3.0),
-    ],
-    ids=['booleans', 'integers', 'float16', 'nan', 'number'],
-)
-def test_points_of_a_window_are_checked(saved, points):
-    """They were believed, and failed when the window was aligned."""
-    changed(saved, arrays={'scan0.points': points})
-    for read in (load_map, load_moments):
-        with pytest.raises(FileFormatError, match='points of scan 0'):
-            read(saved)
-
-
-@pytest.mark.parametrize(
-    ('name', 'value'),
-    [
-        ('voxel_size_m', 10**400),
-        ('level', 10**400),
-        ('origin_m', [10**400, 0, 0]),
-        ('columns', 5),
-        ('kind', 'x' * 1_000_000),
-    ],
-)
-def test_attributes_that_no_map_has_are_refused_in_a_short_line(saved, name, value):
-    changed(saved, attributes={name: value})
-    for read in (load_map, load_moments):
-        with pytest.raises(FileFormatError, match=r'map\.npz') as caught:
-            read(saved)
-        assert len(str(caught.value)) <= MAX_LINE
-
-
 def test_a_changed_map_of_the_same_content_is_read(saved):
     """The helper above writes valid files."""
     digest = load_map(saved)[0].digest()
-    changed(saved)
+    changed(saved, {})
     surfel_map, scans = load_map(saved)
     assert surfel_map.digest() == digest
     assert window_stamps_ns(saved) == [scan.stamp_ns for scan in scans] == [5]
@@ -203,14 +116,6 @@ def test_any_exception_of_a_parser_becomes_an_error_of_its_reader(error):
     assert '\n' not in str(caught.value)
 
 
-def test_a_long_line_keeps_its_ends():
-    line = one_line('begin\n' + 'x' * 10_000_000 + '\x1b[31mend')
-    assert len(line) <= MAX_LINE
-    assert line.startswith('begin\\n')
-    assert line.endswith('\\x1b[31mend')
-    assert '10000014 characters' in line
-
-
 @pytest.fixture
 def laz(tmp_path):
     """Return the path of a LAZ file of 100 points, and its content."""
@@ -220,42 +125,6 @@ def laz(tmp_path):
     path = tmp_path / 'a.laz'
     data.write(str(path))
     return path, bytearray(path.read_bytes())
-
-
-def start_of_points(content):
-    return struct.unpack_from('<I', content, 96)[0]
-
-
-@pytest.mark.parametrize('number', [2**32 - 1, 2**28, 1000])
-def test_a_laz_that_states_other_chunks_is_refused(laz, number):
-    """Lazrs allocated 69 GB for 2^32 chunks and ended the process by SIGABRT."""
-    path, content = laz
-    (table,) = struct.unpack_from('<q', content, start_of_points(content))
-    struct.pack_into('<I', content, table + 4, number)
-    path.write_bytes(content)
-    read = (
-        'import sys\nfrom surfel_mapper.errors import FileFormatError\n'
-        'from surfel_mapper.files.scan_files import read_scan\n'
-        'try: read_scan(sys.argv[1])\n'
-        'except FileFormatError as error: print(error)\n'
-    )
-    done = subprocess.run(
-        [sys.executable, '-c', read, str(path)],
-        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert f'{number} chunks of points at byte {table} of {len(content)}' in done.stdout
-
-
-def test_a_laz_of_large_chunks_is_read(laz):
-    """Decoders of many threads allocate a chunk of the size stated, here 110 GB."""
-    path, content = laz
-    place = content.index(b'laszip encoded') + 64
-    assert struct.unpack_from('<I', content, place) == (50_000,)
-    struct.pack_into('<I', content, place, 3_271_607_120)
-    path.write_bytes(content)
-    points, _ = read_scan(path)
-    np.testing.assert_allclose(points[:, 0], np.arange(100.0), atol=0.005)
 
 
 @pytest.mark.parametrize(
@@ -334,130 +203,16 @@ def pose_bytes(parent, child):
     return writer.join()
 
 
-@pytest.mark.parametrize(
-    'value',
-    [
-        '!!int ""',
-        '!!float ""',
-        '!!bool maybe',
-        '!!timestamp yesterday',
-        '!!binary "x"',
-        '!!omap [1]',
-        '!!python/object/apply:os.system ["false"]',
-        '9' * 4299,
-    ],
-    ids=['int', 'float', 'bool', 'time', 'binary', 'omap', 'python', 'digits'],
-)
-def test_yaml_tags_of_other_values_are_refused(tmp_path, value):
-    """PyYAML raised IndexError, KeyError and AttributeError; so did settings and metadata.yaml."""
-    path = tmp_path / 'metadata.yaml'
-    path.write_text(f'map: {{voxel_size_m: {value}}}')
-    with pytest.raises(ConfigError):
-        load_config(path)
-    with pytest.raises(BagError, match='not the metadata'):
-        files_of(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ('text', 'problem'),
-    [
-        ('topics_with_message_count: [{topic_metadata: {name: /a}, message_count: .inf}]', 'inf'),
-        (f'relative_file_paths: [{"a" * 5000}.mcap]', 'is missing'),
-    ],
-    ids=['count', 'name'],
-)
-def test_metadata_of_impossible_numbers_and_names_is_refused(tmp_path, text, problem):
-    path = tmp_path / 'metadata.yaml'
-    path.write_text(f'rosbag2_bagfile_information: {{{text}}}')
-    with pytest.raises(BagError, match=problem):
-        (stated_counts if 'count' in text else files_of)(tmp_path)
-
-
-def test_json_of_a_world_that_is_nested_too_deeply_is_refused(tmp_path):
-    path = tmp_path / 'world.json'
-    path.write_text('[' * 100_000)
-    with pytest.raises(FileFormatError, match=r'world\.json: damaged: RecursionError'):
-        World.load(path)
-    path.write_text(json.dumps({'format': 'x'}))
-    with pytest.raises(FileFormatError, match=r'world\.json: '):
-        World.load(path)
-
-
-def test_tables_of_nuscenes_with_numbers_of_any_size_are_refused(tmp_path):
-    scan = tmp_path / 'samples' / 'LIDAR_TOP' / 'a__1.pcd.bin'
-    scan.parent.mkdir(parents=True)
-    scan.write_bytes(bytes(20))
-    row = {'token': 'a', 'rotation': [10**400, 0, 0, 0], 'translation': [0, 0, 0]}
-    data = {'filename': scan.name, 'ego_pose_token': 'a', 'calibrated_sensor_token': 'a'}
-    for name, found in (('sample_data', data), ('ego_pose', row), ('calibrated_sensor', row)):
-        path = tmp_path / 'v1.0-mini' / f'{name}.json'
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps([found]))
-    with pytest.raises(FileFormatError, match='not those of nuScenes: OverflowError'):
-        nuscenes(tmp_path)
-
-
-@pytest.mark.parametrize('name', ['map.other', 'scan1.key', 'map.points', 'x'])
-def test_arrays_that_no_map_has_are_refused(saved, name):
-    changed(saved, arrays={name: np.zeros(3)})
-    for read in (load_map, load_moments, window_stamps_ns):
-        with pytest.raises(FileFormatError, match=rf"unknown arrays \['{name}'\]"):
-            read(saved)
-
-
-def test_arrays_that_no_distance_field_has_are_refused(tmp_path):
-    path = tmp_path / 'tsdf.npz'
-    path.write_bytes(corpus.tsdf())
-    load_tsdf(path, TsdfConfig())
-    changed(path, arrays={'other': np.zeros(3)})
-    with pytest.raises(FileFormatError, match=r"unknown arrays \['other'\]"):
-        load_tsdf(path, TsdfConfig())
-
-
-def test_two_members_of_one_name_are_refused(saved):
-    with zipfile.ZipFile(saved, 'a') as archive, pytest.warns(UserWarning, match='Duplicate'):
-        archive.writestr('map.key.npy', b'')
-    with pytest.raises(FileFormatError, match='a member occurs twice'):
-        load_map(saved)
-
-
-def test_columns_that_no_map_has_are_refused(tmp_path):
-    parquet = extras.load('pyarrow.parquet')
-    from surfel_mapper.files.parquet import read_map, read_moments
-
-    path = tmp_path / 'map.parquet'
-    path.write_bytes(corpus.parquet()[0])
-    table = parquet.read_table(path)
-    parquet.write_table(table.append_column('other', table['i']), path)
-    for read in (read_map, read_moments):
-        with pytest.raises(FileFormatError, match=r"unknown columns \['other'\]"):
-            read(path)
-
-
 @pytest.mark.parametrize('far_m', [1e300, -2e9, np.nan, np.inf])
 def test_poses_beyond_any_place_are_refused(saved, far_m):
     """1e300 m passed as a rigid transform."""
     pose = np.eye(4)
     pose[1, 3] = far_m
-    changed(saved, arrays={'scans.pose': pose[None]})
+    changed(saved, {'scans.pose': pose[None]})
     with pytest.raises(FileFormatError, match='expected a rigid transform'):
         load_map(saved)
     with pytest.raises(ValueError, match='expected a rigid transform'):
         SurfelMap(0.5).reduce(np.zeros((5, 3)), pose)
-
-
-def test_settings_of_numbers_that_only_python_reads_are_refused(capsys):
-    for origin in ('1_0 0 0', '\u0661 0 0', '1 2', '1 2 3 4', '1 2 x'):
-        with pytest.raises(ConfigError, match=r'map\.origin'):
-            Config.from_mapping({'map.origin': origin})
-    for arguments in (
-        ['replay', 'a', '--every', '1_0'],
-        ['simulate', 'street', '--speed', '1_0'],
-        ['simulate', 'street', '--seed', '1_0'],
-    ):
-        with pytest.raises(SystemExit):
-            main(arguments)
-        assert '1_0' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -477,18 +232,6 @@ def test_yaml_as_text_equals_that_of_pyyaml_or_is_refused(text, problem):
         return
     with pytest.raises(ValueError, match=problem):
         parse_yaml(text, as_text=True)
-
-
-def test_names_of_files_with_digits_of_unicode_are_sorted():
-    """str.isdigit holds for superscripts, which int refuses."""
-    names = [Path(name) for name in ('1\u00b2', '\u00b2', '10', '2', '\u0661')]
-    assert [path.name for path in sorted(names, key=by_number)] == [
-        '\u0661',
-        '1\u00b2',
-        '2',
-        '10',
-        '\u00b2',
-    ]
 
 
 def test_names_with_an_end_of_line_stay_on_their_line(tmp_path, capsys):
@@ -545,34 +288,3 @@ def test_rows_beyond_the_table_are_refused(rows):
 def test_ranges_that_are_no_numbers_are_refused(name, value):
     with pytest.raises(ValueError, match='min_range_m'):
         SurfelMap(0.5).reduce(np.zeros((5, 3)), **{name: value})
-
-
-def test_ranges_whose_square_is_infinite_are_no_limit():
-    moments = SurfelMap(0.5).reduce(np.ones((5, 3)), max_range_m=1e200)
-    assert moments.num_points == 5
-
-
-def test_names_of_topics_are_checked_a_few_times_however_many_there_are(tmp_path, monkeypatch):
-    """Each was compared with all others to know if it is latched: 65,535 took hours."""
-    names = range(1000)
-    channels = b''.join(
-        record(4, struct.pack('<HH', n, 1) + text(b'/t%d' % n) + text(b'cdr') + bytes(4))
-        for n in names
-    )
-    schema = record(3, struct.pack('<H', 1) + text(b'a/msg/A') + text(b'ros2msg') + text(b''))
-    message = record(5, struct.pack('<HIQQ', 1, 0, 5, 5))
-    path = tmp_path / 'a.mcap'
-    head = b'\x89MCAP0\r\n' + record(1, text(b'ros2') + text(b''))
-    path.write_bytes(head + schema + channels + message)
-    calls = []
-    monkeypatch.setattr(bag_reader, 'has_legal_names', lambda c: not calls.append(c))
-    with bag_reader.BagReader(path) as reader:
-        assert len([*reader.topics]) == len(names)
-        assert not any(reader.is_latched(topic.name) for topic in reader.topics)
-    assert 0 < len(calls) < 10 * len(names)
-
-
-def test_a_state_is_read_without_threads(saved, monkeypatch):
-    """A thread that could not allocate ended without a word, and the reader waited for it."""
-    monkeypatch.setattr(threading.Thread, 'start', lambda self: pytest.fail('a thread'))
-    load_map(saved)
