@@ -1,17 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The node over DDS: latency from publish to ``~/changed``, drops, the highest rate, and idle.
+The node over DDS at 20 Hz: latency from publish to ``~/changed``, and clouds that are lost.
 
 Four processes: a lidar and an odometry (live_publisher.py), the node, and this one, which
 subscribes to ``~/changed`` and to ``~/normals`` at 2 Hz. The lidar is an ordinary publisher:
 reliable, with the defaults of the middleware, or, in rows ``with profile``, with the profile for
-shared memory. A rate is sustained if every cloud published comes back as a change; the latency of
-``~/normals`` counts from the stamp of its latest scan, while clouds come. Idle is a node that has
-mapped, with nothing coming in. Rows ``transport`` are a subscriber of rclpy that only takes the
-clouds, in place of the node, with ordinary priority. The rows of the node by defaults depend on
-whether Linux permits it real-time priority (docs/node.md); without: ``setpriv
---bounding-set=-sys_nice -- python -m test.bench --only live`` as root.
+shared memory. The rows by defaults depend on whether Linux permits the node real-time priority
+(docs/node.md); without: ``setpriv --bounding-set=-sys_nice -- python -m test.bench --only live``
+as root.
 """
 
 from __future__ import annotations
@@ -40,17 +37,11 @@ from test.ros.domain import domain_of_our_own
 
 ROOT = Path(__file__).parents[2]
 RATE_HZ = 20.0
-RATES_HZ = (25.0, 30.0, 35.0, 40.0, 50.0, 60.0, 80.0)
-SECONDS, SECONDS_A_RATE, SECONDS_IDLE = 15.0, 6.0, 8.0
+SECONDS = 15.0
 TIMEOUT_S = 300.0
-SETTLE_S = 2.0
-"""Time from the last cloud until a node is idle, s: maps are sent at 2 Hz, diagnostics at 1 Hz."""
 
-IDLE_BUDGET = 3.0
 BUDGET_VOXEL_M = 0.5
-LATENCY_BUDGET_MS = {'p50_ms': 40.0, 'p99_ms': 50.0, 'normals_max_ms': 150.0}
-BURST, BURST_HZ = 10, 1e6
-"""Clouds published at once, without a pause."""
+LATENCY_BUDGET_MS = {'budget_p50_ms': 40.0, 'budget_p99_ms': 50.0}
 
 Listen = Callable[[Callable[[], bool]], None]
 """Takes messages until a condition holds."""
@@ -59,14 +50,12 @@ CPU_TICKS = os.sysconf('SC_CLK_TCK')
 
 
 def run(options: Options) -> list[Row]:
-    """Return rows of latencies and rates; none without ROS."""
-    scale = options.scans / 100  # --quick takes a quarter of the time
+    """Return rows of latencies; none without ROS."""
     rows: list[Row] = []
     with street_over_dds(options) as street:
         if street:
-            rows += transport(options, SECONDS * min(scale, 1.0))
             for size_m in options.voxel_sizes_m:
-                rows += rates(options, street, size_m, scale)
+                rows += latency_rows(options, street, size_m)
     return rows
 
 
@@ -83,70 +72,32 @@ def street_over_dds(options: Options) -> Iterator[Street | None]:
         yield street
 
 
-def rates(options: Options, street: Street, size_m: float, scale: float) -> Iterator[Row]:
-    """Yield rows for 20 Hz, a burst, higher rates up to the first with drops, and an idle node."""
+def latency_rows(options: Options, street: Street, size_m: float) -> Iterator[Row]:
+    """Yield a row for a lidar with the defaults of the middleware, and one with the profile."""
     mount = list(street.simulation.drive.base_to_sensor)
+    budgets = LATENCY_BUDGET_MS if size_m == BUDGET_VOXEL_M else {}
+    seconds = SECONDS * options.scans / 100  # --quick takes a quarter of the time
     with Node(size_m, mount, options.window, {}) as node, listening() as listener:
         node.wait_for('ready:')
-        publish(options, listener.listen_until, RATE_HZ, 20)  # fills caches
-        budgets = LATENCY_BUDGET_MS if size_m == BUDGET_VOXEL_M else {}
+        publish(options, listener.listen_until, 20)  # fills caches
         for what, profile in (('live', False), ('with profile', True)):
-            row = measure(options, node, listener, RATE_HZ, SECONDS * scale, profile=profile)
-            row = {**row, 'what': what, 'voxel_m': size_m}
-            yield {**row, **{f'budget_{name}': value for name, value in budgets.items()}}
-        burst = measure(options, node, listener, BURST_HZ, BURST / BURST_HZ)
-        yield {**burst, 'what': 'burst', 'voxel_m': size_m}
-        scale = min(scale, 1.0)
-        for rate_hz in RATES_HZ:
-            row = measure(options, node, listener, rate_hz, SECONDS_A_RATE * scale)
-            yield {**row, 'voxel_m': size_m}
-            if row['dropped']:
-                break
-        time.sleep(SETTLE_S)
-        row = {'what': 'idle', 'cpu_percent': node.cpu_percent(SECONDS_IDLE * scale)}
-        yield {**row, 'voxel_m': size_m, 'budget_percent': IDLE_BUDGET}
+            row = measure(options, node, listener, seconds, profile=profile)
+            yield {'what': what, 'voxel_m': size_m, **row, **budgets}
 
 
 def measure(
-    options: Options,
-    node: Node,
-    listener: Any,
-    rate_hz: float,
-    seconds: float,
-    *,
-    profile: bool = False,
+    options: Options, node: Node, listener: Any, seconds: float, *, profile: bool
 ) -> dict[str, Any]:
-    """Return the row of a rate."""
+    """Return the row of a lidar."""
     before_s, rss_mb = node.cpu_s(), node.resident_mb()
-    listener.normals.clear()
-    stamps = publish(
-        options, listener.listen_until, rate_hz, round(rate_hz * seconds), profile=profile
-    )
+    num = round(RATE_HZ * seconds)
+    stamps = publish(options, listener.listen_until, num, profile=profile)
     cpu_s = node.cpu_s() - before_s
     return {
-        'what': 'live',
-        'rate_hz': rate_hz,
         **latencies(stamps, listener.arrivals),
-        **normals_ages(stamps, listener.normals),
         'rss_MB': node.resident_mb(),
         'rss_grown_MB': node.resident_mb() - rss_mb,
         'cpu_ms_scan': 1e3 * cpu_s / len(stamps),
-    }
-
-
-def normals_ages(stamps: Sequence[int], normals: Sequence[tuple[int, int]]) -> dict[str, Any]:
-    """
-    Return the number of full maps, and their largest age by the stamp of their latest scan.
-
-    normals has the time of arrival and the stamp of each, ns. One that comes after the last cloud
-    was published when its turn came, which is another time than the age of its scan.
-    """
-    during = [(came - stamp) / 1e6 for came, stamp in normals if came <= stamps[-1]]
-    after = [(came - stamp) / 1e6 for came, stamp in normals if came > stamps[-1]]
-    return {
-        'normals': len(normals),
-        'normals_max_ms': max(during, default=None),
-        'normals_last_ms': max(after, default=None),
     }
 
 
@@ -161,32 +112,12 @@ def latencies(stamps: Sequence[int], arrivals: Mapping[int, int]) -> dict[str, A
     }
 
 
-def transport(options: Options, seconds: float) -> Iterator[Row]:
-    """Yield the latencies of a subscriber that only takes the clouds, without a node."""
-    from nav_msgs.msg import Odometry
-    from sensor_msgs.msg import PointCloud2
-
-    for what, profile in (('transport', False), ('transport with profile', True)):
-        arrivals: dict[int, int] = {}
-
-        def on_cloud(raw: bytes, arrivals: dict[int, int] = arrivals) -> None:
-            sec, nanosec = np.frombuffer(raw, '<u4', 2, 4).tolist()  # after the 4 bytes of CDR
-            arrivals[sec * 10**9 + nanosec] = time.time_ns()
-
-        with spinning() as (node, listen_until):
-            node.create_subscription(PointCloud2, 'points', on_cloud, 20, raw=True)
-            node.create_subscription(Odometry, 'odom', lambda _: None, 1000, raw=True)
-            num = round(RATE_HZ * seconds)
-            stamps = publish(options, listen_until, RATE_HZ, num, profile=profile)
-        yield {'what': what, 'rate_hz': RATE_HZ, **latencies(stamps, arrivals)}
-
-
 def publish(
-    options: Options, listen_until: Listen, rate_hz: float, num: int, *, profile: bool = False
+    options: Options, listen_until: Listen, num: int, *, profile: bool = False
 ) -> list[int]:
     """Let the lidar publish, and listen until it ends; return the stamps."""
     with tempfile.NamedTemporaryFile('w+', encoding='utf-8') as file:
-        with start_lidar(options, rate_hz, num, file.name, profile=profile) as lidar:
+        with start_lidar(options, RATE_HZ, num, file.name, profile=profile) as lidar:
             listen_until(lambda: lidar.poll() is not None)
         stamps: list[int] = json.load(file)
     return stamps
@@ -280,12 +211,6 @@ class Node:
         pages = int(Path(f'/proc/{self._process.pid}/statm').read_text().split()[1])
         return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
 
-    def cpu_percent(self, seconds: float) -> float:
-        """Return the load of the node over a period, in cores."""
-        before_s = self.cpu_s()
-        time.sleep(seconds)
-        return 100.0 * (self.cpu_s() - before_s) / seconds
-
 
 @contextmanager
 def listening() -> Iterator[Any]:
@@ -294,30 +219,21 @@ def listening() -> Iterator[Any]:
     from sensor_msgs.msg import PointCloud2
 
     class Listener:
-        """Records arrivals of changes by stamp, and arrivals and stamps of full maps."""
+        """Records arrivals of changes by stamp."""
 
         def __init__(self, listen_until: Listen) -> None:
             self.arrivals: dict[int, int] = {}
-            self.normals: list[tuple[int, int]] = []
             self.listen_until = listen_until
 
         def on_changed(self, msg: PointCloud2) -> None:
-            self.arrivals[stamp_ns(msg)] = time.time_ns()
-
-        def on_normals(self, msg: PointCloud2) -> None:
-            if msg.width:  # none before the first scan
-                self.normals.append((time.time_ns(), stamp_ns(msg)))
-
-    def stamp_ns(msg: PointCloud2) -> int:
-        return int(msg.header.stamp.sec * 10**9 + msg.header.stamp.nanosec)
+            stamp = msg.header.stamp
+            self.arrivals[int(stamp.sec * 10**9 + stamp.nanosec)] = time.time_ns()
 
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     with spinning() as (node, listen_until):
         listener = Listener(listen_until)
         node.create_subscription(PointCloud2, '/surfel_mapper/changed', listener.on_changed, 50)
-        node.create_subscription(
-            PointCloud2, '/surfel_mapper/normals', listener.on_normals, latched
-        )
+        node.create_subscription(PointCloud2, '/surfel_mapper/normals', lambda _: None, latched)
         yield listener
 
 

@@ -11,7 +11,6 @@ import mmap
 import os
 from pathlib import Path
 import platform
-import resource
 from typing import Any
 
 
@@ -83,8 +82,3 @@ def one_core() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, before)
-
-
-def peak_bytes() -> int:
-    """Return the peak memory of this process, bytes."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -35,10 +35,9 @@ def options(tmp_path_factory):
 
 
 def test_the_voxel_grid_is_timed_and_others_beside_it(options, monkeypatch):
-    monkeypatch.setattr(filters, 'REPEATS', 2)
     points = np.random.default_rng(3).uniform(-5.0, 5.0, (500, 3)).astype(np.float32)
 
-    (row,) = filters.voxel_grids('cube', points, None, options)
+    (row,) = filters.voxel_grids('cube', points, options)
 
     lowest = points.min(axis=0).astype(np.float64)
     occupied = np.unique(np.floor(points / 0.5 - lowest / 0.5), axis=0)
@@ -49,7 +48,7 @@ def test_the_voxel_grid_is_timed_and_others_beside_it(options, monkeypatch):
         raise PeerError(f'no {spec.name} here')
 
     monkeypatch.setattr(filters, 'peer', missing)
-    found = list(filters.voxel_grids('cube', points, None, replace(options, peers=True)))
+    found = list(filters.voxel_grids('cube', points, replace(options, peers=True)))
     assert [row.get('note') for row in found[1:]] == [
         'not measured: no small_gicp here',
         'not measured: no Open3D here',
@@ -92,18 +91,6 @@ def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_
 def test_every_bench_is_a_module_that_says_what_it_is():
     for name in bench.BENCHES:
         assert bench.summary(name).endswith('.')
-
-
-def test_a_full_map_after_the_last_cloud_does_not_count_for_its_age_under_load():
-    pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
-    from test.bench import live
-
-    stamps = [0, 50_000_000, 100_000_000]
-    normals = [(30_000_000, 0), (95_000_000, 50_000_000), (530_000_000, 100_000_000)]
-    found = live.normals_ages(stamps, normals)
-    assert found == {'normals': 3, 'normals_max_ms': 45.0, 'normals_last_ms': 430.0}
-    empty = {'normals': 0, 'normals_max_ms': None, 'normals_last_ms': None}
-    assert live.normals_ages(stamps, []) == empty
 
 
 def test_scans_are_simulated_once_and_kept(options):

@@ -4,7 +4,7 @@
 Fusion of scans and depth images into a signed distance field, and errors of the meshes.
 
 The street's lidar at 0.2 m with a truncation of 3 voxels, with and without carving, and a depth
-camera that turns in a room at 4 cm and 1 cm with 4 voxels, and with colours; on one core.
+camera that turns in a room at 4 cm and 1 cm with 4 voxels; on one core.
 ``x_ours`` is the ratio of processor times, which depend less on other load than clock times. Our
 input is points or depths in the frame of the sensor; VDBFusion gets points in the map frame.
 Errors of meshes are distances from the equations of street and room; a mesh that is empty or less
@@ -15,7 +15,7 @@ least of three.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -38,8 +38,6 @@ from test.bench.peers.run import PeerError
 from test.bench.peers.tsdf import (
     Mesh,
     OPEN3D_LEGACY,
-    OPEN3D_TENSOR,
-    OPEN3D_TENSOR_20,
     run_tsdf,
     VDBFUSION,
 )
@@ -229,10 +227,8 @@ def room_cases(options: Options, scans: int) -> list[Case]:
         np.save(files[-1], depth)
         rays = camera.directions * (depth * camera.ray_length)[..., None]
         truth.append(rays[::8, ::8].reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3])
-    shade = np.linspace(0.0, 255.0, 3 * camera.rows * camera.columns).astype(np.uint8)
-    color = shade.reshape(camera.rows, camera.columns, 3)
     intrinsic = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    cases = [
+    return [
         Case(
             name=f'room {size_m:g} m',
             voxel_size_m=size_m,
@@ -243,7 +239,7 @@ def room_cases(options: Options, scans: int) -> list[Case]:
             image=lambda depth: from_depth(camera, depth),
             distance=room.distance,
             truth=np.concatenate(truth),
-            peers=(OPEN3D_TENSOR, OPEN3D_TENSOR_20, OPEN3D_LEGACY),
+            peers=(OPEN3D_LEGACY,),
             settings={
                 'intrinsic': intrinsic,
                 'columns': camera.columns,
@@ -254,11 +250,3 @@ def room_cases(options: Options, scans: int) -> list[Case]:
         )
         for size_m in (0.04, 0.01)
     ]
-    colored = replace(
-        cases[0],
-        name=f'{cases[0].name}, colour',
-        image=lambda depth: from_depth(camera, depth).with_images(color=color),
-        peers=(),
-        ours={'color': True},
-    )
-    return [*cases, colored]

@@ -29,18 +29,6 @@ VDBFUSION = PeerSpec(
     python='3.10',  # there are no wheels for later ones
 )
 
-OPEN3D_TENSOR = PeerSpec(
-    name='Open3D 0.19 VoxelBlockGrid',
-    module='test.bench.peers.tsdf_open3d_tensor',
-    requires=OPEN3D,
-)
-
-OPEN3D_TENSOR_20 = PeerSpec(
-    name='Open3D 0.20 VoxelBlockGrid',
-    module='test.bench.peers.tsdf_open3d_tensor',
-    requires=('open3d-cpu==0.20.0',),
-)
-
 OPEN3D_LEGACY = PeerSpec(
     name='Open3D 0.19 ScalableTSDFVolume',
     module='test.bench.peers.tsdf_open3d_legacy',
