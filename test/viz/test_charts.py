@@ -15,9 +15,6 @@ from surfel_mapper.viz.charts import (
     named_bars,
     NO_DATA,
     NUM_BINS,
-    POINTS,
-    short,
-    thinned,
     WIDTH,
 )
 
@@ -64,23 +61,6 @@ def test_nan_leaves_a_gap_and_a_line_of_nan_alone_is_left_out():
     assert paths(svg, 'var(--line-1)') == []
 
 
-def test_one_value_far_above_all_others_does_not_flatten_them():
-    values = np.r_[1e6, np.linspace(1.0, 2.0, 99)]
-    corners, _ = line_of(lines(np.arange(100.0), {'a': values}, 's', 'n'))
-    assert np.ptp(corners[-50:, 1]) > 7.5
-
-
-def test_lines_take_their_colours_from_the_page_and_their_names_stand_in_the_legend():
-    svg = lines(np.arange(3.0), {'_a': np.ones(3), 'b': np.zeros(3)}, 's', 'n')
-    assert paths(svg, 'var(--line-0)')
-    assert paths(svg, 'var(--line-1)')
-    text = ''.join(ElementTree.fromstring(svg).itertext())
-    assert '_a' in text
-    assert 'b' in text
-    assert '#fe00' not in svg
-    assert '<style' not in svg
-
-
 @pytest.mark.parametrize('values', [[], [np.nan], [0.0], [5.0, 5.0]])
 def test_few_values_are_drawn_and_no_values_are_reported(values):
     x = np.arange(float(len(values)))
@@ -117,20 +97,3 @@ def test_text_is_escaped_everywhere():
         ElementTree.fromstring(svg)
         assert '<script' not in svg
         assert NASTY in ''.join(ElementTree.fromstring(svg).itertext())
-
-
-def test_names_that_are_no_text_are_escaped():
-    """Surrogates come from names of files that are not UTF-8; they ended the report."""
-    one, name = np.ones(3), 'a\ud800\x00\n'
-    for svg in lines(np.arange(3.0), {name: one}, 'x', 'y'), named_bars({name: 1}):
-        assert r'a\ud800\x00\n' in ''.join(ElementTree.fromstring(svg).itertext())
-
-
-def test_a_long_line_is_thinned_to_medians():
-    x, y = thinned(np.arange(10_000.0), np.tile([1.0, 1.0, 9.0], 3334)[:10_000])
-    assert len(x) == len(y) == POINTS
-    assert set(y) == {1.0}
-
-
-def test_numbers_are_short():
-    assert [short(v) for v in (0.25, 17.0, 2e4, 1.5e6, 3e9)] == ['0.25', '17', '20k', '1.5M', '3G']

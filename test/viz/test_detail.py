@@ -82,23 +82,6 @@ def test_a_map_within_the_limit_is_shown_whole(hills):
     assert found.choose([0.0, 0.0, 0.0], total - 1).any()
 
 
-def test_too_small_a_limit_gives_the_coarsest_level(hills):
-    found = detailed(hills)
-    assert (found.choose([0.0, 0.0, 0.0], 1) == LEVELS).all()
-
-
-def test_a_few_surfels_far_apart_make_few_tiles():
-    surfel_map = SurfelMap(0.5)
-    places = 10.0 ** np.arange(5)[:, None] * [1.0, -1.0, 0.0]
-    rng = np.random.default_rng(0)
-    surfel_map.add((places[:, None] + rng.uniform(0.0, 0.4, (5, 10, 3))).reshape(-1, 3))
-    found = detailed(surfel_map)
-
-    assert 1 < len(found) <= 5 * 4
-    drawn = sum(len(found.surfels(tile, 0)) for tile in range(len(found)))
-    assert drawn == surfel_map.num_surfels(MIN_POINTS)
-
-
 def test_an_empty_map_has_no_tiles():
     found = detailed(SurfelMap(0.5))
     assert len(found) == 0

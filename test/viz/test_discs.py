@@ -99,20 +99,9 @@ def test_colours_and_labels_are_taken_as_they_are():
     np.testing.assert_array_equal(Colouring.over('label', [shown]).of(shown), PALETTE[[0, 1, 0]])
 
 
-def test_level_ground_is_brighter_than_its_underside():
-    up, down = many(a=np.zeros(1)), many(a=np.zeros(1))
-    down.normal[:] *= -1.0
-    assert Colouring().of(up).sum() > 1.5 * Colouring().of(down).sum()
-
-
 @pytest.mark.parametrize(
     'kind', [kind for kind in COLOURINGS if kind not in ('normal', 'height', 'planarity')]
 )
 def test_values_that_nothing_has_are_refused(kind):
     with pytest.raises(ConfigError, match=rf"colouring '{kind}': nothing shown has it.*: quality"):
         Colouring.over(kind, [discs(quality=np.zeros(3))])
-
-
-def test_unknown_colourings_are_refused():
-    with pytest.raises(ConfigError, match=r"colouring 'hight', expected one of normal, height"):
-        Colouring.over('hight', [discs()])

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -13,8 +11,6 @@ from surfel_mapper.config import ModelsConfig
 from surfel_mapper.layers.drawings import PointsPicture, Section, Table
 from surfel_mapper.layers.models.pictures import (
     drawings_of,
-    MOST_POINTS,
-    MOST_ROWS,
     panels_of,
     section_of,
 )
@@ -78,18 +74,6 @@ def test_the_section_names_every_patch_with_its_numbers(seen):
     assert f'<dt>Gaussians</dt><dd>{len(model.gaussians)}</dd>' in text
 
 
-def test_the_largest_of_many_patches_are_named(seen):
-    model, shapes = seen
-    many = [
-        replace(shape, patch=replace(shape.patch, id=100 * k + shape.patch.id))
-        for k in range(5)
-        for shape in shapes
-    ]
-    text = section_html(section_of(model, many))
-    assert text.count('class="swatch"') == MOST_ROWS < len(many)
-    assert f'The largest {MOST_ROWS} of {len(many)}.' in text
-
-
 def test_models_of_nothing_are_a_section_too():
     text = section_html(section_of(fit(np.empty((0, 3))), []))
     assert '<dt>planes</dt><dd>0</dd>' in text
@@ -108,16 +92,6 @@ def test_models_are_a_layer_and_a_section_of_the_report(seen, tmp_path):
     assert [a['src'][:22] for _, a in parsed.tags if a.get('class') == 'wide'] == [
         'data:image/png;base64,'
     ]
-
-
-@pytest.mark.parametrize(
-    ('num', 'step'), [(1, 1), (MOST_POINTS, 1), (MOST_POINTS + 1, 2), (2 * MOST_POINTS + 1, 3)]
-)
-def test_no_picture_has_more_points_than_its_limit(seen, num, step):
-    points = np.repeat(np.arange(float(num))[:, None], 3, axis=1)
-    cloud = panels_of(points, seen[0])[0].points
-    assert len(cloud) <= MOST_POINTS
-    np.testing.assert_array_equal(cloud, points[::step])
 
 
 def test_texts_of_a_section_are_escaped():

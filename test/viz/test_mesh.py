@@ -11,7 +11,6 @@ import pytest
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 from surfel_mapper.viz.mesh import MAX_TRIANGLES, reduced, VERTEX, vertex_normals
 from surfel_mapper.viz.report import write_report
-from surfel_mapper.viz.turning_view import BESIDE_MESHES, SURFEL
 from test.viz.test_history import mapped
 from test.viz.test_report import Parsed, plane
 
@@ -40,12 +39,6 @@ def test_normals_point_away_from_the_middle_of_a_sphere():
     unit = mesh.vertices / 2.0
     rest = np.abs(unit[:, 2]) < 0.999  # several vertices are at a pole
     assert (normals * unit).sum(axis=1)[rest].min() > 0.99
-
-
-def test_a_small_mesh_stays_as_it_is():
-    mesh = sphere(10)
-    assert reduced(mesh) is mesh
-    assert reduced(EMPTY) is EMPTY
 
 
 @pytest.mark.parametrize('most', [2000, 10_000])
@@ -97,17 +90,6 @@ def test_a_large_mesh_makes_no_large_page(tmp_path):
     assert size < 2_000_000
     assert len(base64.b64decode(data['layers'][0]['triangles'])) <= 12 * MAX_TRIANGLES
     assert 'shown' in [attributes.get('id') for _, attributes in parsed.tags]
-
-
-def test_two_large_meshes_beside_many_surfels_make_no_large_page(tmp_path):
-    large = sphere(300, 20.0, (5.0, 5.0, 5.0))
-    size, _, data = page(tmp_path, large, large, surfels=plane(215))
-
-    assert len(base64.b64decode(data['surfels'])) == SURFEL.itemsize * BESIDE_MESHES
-    drawn = [len(base64.b64decode(layer['triangles'])) // 12 for layer in data['layers']]
-    assert min(drawn) > MAX_TRIANGLES // 6
-    assert sum(drawn) <= MAX_TRIANGLES
-    assert size < 1_600_000  # pictures of map and models take another 0.4 MB
 
 
 def test_without_a_mesh_there_is_nothing_to_choose(tmp_path):

@@ -8,9 +8,9 @@ import numpy as np
 from PIL import Image
 import pytest
 
-from surfel_mapper.errors import ConfigError, FileFormatError
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.viz.picture import draw_map, Frame, label, limits, views, X, Y, Z
+from surfel_mapper.viz.picture import draw_map, Frame, limits, views, X, Y, Z
 
 YELLOW, PURPLE = np.array([[0.993, 0.906, 0.144], [0.267, 0.005, 0.329]])
 """Both ends of viridis, the colours of planarity 1 and 0."""
@@ -65,12 +65,6 @@ def test_planes_are_of_one_colour_whatever_their_planarity(tmp_path):
     expected = (0.55 * 0.88 + 0.45 * np.array([0.5, 0.5, 1.0])) * (0.3 + 0.7 * (0.5 + 0.5 * 0.73))
     assert num_pixels(image, expected) > 100_000
     assert num_pixels(drawn(tmp_path, striped), expected) == 0
-
-
-def test_an_unknown_colouring_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="colouring 'height', expected one of normal, planarity"):
-        draw_map(sheet(0.0, 1.0, 1.0), tmp_path / 'map.png', colouring='height')
-    assert not (tmp_path / 'map.png').exists()
 
 
 def test_a_roof_hides_the_ground(tmp_path):
@@ -130,29 +124,6 @@ def test_pixels_lie_where_the_axes_say_whichever_way_they_run():
         assert (image[:, column] < 255.0).all()
 
 
-def test_the_axes_have_the_coordinates_of_the_fixed_frame():
-    low, high = np.array([-3.0, 10.0, 0.0]), np.array([5.0, 50.0, 2.0])
-    origin_m = np.array([400_000.3, 5_400_000.7, 0.0])
-    frame = Frame.of(views(high - low)[0], (low, high), 10.0, origin_m)
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    axes = FigureCanvasAgg(Figure()).figure.add_subplot()
-
-    label(axes, frame)
-
-    axes.figure.canvas.draw()
-    across, up = (axis.get_ticklocs() for axis in (axes.xaxis, axes.yaxis))
-    np.testing.assert_allclose(across, [5_400_020.0, 5_400_040.0])
-    np.testing.assert_allclose(up, [400_000.0, 400_005.0])
-    assert [text.get_text() for text in axes.get_xticklabels()] == ['5400020', '5400040']
-    assert axes.get_xlim() == pytest.approx((5_400_010.7, 5_400_050.7), abs=1e-6)
-    assert axes.get_ylim() == pytest.approx((400_005.3, 399_997.3), abs=1e-6)
-    local = frame.ticks()[0]
-    np.testing.assert_allclose(local, [19.3, 39.3])  # where the grid is drawn
-    assert (frame.gridded()[:, np.rint((local - 10.0) * 10.0 - 0.5).astype(int)] < 255.0).all()
-
-
 def test_the_trajectory_is_drawn(tmp_path):
     path = np.column_stack([np.linspace(-8.0, 8.0, 50), np.zeros(50), np.full(50, 1.0)])
 
@@ -176,17 +147,6 @@ def test_a_map_without_surfels_gives_empty_axes(tmp_path):
     nothing = sheet(0.0, 1.0, 1.0).select(np.zeros(0, np.int64))
 
     assert drawn(tmp_path, nothing).min() < 0.5
-
-
-def test_a_single_surfel_is_drawn(tmp_path):
-    assert num_pixels(drawn(tmp_path, sheet(0.0, 1.0, 1.0).select(np.array([7]))), YELLOW) > 1000
-
-
-@pytest.mark.parametrize('title', ['caf\udce9.mcap', 'a$x^$.mcap', '$\\frac', 'a\0\x1b[31m'])
-def test_any_name_of_a_file_can_be_the_title(tmp_path, title):
-    """Formulas that are none, and names that are not UTF-8, ended a replay before its report."""
-    draw_map(sheet(0.0, 1.0, 1.0), tmp_path / 'a.png', title)
-    assert Image.open(tmp_path / 'a.png').size > (100, 100)
 
 
 def test_the_same_map_gives_the_same_file(tmp_path):

@@ -213,42 +213,6 @@ def test_a_click_shows_the_values_of_a_surfel(opened):
     assert complaints == []
 
 
-def test_keys_turn_and_zoom_the_map(opened):
-    page, complaints = opened
-    page.locator('#surfels').focus()
-    page.keyboard.press('0')
-    settle(page)
-    before = pixels(page)  # with the outline of the focus
-
-    def is_moved(image):
-        return np.abs(image - before).mean() > 0.01
-
-    for key in ('ArrowLeft', '+', 'Shift+ArrowUp'):
-        for _ in range(3):
-            page.keyboard.press(key)
-        assert is_moved(picture_when(page, is_moved)), key
-        page.keyboard.press('0')
-        again = picture_when(page, lambda image: np.allclose(image, before, atol=0.03))
-        np.testing.assert_allclose(again, before, atol=0.03)
-    assert complaints == []
-
-
-def test_the_bar_has_the_length_that_it_states(opened):
-    page, _ = opened
-    metres = float(page.locator('#metres').text_content().removesuffix(' m'))
-    width = page.locator('#bar').evaluate('part => part.getBoundingClientRect().width')
-    box = page.locator('#surfels').bounding_box()
-    seen = []
-    for column in (-150, 150):  # the middle of the map is in the middle, its x to the right
-        page.mouse.click(box['x'] + box['width'] / 2 + column, box['y'] + box['height'] / 2)
-        page.locator('#values').wait_for()
-        seen.append(float(page.locator('#values').inner_text().split()[3]))
-
-    # picked are the middles of surfels of 0.5 m
-    np.testing.assert_allclose(300.0 / width * metres, seen[1] - seen[0], atol=0.6)
-    assert 24.0 < width <= 120.0
-
-
 def test_the_whole_map_is_in_view_on_a_telephone(browser, written):
     page = browser.new_page(viewport={'width': 390, 'height': 844}, is_mobile=True, has_touch=True)
     page.set_default_timeout(1000 * WAIT_S)
@@ -327,15 +291,3 @@ def test_the_policy_blocks_everything_injected_into_the_page(browser, written, t
     blocked = [text for text in complaints if 'Content Security Policy' in text]
     assert len(set(blocked)) == len(INJECTED), complaints
     page.close()
-
-
-def test_plots_and_swatches_keep_their_styles(opened):
-    page, _ = opened
-    styled = page.locator('[style]:not([style=""])')
-    assert styled.count() == page.locator('.ramp, #bar').count()  # by the script
-    colour = page.locator('#swatch').evaluate('part => getComputedStyle(part).color')
-    assert colour == 'rgb(1, 2, 3)'
-    bars = page.locator('svg path[data-style]').evaluate_all(
-        'parts => parts.map((part) => getComputedStyle(part).fill)'
-    )
-    assert 'rgb(59, 111, 140)' in bars  # --bar

@@ -190,18 +190,6 @@ def hidden(tmp_path):
     }
 
 
-def test_a_mesh_is_hidden_only_beside_surfels(tmp_path, capsys):
-    ground_map().save(tmp_path / 'map.npz')
-    write_mesh(tmp_path / 'mesh.ply', sphere(8, 3.0, (5.0, 5.0, 5.0)))
-    shown(tmp_path, tmp_path / 'map.npz', tmp_path / 'mesh.ply')
-    assert hidden(tmp_path) == {'/map/mesh'}
-    assert 'triangles, hidden: its eye' in capsys.readouterr().out
-
-    shown(tmp_path, tmp_path / 'mesh.ply')
-    assert hidden(tmp_path) == set()
-    assert 'hidden' not in capsys.readouterr().out
-
-
 def test_surfels_of_ply_are_discs_with_their_values(tmp_path, capsys):
     surfel_map = ground_map(UTM)
     surfel_map.save(tmp_path / 'map.ply')

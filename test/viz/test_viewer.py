@@ -21,7 +21,7 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.viz import scene
 from surfel_mapper.viz.server import LIVE, started_server
-from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
+from surfel_mapper.viz.viewer import Viewer
 from test import extras
 from test.bags.recorded import drive, write_rosbag2
 from test.layers.test_distance_field import insert, mapper_with
@@ -50,15 +50,6 @@ def test_a_replay_is_recorded_with_scans_surfels_trajectory_and_window(tmp_path)
     printed = rerun('print', file).stdout
     for entity in ENTITIES:
         assert entity in printed
-
-
-def test_points_are_picked_evenly_and_finite():
-    points = np.arange(3.0 * 50_000).reshape(-1, 3)
-    points[7] = np.nan
-    found = picked(points)
-    assert MAX_POINTS / 2 < len(found) <= MAX_POINTS
-    assert np.isfinite(found).all()
-    assert len(picked(points[:10])) == 9
 
 
 def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
@@ -164,13 +155,6 @@ def test_a_recording_for_which_there_is_no_room_is_a_sentence(tmp_path):
     assert 'map.rrd: cannot be written: ' in done.stderr
     assert 'Traceback' not in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ['map.npz']
-
-
-def test_a_recording_is_not_written_to_a_pipe(tmp_path):
-    """Without a reader it blocked for ever."""
-    os.mkfifo(tmp_path / 'pipe')
-    with pytest.raises(FileFormatError, match='not a regular file'):
-        scene.Scene.to_file(tmp_path / 'pipe')
 
 
 def test_a_recording_has_any_name_and_replaces_another_as_a_whole(tmp_path):
