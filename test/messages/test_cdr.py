@@ -102,12 +102,6 @@ def make_marker(frame_id='odom', ns='discs', points=3, coloured=True, seed=0, **
     return Marker(**{**values, **changes})
 
 
-@pytest.mark.parametrize(('frame_id', 'ns'), product(TEXTS, TEXTS))
-def test_strings_of_any_length_leave_everything_in_place(frame_id, ns):
-    markers = [make_marker(frame_id, ns), make_marker(ns, frame_id, points=0)]
-    assert marker_array(markers) == b'\x00\x01\x00\x00' + twin(markers)[0]
-
-
 NAMES = st.text(st.characters(exclude_characters='\0', exclude_categories=['Cs']), max_size=9)
 MARKERS = st.lists(
     st.builds(

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import colorsys
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -27,9 +25,7 @@ from surfel_mapper.messages.model_messages import (
     model_markers,
     most_points,
     NONE,
-    OPACITY,
     PLANE,
-    primitive_colors,
     primitive_columns,
     SURFACE,
     surfel_primitive_columns,
@@ -95,26 +91,6 @@ def test_every_patch_is_filled_and_has_outline_and_id(seen, markers):
         assert starts == {tuple(corner) for corner in ends[:, 1].tolist()}
         assert starts == {tuple(corner) for ring in shape.rings for corner in ring.tolist()}
     assert set(found) == names
-
-
-def test_the_text_of_the_id_is_a_voxel_above_its_plane(seen, markers):
-    found = by_name(markers)
-    for plane in seen[0].planes:
-        place = np.array(found['ids', plane.id].pose[:3])
-        assert place @ plane.normal + plane.offset_m == pytest.approx(A)
-
-
-def test_colours_follow_from_ids_and_differ(seen, markers):
-    found = by_name(markers)
-    for plane in seen[0].planes:
-        red, green, blue, opacity = found['planes', plane.id].color
-        assert opacity == OPACITY
-        assert colorsys.rgb_to_hsv(red, green, blue)[1:] == pytest.approx((0.75, 0.9))
-        assert found['outlines', plane.id].color == (red, green, blue, 1.0)
-    colors = primitive_colors(range(30))
-    apart = np.linalg.norm(colors[:, None] - colors, axis=2)[~np.eye(30, dtype=bool)]
-    assert apart.min() > 0.04
-    assert np.array_equal(primitive_colors([7, 3])[1], colors[3])
 
 
 def test_surfaces_and_gaussians_are_shaded(seen, markers):

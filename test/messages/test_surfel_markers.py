@@ -7,7 +7,7 @@ import pytest
 
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
-from surfel_mapper.messages.kernels.discs import draw_discs, draw_normals
+from surfel_mapper.messages.kernels.discs import draw_discs
 from surfel_mapper.messages.markers import (
     ADD,
     DELETE,
@@ -76,16 +76,6 @@ def test_triangles_tile_a_regular_polygon_that_faces_along_the_normal(segments, 
     np.testing.assert_array_equal(colors, np.repeat(given, 3 * (segments - 2), axis=0))
 
 
-@both
-def test_lines_go_from_the_surfel_along_its_normal(call):
-    surfels = make_surfels(5)
-    points = np.empty((6, 3))
-    call(draw_normals, (surfels.position, surfels.normal), np.array([4, 0, 2]), 0.25, points)
-    start, end = points.reshape(3, 2, 3).transpose(1, 0, 2)
-    np.testing.assert_array_equal(start, surfels.position[[4, 0, 2]])
-    np.testing.assert_allclose(end - start, 0.25 * surfels.normal[[4, 0, 2]], atol=1e-13)
-
-
 def test_the_discs_of_full_voxels_touch():
     n = 200_000
     side = np.random.default_rng(1).uniform(0.0, 0.5, (n, 2))  # a plane across a 0.5 m voxel
@@ -105,10 +95,6 @@ def test_colours_run_from_dark_to_bright():
     assert (colors[:, 3] == 1.0).all()
     luminance = colors[:, :3].astype(float) ** 2.2 @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(luminance) > 0.0).all()
-
-
-def test_colours_stay_in_the_palette():
-    np.testing.assert_array_equal(shades(np.array([-1.0, np.nan, 2.0])), shades(np.r_[0, 0, 1.0]))
 
 
 def test_normals_have_the_colours_of_their_directions():
