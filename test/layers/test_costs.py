@@ -62,12 +62,6 @@ def test_a_step_costs_its_share_on_both_sides_of_it():
     assert (grid.cost[:, 11:] == 0).all()
 
 
-def test_a_step_along_the_other_axis_costs_the_same():
-    along_y = grid_of(ground(lambda x, y: 0.1 + 0.125 * (y > 1.0)))
-    along_x = grid_of(ground(lambda x, y: 0.1 + 0.125 * (x > 1.0)))
-    np.testing.assert_array_equal(along_y.cost, along_x.cost.T)
-
-
 def test_a_kerb_above_the_limit_a_hole_and_a_wall_are_obstacles():
     kerb = grid_of(ground(lambda x, y: 0.1 + 0.3 * (x > 1.0)))
     hole = grid_of(ground(lambda x, y: 0.1 - 0.7 * ((abs(x - 1.25) < 0.25) & (abs(y) < 0.5))))

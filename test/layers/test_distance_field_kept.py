@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The distance field of a mapper is saved, loaded, archived and cleared with its map."""
 
-import itertools
 import os
-import shutil
-import sys
 
 import numpy as np
 import pytest
@@ -13,7 +10,7 @@ import pytest
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.parquet_tiles import write_tiles
 from surfel_mapper.files.ply import read_points
-from surfel_mapper.pipeline.checkpoints import checkpoint_paths, Checkpoints, duplicate, load_start
+from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
 from surfel_mapper.pipeline.regions import Box
 from surfel_mapper.pipeline.saved_state import load_mapper, save_mapper
 from surfel_mapper.ros.map_files import load_map, save_map
@@ -104,73 +101,6 @@ def test_a_checkpoint_and_map_load_have_the_field(tmp_path, start):
     assert_same_field(field_of(other), field_of(mapper))
     load_mapper(tmp_path / 'map.checkpoint.1.npz', other)
     assert_same_field(field_of(other), first)
-
-
-class Killed(BaseException):
-    """The process ends here."""
-
-
-def is_killed(call, number, functions):
-    """Call a function; raise Killed before the number-th line that runs in some functions."""
-    codes, lines = {function.__code__ for function in functions}, itertools.count(1)
-
-    def on_line(frame, event, _):
-        if event == 'line' and next(lines) == number:
-            raise Killed
-        return on_line
-
-    before = sys.gettrace()
-    sys.settrace(lambda frame, *_: on_line if frame.f_code in codes else None)
-    try:
-        call()
-    except Killed:
-        return True
-    finally:
-        sys.settrace(before)
-    return False
-
-
-def content(mapper):
-    """Return map and field of a mapper, to be compared."""
-    field = field_of(mapper)
-    return mapper.map.digest(), field.index.tobytes(), field.field.tobytes()
-
-
-@pytest.mark.parametrize('has_links', [True, False])
-def test_a_map_with_its_field_is_found_wherever_a_checkpoint_was_killed(
-    tmp_path, monkeypatch, has_links
-):
-    folder, kept = tmp_path / 'maps', tmp_path / 'kept'
-    settings = {'output.directory': str(folder), 'map.load': 'latest'}
-    mapper, contents = mapper_with(**settings), []
-    for number in (1, 2, 3):
-        insert(mapper, number, (float(number), 0.0, 0.0))
-        contents.append(content(mapper))
-        if number < 3:
-            Checkpoints(mapper).save()
-    assert all(len(set(values)) == 3 for values in zip(*contents, strict=True))
-    shutil.copytree(folder, kept)
-    if not has_links:
-
-        def refuse(*_, **__):
-            raise PermissionError('as on FAT')
-
-        monkeypatch.setattr(os, 'link', refuse)
-    steps = Checkpoints.save, duplicate, save_mapper
-    for number in itertools.count(1):
-        shutil.rmtree(folder)
-        shutil.copytree(kept, folder)
-        killed = is_killed(Checkpoints(mapper).save, number, steps)
-        found = mapper_with(**settings)
-        load_start(found)
-        assert content(found) in contents[1:], number
-        Checkpoints(mapper).save()
-        for path in checkpoint_paths(mapper.config.output):
-            load_mapper(path, found)
-            assert content(found) in contents[1:], (number, path)
-        if not killed:
-            break
-    assert number > 20
 
 
 def test_a_drive_with_an_archive_has_a_mesh_of_all_of_it(tmp_path):

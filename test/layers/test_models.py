@@ -16,7 +16,6 @@ from surfel_mapper.scan import Scan
 from test.alignment.street import drifted, street_scans
 from test.fields import config_of
 from test.models.live_scenes import groups, ids, live
-from test.models.scenes import room, VIEW
 
 S = 10**9
 SETTINGS = {
@@ -72,19 +71,6 @@ def test_a_street_has_its_ground_and_its_walls(street):
     }
     assert mapper.counters.summary()['milliseconds']['models']['median'] > 0.0
     assert_up_to_date(mapper)
-
-
-def test_a_room_has_floor_walls_and_the_faces_of_the_box():
-    points, _ = room(320, 240)
-    scan = Scan(points=(points - VIEW).astype(np.float32), stamp_ns=S, frame_id='lidar')
-    mapper = mapper_with(map__voxel_size_m=0.1, layers__models__noise_m=0.0)
-    pose = np.eye(4)
-    pose[:3, 3] = VIEW
-    (update,) = feed(mapper, [scan], [pose])
-    assert len(update.models.created) == len(mapper.models.versions)
-    normals = np.abs([plane.normal for plane in mapper.models.model.planes])
-    assert sorted(normals.argmax(axis=1).tolist()) == [0, 0, 1, 1, 2, 2]
-    assert normals.max(axis=1) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_models_follow_by_the_stamps_of_the_scans():

@@ -3,7 +3,6 @@
 """Mesh and file of a drive from its archive, region by region: those of all blocks in one map."""
 
 from functools import partial
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -184,27 +183,6 @@ def test_empty_archive_is_saved_as_an_empty_field(tmp_path):
     parts = partial(merged_parts, empty, BlockArchive(tmp_path / 'a'))
     save_tsdf_parts(tmp_path / 'empty.npz', empty.config, parts)
     assert load_tsdf(tmp_path / 'empty.npz', empty.config).num_blocks == 0
-
-
-def test_saving_an_archive_takes_the_memory_of_a_region(tmp_path, monkeypatch):
-    monkeypatch.setattr(tsdf_archive, 'REGION', 8)
-    monkeypatch.setattr(whole_surface, 'REGION', 8)
-    blocks = hilly(config(), shape=(24, 16, 5))
-    archive = archived(tmp_path, blocks, stay=0.0)
-    tracemalloc.start()
-    try:
-        for part in merged_parts(blocks, archive):
-            assert len(part) <= 8**3
-        of_parts = tracemalloc.get_traced_memory()[1]
-        tracemalloc.reset_peak()
-        save_tsdf_parts(tmp_path / 'm.npz', blocks.config, partial(merged_parts, blocks, archive))
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    size = (tmp_path / 'm.npz').stat().st_size
-    assert size > 3e6
-    assert peak < 0.5 * size
-    assert peak < of_parts + 1e6  # the pieces in which bytes are written, and the keys
 
 
 def test_archive_that_cannot_be_saved_leaves_the_old_file(tmp_path):
