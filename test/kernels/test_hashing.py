@@ -131,55 +131,6 @@ def test_rows_are_inserted_and_removed_as_in_a_dict(call):
 
 
 @both
-def test_a_crowded_bucket_can_lose_any_of_its_rows(call):
-    rng = np.random.default_rng(2)
-    keys = colliding_keys(90, rng)[:60].tolist()
-    for first in range(0, 60, 4):
-        owner = Owner(call, 60, 1)
-        for row, key in enumerate(keys):
-            owner.insert(key, row)
-        for key in [keys[first], *rng.permutation(keys)[:20].tolist()]:
-            if key in owner.expected:
-                owner.remove(key)
-                owner.check()
-
-
-def test_neighbouring_voxels_fill_the_table_evenly():
-    owner = Owner(compiled, 64**3 // 4, 2048)
-    side = np.arange(-20, 20)
-    index = np.stack(np.meshgrid(side, side, side, indexing='ij'), -1).reshape(-1, 3) + 2**20
-    keys = ((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]).tolist()
-    for row, key in enumerate(keys):
-        owner.insert(key, row)
-    num_segments = int(owner.state[NEXT_SEGMENT])
-    assert len(keys) / (num_segments * SEGMENT) > 0.4  # even halves: from 1/4 to 3/4 full
-    assert owner.state[DEPTH] <= np.log2(num_segments) + 2
-
-
-@both
-def test_a_segment_does_not_split_without_room(call):
-    owner = Owner(call, FULLEST, 2)
-    keys = np.random.default_rng(3).integers(0, 2**62, FULLEST).tolist()
-    for row, key in enumerate(keys):
-        owner.insert(key, row)
-    before = [array.copy() for array in (*owner.table, owner.state)]
-    hashed = hash_key(np.int64(keys[0]))
-    assert not call(
-        split_segment, hashed, owner.table, owner.state, owner.entries
-    )  # the directory is full
-    for array, copy in zip((*owner.table, owner.state), before, strict=True):
-        assert (array == copy).all()
-    owner.directory = np.repeat(owner.directory, 2)
-    owner.state[DEPTH] += 1
-    assert call(split_segment, hashed, owner.table, owner.state, owner.entries)
-    owner.check()
-    assert owner.state[NEXT_SEGMENT] == 2
-    assert not call(
-        split_segment, hashed, owner.table, owner.state, owner.entries
-    )  # no third segment
-
-
-@both
 @pytest.mark.parametrize('key', [0, 1, 2**63 - 1, 2**42, (2**20 << 42) + (2**20 << 21) + 2**20])
 def test_hashes_are_the_same_compiled_and_interpreted_and_have_32_bits(call, key):
     hashed = int(call(hash_key, np.int64(key)))

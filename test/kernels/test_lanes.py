@@ -62,16 +62,6 @@ def test_places_are_added_to_the_words_from_an_index_on(call, at):
     assert words.tolist() == after.tolist()
 
 
-@both
-def test_sums_are_dropped(call):
-    places = np.array([[1, 2, 3], [HIGHEST, 4, HIGHEST]])
-    words = np.zeros(3 * WORDS, np.int64)
-    words[WORDS:] = -5
-    call(add_at, words, np.uint64(WORDS), places, True)
-    assert words[WORDS : 2 * WORDS].tolist() == expected(places[1:])
-    assert (words[2 * WORDS :] == -5).all()
-
-
 @pytest.mark.parametrize('corner', [(0, 0, 0), (HIGHEST, 0, HIGHEST), (HIGHEST,) * 3])
 def test_words_hold_the_sums_of_a_full_voxel_and_the_count_of_the_widest(corner):
     words = np.zeros(2 * WORDS, np.int64)
@@ -111,20 +101,6 @@ def test_the_highest_match_is_that_of_python(call, first, upper):
         assert call(search, entries, first, upper) == highest_lower_half(entries, first, upper)
         found.add(highest_lower_half(entries, first, upper) > 0)
     assert found == {True, False}
-
-
-@both
-@pytest.mark.parametrize('place', range(WORDS))
-def test_every_word_of_the_eight_is_looked_at_and_no_other(call, place):
-    entries = np.zeros(3 * WORDS, np.int64)
-    entries[WORDS + place] = 5 << 32 | 9
-    assert [call(search, entries, first, 5) for first in (0, 8, 16)] == [0, 9, 0]
-    assert call(search, entries, WORDS, 9) == 0
-
-
-@both
-def test_words_of_zero_match_zero_with_zero(call):
-    assert call(search, np.zeros(WORDS, np.int64), 0, 0) == 0
 
 
 @njit
@@ -200,11 +176,3 @@ def test_the_least_number_not_passed_over_is_found_wherever_it_is(call):
         only = np.uint64(2**NUMBERS - 1 - 2**place)
         assert call(least_of, np.full(NUMBERS, np.inf), only) == place
     assert call(least_of, np.zeros(NUMBERS), np.uint64(2**NUMBERS - 1)) == NUMBERS - 1
-
-
-@both
-def test_numbers_that_differ_by_more_than_the_places_in_their_bits_are_told_apart(call):
-    for number in (1e-12, 0.3, 1.0, 1.99, 5e5):
-        numbers = np.full(NUMBERS, number)
-        numbers[9] *= 1.0 - 2.0**-15
-        assert call(least_of, numbers, np.uint64(0)) == 9
