@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from surfel_mapper.sensors.depth import depth_points, PinholeCamera
-from surfel_mapper.sensors.kernels.depth import unproject
-from test.kernels.modes import both
 
 CAMERA = PinholeCamera(width=40, height=30, fx=35.0, fy=36.0, cx=19.2, cy=14.7)
 
@@ -68,17 +66,6 @@ def test_any_layout_of_the_image_will_do():
     frozen.flags.writeable = False
     for other in (wide[:, :40], frozen):
         np.testing.assert_array_equal(depth_points(other, CAMERA), expected)
-
-
-@both
-def test_the_kernel_goes_row_by_row(call):
-    depth = np.array([[1000, 0], [3000, 4000]], np.uint16)
-    points = np.empty((3, 4), np.float32)
-    across, down = np.array([-0.5, 0.5]), np.array([0.0, 0.25])
-    assert call(unproject, depth, 1e-3, 65535.0, across, down, points) == 3
-    np.testing.assert_allclose(
-        points[:, :3], [[-0.5, -1.5, 2.0], [0.0, 0.75, 1.0], [1.0, 3.0, 4.0]], rtol=1e-7
-    )
 
 
 def test_an_image_of_another_size_or_type_is_refused():

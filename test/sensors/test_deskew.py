@@ -13,7 +13,7 @@ from surfel_mapper.errors import CloudFormatError, ConfigError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, se3_exp
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.poses import TransformBuffer
-from surfel_mapper.scan import LazyPoints, PointTimes, Scan
+from surfel_mapper.scan import PointTimes, Scan
 from surfel_mapper.sensors.deskew import (
     deskewed,
     MAX_TURN_RAD,
@@ -78,19 +78,6 @@ def test_negative_times_that_wrapped_are_negative():
     found = point_times(sweep(times))
     assert found.offsets.tolist() == [-300, 0, 99 * MS]
     assert (found.first_ns, found.last_ns) == (START_NS - 300, START_NS + 99 * MS)
-
-
-@pytest.mark.parametrize('offset', [16, 17])
-@pytest.mark.parametrize('dtype', [np.float32, np.float64, np.uint32])
-def test_times_are_read_without_decoding_the_points(dtype, offset):
-    fields = {'names': [*'xyzt'], 'formats': [*3 * [np.float32], dtype]}
-    layout = np.dtype({**fields, 'offsets': [0, 4, 8, offset], 'itemsize': offset + 8})
-    cloud = np.ones(4, layout)
-    cloud['x'][3], cloud['t'] = np.nan, [5, 3, 4, 1000]
-    lazy = LazyPoints(4, lambda: pytest.fail('decoded'), tuple(cloud[name] for name in 'xyz'))
-    found = point_times(sweep(cloud['t'], points=lazy), unit='ns', reference='stamp')
-    assert found.offsets.tolist() == [5, 3, 4, 5]
-    assert (found.first_ns, found.last_ns) == (START_NS + 3, START_NS + 5)
 
 
 @pytest.mark.parametrize('dtype', ['>f4', '>f8', '>u4', 'f2', 'g', 'i1', 'u2', 'i8', 'u8'])
@@ -286,25 +273,6 @@ def test_between_poses_far_apart_more_are_looked_up():
     deskewed(with_times(np.ones((2, 3)), np.array([0, 100 * MS])), turning)
     assert len(set(asked)) >= 0.1 / MAX_TURN_RAD
     assert np.diff(sorted(set(asked))).max() <= MAX_TURN_RAD * 1e9
-
-
-@both
-def test_the_kernel_turns_and_shifts_between_knots(call):
-    angle = 0.004
-    knots = np.array([0, 100])
-    poses = np.zeros((2, 3, 4))
-    poses[0, :, :3] = np.eye(3)
-    c, s = np.cos(angle), np.sin(angle)
-    poses[1] = [[c, -s, 0, 2.0], [s, c, 0, 0], [0, 0, 1, 0]]
-    turns = np.array([[0, 0, np.sin(angle / 2)], [0, 0, 0]])
-    points = np.tile(np.float32([10.0, 0.0, 1.0]), (4, 1))
-    moved = np.empty((3, 4))
-    call(move_points, points.T, np.array([-5, 0, 25, 130]), knots, poses, turns, 0.0, moved)
-    part = np.array([0.0, 0.0, 0.25, 1.0])
-    expected = np.stack(
-        [10 * np.cos(part * angle) + 2 * part, 10 * np.sin(part * angle), np.ones(4)], axis=1
-    )
-    np.testing.assert_allclose(moved.T, expected, atol=1e-14)
 
 
 @both
