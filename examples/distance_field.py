@@ -6,8 +6,7 @@ A distance field without a mapper: fuse scans, mesh them, and ask how far obstac
     python examples/distance_field.py street.ply
 
 A simulated lidar drives along a street. The mesh is written, and the distance from the lidar to
-the nearest obstacle printed twice: that of the field which is kept up to date, and that of a box
-by scipy.
+the nearest obstacle printed twice: that of ``field.esdf``, and that of a box by scipy.
 """
 
 from __future__ import annotations

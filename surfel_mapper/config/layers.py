@@ -375,7 +375,7 @@ class EsdfConfig(Stage):
 
     # No settings: callers of the library may change the fields.
     radius_m: float = 20.0
-    """Distances are kept within this of the sensor, m; 0: everywhere."""
+    """Distances are computed within this of the sensor, m; 0: everywhere."""
 
     def check(self, stage: str) -> None:
         """Check that the heights ascend."""

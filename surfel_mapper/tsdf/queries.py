@@ -16,12 +16,16 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_numbers
+from surfel_mapper.errors import MapLimitError
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.kernels import queries as kernels
 
 UNKNOWN = kernels.UNKNOWN
 FREE = kernels.FREE
 OCCUPIED = kernels.OCCUPIED
+
+MAX_VOXELS = 1 << 27
+"""Limit of the voxels in a box: their distances take 0.5 GB, computing them four times that."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +141,27 @@ def in_voxels(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.f
 
 
 Float32 = npt.NDArray[np.float32]
+
+
+def extent(
+    blocks: BlockMap, index: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return the bounds of blocks in voxels: the first of each axis, and the last plus one."""
+    if not len(index):
+        return np.zeros(3, np.int64), np.zeros(3, np.int64)
+    side = blocks.config.voxels_per_side
+    return index.min(axis=0) * side, (index.max(axis=0) + 1) * side
+
+
+def checked_size(size: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the size of a box in voxels; raise MapLimitError beyond MAX_VOXELS."""
+    shape = size.tolist()
+    if math.prod(shape) > MAX_VOXELS:
+        raise MapLimitError(
+            f'a box of {" x ".join(map(str, shape))} voxels; at most {MAX_VOXELS}: take a smaller '
+            'one, or set layers.tsdf.max_radius_m'
+        )
+    return size
 
 
 def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.int32], Float32]:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Euclidean distances kept up to date, against scipy's transform of the whole field."""
+"""Euclidean distances of a field, against scipy's transform of the whole field."""
 
 import numpy as np
 import pytest
@@ -64,9 +64,8 @@ def test_distances_after_changes_equal_the_transform_of_the_whole(rng, share):
         distance = np.where(flips, np.where(distance < 0.1, 0.2, -0.02), distance)
         distance = distance.astype(np.float32)
         write(blocks, distance, FIRST)
-        assert field.update() == flips.sum()
+        field.update()
         np.testing.assert_allclose(sampled(field), expected(distance), atol=1e-6)
-    assert field.update() == 0
 
 
 def test_blocks_that_leave_and_come_are_followed(rng):
@@ -117,7 +116,7 @@ def test_known_distances_are_those_of_the_observed_voxels(rng):
 
 def test_places_outside_of_the_map_are_unknown():
     field = EuclideanField(BlockMap(TsdfConfig()), max_m=1.0)
-    assert field.update() == 0
+    field.update()
     assert np.isnan(field.sample([(0.0, 0.0, 0.0), (np.nan, 0.0, 0.0), (1e30, 0.0, 0.0)])).all()
     assert len(field.known().points) == 0
     with pytest.raises(ValueError, match=r'points: \(3,\), expected \(P, 3\)'):

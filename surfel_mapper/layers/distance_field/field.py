@@ -205,7 +205,7 @@ class DistanceField:
 
     def esdf(self, *, max_m: float = 2.0) -> EuclideanField:
         """
-        Return the Euclidean distances from all voxels to obstacles, to follow with ``update``.
+        Return the Euclidean distances from all voxels to obstacles; ``update`` renews them.
 
         Parameters
         ----------
@@ -216,6 +216,8 @@ class DistanceField:
         ------
         ConfigError
             If max_m is not between 1 and 127 voxels.
+        MapLimitError
+            If the blocks span too many voxels.
 
         """
         found = EuclideanField(self.blocks, max_m=max_m)

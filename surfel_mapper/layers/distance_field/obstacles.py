@@ -11,21 +11,16 @@ from the occupied voxels by scipy's exact transform (Maurer, Qi and Raghavan 200
 from __future__ import annotations
 
 from dataclasses import dataclass
-import math
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
 from surfel_mapper.arguments import as_numbers
-from surfel_mapper.errors import MapLimitError
 from surfel_mapper.layers.costs.traversability import CostGrid, OBSTACLE
 from surfel_mapper.layers.costs.traversability import UNKNOWN as UNSEEN
 from surfel_mapper.tsdf.blocks import BlockMap
-from surfel_mapper.tsdf.queries import OCCUPIED, states, UNKNOWN
-
-MAX_VOXELS = 1 << 27
-"""Limit of the voxels in a box: their distances take 0.5 GB, computing them four times that."""
+from surfel_mapper.tsdf.queries import checked_size, extent, OCCUPIED, states, UNKNOWN
 
 MAX_INDEX = 1 << 31
 """Limit of the index of a voxel; those of blocks are int32."""
@@ -223,16 +218,6 @@ def obstacle_distances(
     )
 
 
-def extent(
-    blocks: BlockMap, index: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return the bounds of blocks in voxels: the first of each axis, and the last plus one."""
-    if not len(index):
-        return np.zeros(3, np.int64), np.zeros(3, np.int64)
-    side = blocks.config.voxels_per_side
-    return index.min(axis=0) * side, (index.max(axis=0) + 1) * side
-
-
 def box_states(
     blocks: BlockMap, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.uint8]:
@@ -253,14 +238,3 @@ def in_voxels(name: str, place: npt.ArrayLike, size_m: float) -> npt.NDArray[np.
     if not (np.abs(found) < MAX_INDEX * size_m).all():  # false for nan
         raise ValueError(f'{name}: {found.tolist()}, expected within {MAX_INDEX * size_m:g} m')
     return found / size_m
-
-
-def checked_size(size: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return the size of a box in voxels; raise MapLimitError beyond MAX_VOXELS."""
-    shape = size.tolist()
-    if math.prod(shape) > MAX_VOXELS:
-        raise MapLimitError(
-            f'a box of {" x ".join(map(str, shape))} voxels; at most {MAX_VOXELS}: take a smaller '
-            'one, or set layers.tsdf.max_radius_m'
-        )
-    return size
