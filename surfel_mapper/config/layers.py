@@ -79,11 +79,6 @@ class TsdfConfig(Stage):
     max_age_s: float = setting(
         0.0, 'Blocks not updated for longer are dropped, s; 0: no such limit.', low=0.0, high=1e9
     )
-    archive_directory: str = setting(
-        '',
-        'Directory in which blocks that leave by max_radius_m or max_age_s are kept while the '
-        'program runs, so that mesh.ply and saved maps have them; empty: they are dropped.',
-    )
     carve: bool = setting(True, 'Also update the blocks between sensor and surface.')
     distance: str = setting(
         'along_ray',

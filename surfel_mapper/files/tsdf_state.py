@@ -9,11 +9,7 @@ trusted: blocks must be unique, distances within the truncation, weights not neg
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack
-import math
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -21,9 +17,8 @@ import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import FileFormatError, MapLimitError, refusing
-from surfel_mapper.files.atomic import cannot_write
 from surfel_mapper.files.state import load_state, save_state
-from surfel_mapper.tsdf.blocks import block_index, block_keys, BlockMap, Blocks
+from surfel_mapper.tsdf.blocks import block_keys, BlockMap, Blocks
 
 KIND = 'tsdf'
 SHAPE = (
@@ -75,92 +70,6 @@ def save_tsdf(path: str | Path, blocks: BlockMap, *, compress: bool = False) -> 
     arrays = {name: getattr(content, name) for name in ARRAYS}
     attributes = attributes_of(blocks.config)
     save_state(path, arrays, attributes, compress=compress)
-
-
-def save_tsdf_parts(
-    path: str | Path, config: TsdfConfig, parts: Callable[[], Iterable[Blocks]]
-) -> None:
-    """
-    Write a TSDF that may be larger than memory: the same file as save_tsdf writes.
-
-    The voxels are collected in a file without a name beside the target, which then takes as much
-    of the disk as the target itself; in memory are one part and 40 bytes a block.
-
-    Parameters
-    ----------
-    path : str or Path
-        As for save_tsdf.
-    config : TsdfConfig
-        Settings of the map.
-    parts : callable
-        Returns the blocks in parts, each block once; called twice.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be written, or the parts not be read.
-
-    """
-    found = [np.empty(0, np.int64), *(block_keys(part.index) for part in parts())]
-    keys = np.sort(np.concatenate(found))
-    empty = BlockMap(config)
-    try:  # outside of the stack: to close a file writes the rest of its buffer
-        with ExitStack() as files:
-            channels = {
-                name: Channel(
-                    files, Path(path).parent, getattr(empty, name).shape[1:], ARRAYS[name]
-                )
-                for name in CHANNELS
-                if len(getattr(empty, name))
-            }
-            stamp_ns = np.empty(len(keys), np.int64)
-            for part in parts():
-                place = np.searchsorted(keys, block_keys(part.index))
-                stamp_ns[place] = part.stamp_ns
-                for name, channel in channels.items():
-                    channel.write(place, getattr(part, name))
-            arrays = {'index': block_index(keys), 'stamp_ns': stamp_ns}
-            for name in CHANNELS:
-                missing = np.empty((0, *getattr(empty, name).shape[1:]), ARRAYS[name])
-                arrays[name] = channels[name].read(len(keys)) if name in channels else missing
-            save_state(path, arrays, attributes_of(config))
-    except OSError as error:
-        raise cannot_write(path, error) from error
-
-
-class Channel:
-    """
-    Rows of an array in a file without a name, which ends with a stack of contexts.
-
-    Parameters
-    ----------
-    files : ExitStack
-        Closes the file.
-    directory : Path
-        Directory of the file.
-    shape, dtype
-        Of a row.
-
-    """
-
-    def __init__(self, files: ExitStack, directory: Path, shape: tuple[int, ...], dtype: type):
-        file = TemporaryFile(dir=directory)  # noqa: SIM115 - the stack closes it
-        self._file = files.enter_context(file)
-        self._shape, self._dtype = shape, np.dtype(dtype)
-
-    def write(self, place: npt.NDArray[np.int64], rows: npt.NDArray[Any]) -> None:
-        """Write rows (R, ...) at their places (R,)."""
-        size = math.prod(self._shape) * self._dtype.itemsize
-        for first, row in zip(place.tolist(), rows, strict=True):
-            self._file.seek(first * size)
-            self._file.write(np.ascontiguousarray(row).data)
-
-    def read(self, count: int) -> npt.NDArray[Any]:
-        """Return all rows, (count, ...), read from the file as they are used."""
-        self._file.flush()
-        if not count:
-            return np.empty((0, *self._shape), self._dtype)
-        return np.memmap(self._file, self._dtype, 'r', shape=(count, *self._shape))
 
 
 def attributes_of(config: TsdfConfig) -> dict[str, Any]:

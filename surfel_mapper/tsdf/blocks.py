@@ -27,7 +27,7 @@ flagged as updated and are not evicted.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -82,12 +82,6 @@ class Blocks:
     def __len__(self) -> int:
         """Return the number of blocks."""
         return len(self.index)
-
-    def part(self, places: Int64) -> Blocks:
-        """Return some of the blocks, by their places."""
-        arrays = (getattr(self, one.name) for one in fields(self))
-        names = (one.name for one in fields(self))
-        return Blocks(**dict(zip(names, (copied_rows(a, places) for a in arrays), strict=True)))
 
 
 def copied_rows(array: npt.NDArray[Any], rows: Int64) -> Any:
@@ -502,60 +496,6 @@ class BlockMap(BlockArrays):
             self.touch(changed, 0)
             self.head[changed, STAMP] = stamps
             self.remove(changed[~(self.weight[changed] > 0.0).any(axis=1)])
-
-    def merge(self, blocks: Blocks) -> None:
-        """
-        Fuse blocks into the map, as if their measurements had been made here.
-
-        Distances and colours are weighted means, counts of labels are added; kept labels without
-        counts (first_k, single) stay those of the map. A block may occur several times.
-
-        Raises
-        ------
-        MapLimitError
-            If they exceed max_blocks; the map is unchanged.
-
-        """
-        keys, left = block_keys(blocks.index), np.arange(len(blocks))
-        while len(left):
-            _, first = np.unique(keys[left], return_index=True)
-            self._merge_once(blocks.part(left[first]))
-            left = np.delete(left, first)
-
-    def _merge_once(self, blocks: Blocks) -> None:
-        """Fuse blocks that are all different into the map."""
-        there = self.find(blocks.index)
-        old = there >= 0
-        self.insert(blocks.part(np.flatnonzero(~old)))
-        rows, more, config = there[old], blocks.part(np.flatnonzero(old)), self.config
-        for mean, other in (
-            (self.field[:, :1], more.field[:, :1]),
-            (self.color[:, :3], more.color[:, :3]),
-        ):
-            if not len(other):
-                continue
-            is_color = mean.shape[1] == 3
-            total = self.color[:, 3:] if is_color else self.field[:, 1:]
-            weight = more.color[:, 3:] if is_color else more.field[:, 1:]
-            together = total[rows] + weight
-            share = np.divide(weight, together, out=np.zeros_like(weight), where=weight > 0.0)
-            mean[rows] += (other - mean[rows]) * share
-            total[rows] = np.minimum(together, np.float32(config.max_weight))
-        if len(more.votes):
-            counted = config.semantics in ('majority', 'binary')
-            is_none = ~self.votes[rows].any(axis=1, keepdims=True)
-            added = self.votes[rows] + more.votes
-            kept = np.where(is_none, more.votes, self.votes[rows])
-            self.votes[rows] = added if counted else kept
-        if len(more.stamps):
-            first, last = self.stamps[rows, 0], self.stamps[rows, 1]
-            earlier = np.where(first == 0, more.stamps[:, 0], first)
-            known = more.stamps[:, 0] > 0
-            self.stamps[rows, 0] = np.where(known, np.minimum(earlier, more.stamps[:, 0]), first)
-            self.stamps[rows, 1] = np.maximum(last, more.stamps[:, 1])
-        stamps = np.maximum(self.head[rows, STAMP], more.stamp_ns)
-        self.touch(rows, 0)
-        self.head[rows, STAMP] = stamps
 
     def _used_head(self) -> Int64:
         return self.head[: self._hash.rows_used]

@@ -218,11 +218,7 @@ class Mesher:
 
     def mesh(self) -> BlockMesh:
         """Return the triangles of all blocks with welded vertices."""
-        return self.welded(self._meshes)
-
-    def welded(self, keys: Iterable[int]) -> BlockMesh:
-        """Return the triangles of some blocks, by their keys, with welded vertices."""
-        meshes = [self._meshes[key] for key in keys if key in self._meshes]
+        meshes = list(self._meshes.values())
         if not meshes:
             return BlockMesh(**vars(EMPTY), edges=np.empty((0, 4), np.int32))
         joined = concatenated(meshes)
@@ -350,16 +346,6 @@ def concatenated(meshes: Sequence[Mesh]) -> Mesh:
         triangles=triangles,
         colors=np.concatenate([mesh.colors for mesh in meshes]),
         labels=np.concatenate([mesh.labels for mesh in meshes]),
-    )
-
-
-def together(parts: Sequence[Mesh]) -> Mesh:
-    """Return the mesh of parts whose triangles count the vertices of all of them."""
-    return Mesh(
-        vertices=np.concatenate([part.vertices for part in parts]),
-        triangles=np.concatenate([part.triangles for part in parts]),
-        colors=np.concatenate([part.colors for part in parts]),
-        labels=np.concatenate([part.labels for part in parts]),
     )
 
 

@@ -12,7 +12,7 @@ import pytest
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import FileFormatError, MapLimitError
 from surfel_mapper.files.state import load_state, save_state
-from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf, save_tsdf_parts
+from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from test.tsdf.scenes import image_of, SMALL
@@ -167,15 +167,11 @@ def limited_files(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-@pytest.mark.parametrize('num_blocks', [1, 9], ids=['at the end', 'between blocks'])
-def test_a_full_disk_is_reported_with_the_path(tmp_path, num_blocks):
-    """The 4 KiB of a block remain in the buffer until the next one, or the end."""
-    blocks = filled(PLAIN).blocks
-    part = blocks.copied(blocks.rows()[:num_blocks])
+def test_a_full_disk_is_reported_with_the_path(tmp_path):
     path = tmp_path / 'map.npz'
     with (
         limited_files(1000),
         pytest.raises(FileFormatError, match=rf'^{path}: cannot be written: File too large$'),
     ):
-        save_tsdf_parts(path, PLAIN, lambda: [part])
+        save_tsdf(path, filled(PLAIN).blocks)
     assert list(tmp_path.iterdir()) == []

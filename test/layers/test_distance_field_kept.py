@@ -103,28 +103,6 @@ def test_a_checkpoint_and_map_load_have_the_field(tmp_path, start):
     assert_same_field(field_of(other), first)
 
 
-def test_a_drive_with_an_archive_has_a_mesh_of_all_of_it(tmp_path):
-    settings = {'layers.tsdf.max_radius_m': 6.0}
-    mapper = mapper_with(**settings, **{'layers.tsdf.archive_directory': str(tmp_path / 'a')})
-    without, everything = mapper_with(**settings), mapper_with()
-    for number, x in enumerate((0.0, 20.0, 40.0, 0.0), start=1):
-        for one in (mapper, without, everything):
-            insert(one, number, (x, 0.0, 0.0))
-    assert mapper.summary()['tsdf']['blocks_archived'] > 0
-    for name, one in (('a', mapper), ('b', everything), ('c', without)):
-        (tmp_path / name).mkdir(exist_ok=True)
-        one.tsdf.write(tmp_path / name, ())
-    found, expected, window = (read_points(tmp_path / name / 'mesh.ply') for name in 'abc')
-    assert len(found['x']) == len(expected['x']) > 2 * len(window['x'])
-    assert found['x'].max() == pytest.approx(45.0, abs=0.05)
-    save_mapper(tmp_path / 'map.npz', mapper)
-    other = mapper_with()
-    load_mapper(tmp_path / 'map.npz', other)
-    np.testing.assert_allclose(field_of(other).field, field_of(everything).field, atol=1e-6)
-    mapper.clear()
-    assert mapper.summary()['tsdf']['blocks_archived'] == mapper.tsdf.blocks.num_blocks == 0
-
-
 def test_a_cleared_region_is_unknown_in_the_field():
     mapper = mapper_with()
     insert(mapper, 1)

@@ -20,14 +20,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config import Config, TsdfConfig
-from surfel_mapper.files.mesh_ply import write_mesh_parts
-from surfel_mapper.files.tsdf_archive import BlockArchive, joined
-from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf, save_tsdf_parts
+from surfel_mapper.config import Config
+from surfel_mapper.files.mesh_ply import write_mesh
+from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
 from surfel_mapper.layers.distance_field.field import DistanceField
 from surfel_mapper.layers.distance_field.live_mesh import LiveMesh, WholeMesh
 from surfel_mapper.layers.distance_field.obstacles import clearance_slice, slice_at
-from surfel_mapper.layers.distance_field.whole_surface import merged_parts, surface_parts
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing
 from surfel_mapper.layers.layer import (
     Contains,
@@ -50,11 +48,11 @@ from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.grids import occupancy_grid
 from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
 from surfel_mapper.scan import Scan
-from surfel_mapper.tsdf.blocks import block_keys, BlockMap, Blocks
+from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.euclidean import EuclideanField
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.measurements import Integrated
-from surfel_mapper.tsdf.mesh import Mesh, Mesher, together
+from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
@@ -81,8 +79,6 @@ class TsdfLayer(Layer):
 
     def __init__(self, config: Config, around: Surroundings) -> None:
         super().__init__(config, around)
-        directory = config.tsdf.archive_directory
-        self._archive = BlockArchive(directory) if directory else None
         self.clear()
 
     @property
@@ -97,8 +93,6 @@ class TsdfLayer(Layer):
 
     def clear(self) -> None:
         """Forget everything but the sensors."""
-        if self._archive is not None:
-            self._archive.clear()
         self._begin(BlockMap(self.config.tsdf))
 
     def _begin(self, blocks: BlockMap) -> None:
@@ -169,9 +163,7 @@ class TsdfLayer(Layer):
             image = range_image(scan, sensor, **wanted)
             done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
         self._position = T_map_sensor[:3, 3].copy()
-        left = self.blocks.evict(self._position, scan.stamp_ns)
-        if self._archive is not None:
-            self._archive.add(left)
+        self.blocks.evict(self._position, scan.stamp_ns)
         self._num_scans += 1
         self._num_refused += done.num_refused
         self._num_labels_lost += done.num_labels_lost
@@ -217,10 +209,8 @@ class TsdfLayer(Layer):
         self.blocks.clear_region(contains, rows[rows >= 0])
 
     def clear_region(self, contains: Contains) -> None:
-        """Set the voxels in a region to unknown, those of the archive too."""
+        """Set the voxels in a region to unknown."""
         self.blocks.clear_region(contains)
-        if self._archive is not None:
-            self._archive.edit(partial(cleared, config=self.config.tsdf, contains=contains))
 
     def warm_up(self) -> None:
         """Compile the kernels, for points of either type."""
@@ -242,7 +232,6 @@ class TsdfLayer(Layer):
             'scans': self._num_scans,
             'waiting': len(self._waiting),
             'blocks': self.blocks.num_blocks,
-            'blocks_archived': self._archive.num_blocks if self._archive else 0,
             'blocks_refused': self._num_refused,
             'labels_lost': self._num_labels_lost,
             'bytes': self.blocks.nbytes,
@@ -299,31 +288,22 @@ class TsdfLayer(Layer):
         )
 
     def save(self, path: Path) -> None:
-        """Write the field, and the archive region by region."""
-        if self._archive is None or not self._archive.num_blocks:
-            save_tsdf(path, self.blocks)
-        else:
-            parts = partial(merged_parts, self.blocks, self._archive)
-            save_tsdf_parts(path, self.config.tsdf, parts)
+        """Write the field."""
+        save_tsdf(path, self.blocks)
 
     def load(self, path: Path) -> Callable[[], None]:
         """Read a field that ``save`` wrote; return the function that puts it in place."""
         return partial(self._begin, load_tsdf(path, self.config.tsdf))
 
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
-        """Write mesh.ply, of the archive too."""
+        """Write mesh.ply."""
         path = directory / 'mesh.ply'
-        write_mesh_parts(path, self._surface_parts(), self.around.surfel_map.origin_m)
+        write_mesh(path, self.mesh(), self.around.surfel_map.origin_m)
         return [path]
 
     def drawings(self) -> Sequence[Drawing]:
-        """Return the mesh, of the archive too."""
-        return [MeshDrawing(name='mesh', mesh=together(list(self._surface_parts())))]
-
-    def _surface_parts(self) -> Iterable[Mesh]:
-        if self._archive is None or not self._archive.num_blocks:
-            return [self.mesh()]
-        return surface_parts(self.blocks, self._archive)
+        """Return the mesh."""
+        return [MeshDrawing(name='mesh', mesh=self.mesh())]
 
     def _all_tiles(self, now: Moment) -> Iterable[bytes]:
         return self._live_mesh.complete(now) if self.config.tsdf.mesh_rate_hz else ()
@@ -377,16 +357,3 @@ class TsdfLayer(Layer):
         if errors:
             raise errors[0]
         return results
-
-
-def cleared(blocks: Blocks, *, config: TsdfConfig, contains: Contains) -> Blocks:
-    """Return blocks whose voxels in a region are unknown, without those that become empty."""
-    found = []
-    while len(blocks):  # a block may occur several times
-        one = BlockMap(config)
-        _, first = np.unique(block_keys(blocks.index), return_index=True)
-        one.insert(blocks.part(first))
-        one.clear_region(contains)
-        found.append(one.copied(one.rows()))
-        blocks = blocks.part(np.delete(np.arange(len(blocks)), first))
-    return joined(found)
