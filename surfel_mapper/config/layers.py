@@ -21,10 +21,9 @@ from typing import ClassVar
 from surfel_mapper.config.settings import setting, Stage
 from surfel_mapper.errors import ConfigError
 
-WEIGHT_MODES = ('constant', 'inverse_square', 'ray_density', 'ray_density_inv_sq')
+WEIGHT_MODES = ('constant', 'inverse_square')
 DISTANCES = ('along_ray', 'to_plane')
-INTERPOLATIONS = ('nearest', 'bilinear', 'adaptive')
-SEMANTICS = ('none', 'majority', 'first_k', 'single', 'binary')
+SEMANTICS = ('none', 'single')
 
 MAX_LABEL = (1 << 24) - 1
 """Labels are kept as float32, which holds whole numbers up to here."""
@@ -88,8 +87,7 @@ class TsdfConfig(Stage):
     )
     weight_mode: str = setting(
         'inverse_square',
-        'Weight of a measurement: constant, 1; inverse_square, 1/depth^2; ray_density, rays per '
-        'voxel face; ray_density_inv_sq, that over depth^2.',
+        'Weight of a measurement: constant, 1; inverse_square, 1/depth^2.',
         choices=WEIGHT_MODES,
     )
     forget_s: float = setting(
@@ -117,11 +115,9 @@ class TsdfConfig(Stage):
     )
     semantics: str = setting(
         'none',
-        'How labels are fused: none; majority of counts; weights of the first_k labels; single, '
-        'one label by weighted majority vote; binary, label 0 against all others.',
+        'Labels of voxels: none; single, one for each voxel by weighted majority vote.',
         choices=SEMANTICS,
     )
-    num_labels: int = setting(0, 'Majority: labels are 0 to num_labels - 1.', low=0, high=4096)
     dynamic_labels: tuple[float, ...] = setting(
         (), 'Labels of moving objects: they free space and leave no surface.'
     )
@@ -143,28 +139,8 @@ class TsdfConfig(Stage):
     voxels_per_side: int = 8
     """Voxels along the edge of a block, a power of two."""
 
-    max_blocks: int = 0
-    """At most this many blocks; 0: no such limit."""
-
-    allocation: str = 'band'
-    """Blocks that a scan updates: band, those its rays cross near a surface; frustum, all in view.
-    """
-
-    interpolation: str = 'adaptive'
-    """Interpolation of the range image."""
-
     max_difference_m: float = 0.2
     """Adaptive: pixels that differ by more are not interpolated, m."""
-
-    max_difference_ratio: float = 0.0
-    """Adaptive: pixels that differ by more than this share of the range are not interpolated."""
-
-    weight_dropoff: bool = True
-    """Weights fall linearly to zero behind a surface."""
-
-    dropoff_m: float = 0.0
-    """Distance behind the surface at which weights start to fall, m; less than truncation_m; 0:
-    one voxel."""
 
     min_measurement_weight: float = 1e-4
     """Least weight of a measurement."""
@@ -172,31 +148,6 @@ class TsdfConfig(Stage):
     max_weight: float = 1e5
     """Largest weight of a voxel; the smaller, the faster it forgets: a measurement of weight w
     then counts w / (max_weight + w)."""
-
-    extra_distance_m: float = 0.0
-    """Depth behind the band in which voxels take -truncation_m, m."""
-
-    extra_labels: tuple[float, ...] = ()
-    """Labels to which extra_distance_m applies; empty: all."""
-
-    skip_extra_channels: bool = False
-    """Write neither colours nor labels to voxels behind the band."""
-
-    tracking: bool = False
-    """Keep the first and last stamp of every voxel."""
-
-    label_map: tuple[float, ...] = ()
-    """Labels to replace before anything else: pairs of the label of the sensor and the one to
-    keep, -1 for unknown. Others stay."""
-
-    first_k: int = 5
-    """first_k: labels kept for each voxel."""
-
-    min_label_weight: float = 0.0
-    """first_k: the heaviest label must exceed this weight."""
-
-    invalid_labels: tuple[float, ...] = ()
-    """Further labels that free space and leave no surface: sky, the robot."""
 
     max_ray_offset_voxels: float | None = None
     """Lidar: if pixels are not interpolated, voxels farther than this from the ray of their
@@ -210,10 +161,6 @@ class TsdfConfig(Stage):
     """The mesh has no faces where distances of neighbours across the surface differ by more, in
     voxels; 0: no such limit. None: the truncation and 1.25 by distance to_plane, else no limit."""
 
-    mesh_color: str = 'auto'
-    """Colour of the mesh: color, that of the voxels; label, one for each label; slope, shaded by
-    direction; auto, the first of these that is kept."""
-
     threads: int = 0
     """Threads; 0: one for each core that the process may use."""
 
@@ -224,13 +171,8 @@ class TsdfConfig(Stage):
             ('voxels_per_side', side & (side - 1) == 0, 'a power of two'),
             (
                 'truncation_m',
-                not self.weight_dropoff or self.dropoff_start_m < self.truncation_m,
-                f'more than {self.dropoff_start_m}, a voxel',
-            ),
-            (
-                'skip_extra_channels',
-                not (self.skip_extra_channels and self.extra_labels),
-                'false where extra_labels are given',
+                self.voxel_size_m < self.truncation_m,
+                f'more than {self.voxel_size_m}, a voxel',
             ),
             (
                 'max_range_m',
@@ -243,38 +185,16 @@ class TsdfConfig(Stage):
                 self.semantics != 'none' or not self.label_topic,
                 'another where label_topic is given',
             ),
-            ('num_labels', self.semantics != 'majority' or self.num_labels > 0, 'positive'),
-            *self._label_and_mesh_conditions(),
         )
         for name, holds, expected in checks:
             if not holds:
                 raise ConfigError(f'{stage}.{name}: {getattr(self, name)}, expected {expected}')
-        for name in ('extra_labels', 'dynamic_labels', 'invalid_labels'):
-            for label in getattr(self, name):
-                if not (label.is_integer() and 0 <= label <= MAX_LABEL):
-                    raise ConfigError(
-                        f'{stage}.{name}: {label}, expected whole numbers from 0 to {MAX_LABEL}'
-                    )
-
-    def _label_and_mesh_conditions(self) -> tuple[tuple[str, bool, str], ...]:
-        """Return the conditions on labels and the mesh, in the same form."""
-        return (
-            (
-                'label_map',
-                len(self.label_map) % 2 == 0
-                and len(set(self.label_map[::2])) == len(self.label_map) / 2
-                and all(label.is_integer() for label in self.label_map)
-                and all(0 <= label <= MAX_LABEL for label in self.label_map[::2])
-                and all(-1 <= label <= MAX_LABEL for label in self.label_map[1::2]),
-                f'pairs of different labels from 0, and labels from -1, to {MAX_LABEL}',
-            ),
-            ('mesh_color', self.mesh_color != 'color' or self.color, 'another without color'),
-            (
-                'mesh_color',
-                self.mesh_color != 'label' or self.semantics != 'none',
-                'another without semantics',
-            ),
-        )
+        for label in self.dynamic_labels:
+            if not (label.is_integer() and 0 <= label <= MAX_LABEL):
+                raise ConfigError(
+                    f'{stage}.dynamic_labels: {label}, expected whole numbers from 0 to '
+                    f'{MAX_LABEL}'
+                )
 
     @property
     def image_topics(self) -> dict[str, str]:
@@ -286,24 +206,6 @@ class TsdfConfig(Stage):
     def block_size_m(self) -> float:
         """Edge of a block."""
         return self.voxel_size_m * self.voxels_per_side
-
-    @property
-    def dropoff_start_m(self) -> float:
-        """Distance behind a surface at which weights start to fall, m."""
-        return self.dropoff_m or self.voxel_size_m
-
-    @property
-    def mesh_colors(self) -> str:
-        """Source of the colours of the mesh: color, label or slope."""
-        kept = {'color': self.color, 'label': self.semantics != 'none', 'slope': True}
-        if self.mesh_color != 'auto':
-            return self.mesh_color
-        return next(name for name, is_kept in kept.items() if is_kept)
-
-    @property
-    def reach_behind_m(self) -> float:
-        """Distance behind a surface up to which voxels change, m."""
-        return self.truncation_m + self.extra_distance_m
 
     @property
     def ray_offset_voxels(self) -> float:
@@ -331,12 +233,6 @@ class TsdfConfig(Stage):
         if self.distance != 'to_plane':
             return math.inf
         return self.truncation_m + 1.25 * self.voxel_size_m
-
-    @property
-    def votes_per_voxel(self) -> int:
-        """Numbers that a voxel keeps for its label."""
-        widths = {'majority': self.num_labels, 'first_k': 2 * self.first_k}
-        return widths.get(self.semantics, 0 if self.semantics == 'none' else 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.errors import FileFormatError, MapLimitError, refusing
+from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.tsdf.blocks import block_keys, BlockMap, Blocks
 
@@ -26,9 +26,7 @@ SHAPE = (
     'voxels_per_side',
     'truncation_m',
     'color',
-    'tracking',
     'semantics',
-    'votes_per_voxel',
 )
 """Settings that must be equal in a configuration and a file."""
 
@@ -38,11 +36,13 @@ ARRAYS = {
     'field': np.float32,
     'color': np.float32,
     'votes': np.float32,
-    'stamps': np.int64,
 }
 
-CHANNELS = ('field', 'color', 'votes', 'stamps')
+CHANNELS = ('field', 'color', 'votes')
 """The arrays of voxels; those that a map does not have are without rows."""
+
+NO_STAMPS: npt.NDArray[np.int64] = np.empty((0, 2, 512), np.int64)
+"""Array of files of version 1 that has no rows any more."""
 
 
 def save_tsdf(path: str | Path, blocks: BlockMap, *, compress: bool = False) -> None:
@@ -68,13 +68,14 @@ def save_tsdf(path: str | Path, blocks: BlockMap, *, compress: bool = False) -> 
     rows = rows[np.argsort(block_keys(blocks.index(rows)))]
     content = blocks.copied(rows)
     arrays = {name: getattr(content, name) for name in ARRAYS}
+    arrays['stamps'] = NO_STAMPS
     attributes = attributes_of(blocks.config)
     save_state(path, arrays, attributes, compress=compress)
 
 
 def attributes_of(config: TsdfConfig) -> dict[str, Any]:
     """Return the attributes of the file of a map."""
-    return {'kind': KIND, **{name: getattr(config, name) for name in SHAPE}}
+    return {'kind': KIND, 'tracking': False, **{name: getattr(config, name) for name in SHAPE}}
 
 
 def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
@@ -93,8 +94,6 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
     FileFormatError
         If the file cannot be read, is damaged, of another kind or version, or of another voxel
         size, block, truncation or channels.
-    MapLimitError
-        If the map does not fit into max_blocks.
 
     """
     arrays, attributes = load_state(path)
@@ -109,11 +108,6 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
     blocks = BlockMap(config)
     with refusing(path, FileFormatError):
         content = checked(blocks, arrays)
-    if config.max_blocks and len(content) > config.max_blocks:
-        raise MapLimitError(
-            f'{path}: {len(content)} blocks, expected at most layers.tsdf.max_blocks = '
-            f'{config.max_blocks}'
-        )
     blocks.insert(content)
     return blocks
 
@@ -121,6 +115,8 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
 def checked(blocks: BlockMap, arrays: dict[str, npt.NDArray[Any]]) -> Blocks:
     """Return the content of a file; raise ValueError if it is impossible."""
     count = len(arrays['index'])
+    if len(arrays.pop('stamps', NO_STAMPS)):
+        raise ValueError('stamps of voxels, which are not kept any more')
     if unknown := sorted({*arrays} - {*ARRAYS}):
         raise ValueError(f'unknown arrays {unknown}')
     for name, dtype in ARRAYS.items():

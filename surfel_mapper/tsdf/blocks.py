@@ -11,10 +11,9 @@ number i + M (j + M k), x fastest, N = M^3 in all, and its centre at
     field   (R, 2, N) float32  distance in m, positive in front of a surface and negative behind
                                it; weight, 0 for a voxel that was never observed
     color   (R, 4, N) float32  red, green, blue in [0, 255]; weight of the colour
-    votes   (R, V, N) float32  for labels, see kernels/channels.py; V depends on the semantics
-    stamps  (R, 2, N) int64    first and last stamp, ns; 0 for a voxel that was never observed
+    votes   (R, 2, N) float32  for labels, see kernels/channels.py
 
-color, votes and stamps have no rows unless the configuration asks for them. All arrays are slabs
+color and votes have no rows unless the configuration asks for them. All arrays are slabs
 that grow in place: a view is valid until blocks are added and must not be kept. The row of a
 removed block is reused; free rows are zero except for their head.
 
@@ -67,7 +66,7 @@ class Blocks:
         Block index along x, y, z.
     stamp_ns : (K,) int64
         Stamp of the last change of each block, ns.
-    field, color, votes, stamps
+    field, color, votes
         As in the module docstring, one row a block.
 
     """
@@ -77,7 +76,6 @@ class Blocks:
     field: Float32
     color: Float32
     votes: Float32
-    stamps: Int64
 
     def __len__(self) -> int:
         """Return the number of blocks."""
@@ -127,8 +125,7 @@ class BlockArrays:
             'head': HEAD,
             'field': voxels,
             'color': 2 * voxels * config.color,
-            'votes': config.votes_per_voxel * voxels // 2,
-            'stamps': 2 * voxels * config.tracking,
+            'votes': voxels * (config.semantics != 'none'),
         }
         self._slabs = {name: Slab(FIRST_ROWS, width) for name, width in widths.items() if width}
         self._row_bytes = 8 * sum(widths.values())
@@ -165,15 +162,8 @@ class BlockArrays:
 
     @property
     def votes(self) -> Float32:
-        """Votes for labels, (R, V, N), or no rows."""
-        return self._floats('votes', self.config.votes_per_voxel)
-
-    @property
-    def stamps(self) -> Int64:
-        """First and last stamps, (R, 2, N) ns, or no rows."""
-        if 'stamps' not in self._slabs:
-            return np.empty((0, 2, self.voxels_per_block), np.int64)
-        return self._slabs['stamps'].array.reshape(-1, 2, self.voxels_per_block)
+        """Votes for labels, (R, 2, N), or no rows."""
+        return self._floats('votes', 2)
 
     def _floats(self, name: str, width: int) -> Float32:
         if name not in self._slabs:
@@ -183,7 +173,7 @@ class BlockArrays:
 
     def _copied(self, rows: Int64) -> dict[str, npt.NDArray[Any]]:
         """Return copies of the channels of rows, without their heads, by name."""
-        names = ('field', 'color', 'votes', 'stamps')
+        names = ('field', 'color', 'votes')
         return {name: copied_rows(getattr(self, name), rows) for name in names}
 
     def _write(self, rows: Int64, blocks: Blocks) -> None:
@@ -228,7 +218,7 @@ class BlockMap(BlockArrays):
     Parameters
     ----------
     config : TsdfConfig
-        Voxel size, voxels per side, channels, budget.
+        Voxel size, voxels per side, channels.
 
     Attributes
     ----------
@@ -301,7 +291,7 @@ class BlockMap(BlockArrays):
         Returns
         -------
         (K,) int64
-            Rows; -1 for blocks beyond the budget.
+            Rows.
 
         Raises
         ------
@@ -316,15 +306,10 @@ class BlockMap(BlockArrays):
                 f'{self.config.block_size_m} m reach {INDEX_OFFSET * self.config.block_size_m} m '
                 'from the origin; use a local frame'
             )
-        return self.place_keys(keys)
-
-    def place_keys(self, keys: Int64) -> Int64:
-        """Return the rows of blocks by key; otherwise as place."""
-        limit = self.config.max_blocks or np.iinfo(np.int64).max
         rows = np.full(len(keys), -1, np.int64)
         done = 0
         while done < len(keys):
-            done = place_blocks(keys, self.head, self._hash.arrays, self._state, limit, done, rows)
+            done = place_blocks(keys, self.head, self._hash.arrays, self._state, done, rows)
             if done < len(keys):
                 try:
                     self._make_room()
@@ -445,21 +430,8 @@ class BlockMap(BlockArrays):
         )
 
     def insert(self, blocks: Blocks) -> None:
-        """
-        Write blocks into the map, replacing those of the same index; increments the version.
-
-        Raises
-        ------
-        MapLimitError
-            If they exceed max_blocks; the map is unchanged.
-
-        """
+        """Write blocks into the map, replacing those of the same index; increments the version."""
         rows = self.place(blocks.index)
-        if (rows < 0).any():
-            self.drop_new(rows)
-            raise MapLimitError(
-                f'{len(blocks)} blocks do not fit into max_blocks = {self.config.max_blocks}'
-            )
         self._write(rows, blocks)
         self.touch(rows, 0)
         self.head[rows, STAMP] = blocks.stamp_ns
@@ -489,7 +461,7 @@ class BlockMap(BlockArrays):
             changed, hit = part[inside.any(axis=1)], inside[inside.any(axis=1)]
             if not len(changed):
                 continue
-            for array in (self.field, self.color, self.votes, self.stamps):
+            for array in (self.field, self.color, self.votes):
                 if len(array):
                     array[changed] = np.where(hit[:, None], 0, array[changed])
             stamps = self.head[changed, STAMP]

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -123,7 +124,7 @@ class EuclideanField:
     def _transform(self, occupied: Flags) -> npt.NDArray[np.uint16]:
         """Return the squared distances of voxels to occupied ones, (nz, ny, nx) both."""
         reach = int(self.max_m / self._blocks.config.voxel_size_m * (1.0 + 1e-9))
-        squared = np.where(occupied, np.uint16(0), FAR)
+        squared: Any = np.where(occupied, np.uint16(0), FAR)
         for axes in ((0, 1, 2), (0, 2, 1), (1, 0, 2)):  # along y, x and z
             source = np.ascontiguousarray(squared.transpose(axes))
             squared = source.copy()

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config import INTERPOLATIONS, SEMANTICS, TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.threads import share, usable_cores
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.kernels import lookup as kernels
@@ -36,15 +36,10 @@ from surfel_mapper.tsdf.measurements import (
     checked_pose,
     Integrated,
     POWERS,
-    remapped,
     settings,
 )
 from surfel_mapper.tsdf.range_image import RangeImage
-from surfel_mapper.tsdf.selection import (
-    BlockSelection,
-    NO_COSINE,
-    reach_behind_m,
-)
+from surfel_mapper.tsdf.selection import BlockSelection, NO_COSINE, reach_behind_m
 from surfel_mapper.tsdf.sensors import LidarModel, Sensor
 
 logger = logging.getLogger(__name__)
@@ -101,16 +96,13 @@ class Integrator:
         side = np.arange(config.voxels_per_side) * config.voxel_size_m
         z, y, x = np.meshgrid(side, side, side, indexing='ij')
         self._voxels = np.stack([x.ravel(), y.ravel(), z.ravel()])
-        masked = {*config.dynamic_labels, *config.invalid_labels}
-        self._masked_labels = np.array(sorted(masked), np.int32)
+        self._dynamic_labels = np.array(config.dynamic_labels, np.int32)
 
     def integrate(
         self,
         image: RangeImage,
         T_map_sensor: Float64,
         stamp_ns: int = 0,
-        *,
-        allocate_blocks: bool = True,
     ) -> Integrated:
         """
         Fuse a range image into the map.
@@ -123,8 +115,6 @@ class Integrator:
             Pose of the sensor in the map frame.
         stamp_ns : int
             Stamp of the measurement, ns.
-        allocate_blocks : bool
-            Whether missing blocks are added; otherwise only existing ones change.
 
         Returns
         -------
@@ -149,14 +139,13 @@ class Integrator:
         selected = self._selection.blocks(image, T, thin)
         index, blocks = selected.index, self.blocks
         before = blocks.num_blocks
-        rows = blocks.place(index) if allocate_blocks else blocks.find(index)
-        there = rows >= 0
+        rows = blocks.place(index)
         try:
-            skipped = there & ~selected.near & self._free_for_long(rows)
+            skipped = ~selected.near & self._free_for_long(rows)
             blocks.head[rows[skipped], STAMP] = stamp_ns
-            fused = there & ~skipped
+            fused = ~skipped
             sums = self._thin_sums(thin, selected.thin, image, T)
-            found, num_lost = self._fuse(image, T, stamp_ns, index[fused], rows[fused], sums)
+            found = self._fuse(image, T, stamp_ns, index[fused], rows[fused], sums)
             observed = found[:, OBSERVED]
             changed = observed > 0
             updated = rows[fused][changed]
@@ -170,9 +159,7 @@ class Integrator:
             num_updated=len(updated),
             num_skipped=int(skipped.sum()),
             num_added=blocks.num_blocks - before,
-            num_refused=int((~there).sum()) if allocate_blocks else 0,
             num_voxels=int(observed.sum()),
-            num_labels_lost=num_lost,
         )
 
     def _thin_points(self, image: RangeImage, T_map_sensor: Float64) -> Float64:
@@ -213,8 +200,8 @@ class Integrator:
         index: Int64,
         rows: Int64,
         thin: tuple[Int64, Float32],
-    ) -> tuple[Int64, int]:
-        """Fuse an image into blocks; return figures of each, and the number of lost labels."""
+    ) -> Int64:
+        """Fuse an image into blocks; return figures of each."""
         config, sensor = self.blocks.config, image.sensor
         R_sensor_map = T_map_sensor[:3, :3].T
         corner = index * config.block_size_m + 0.5 * config.voxel_size_m
@@ -230,18 +217,16 @@ class Integrator:
             self._images(image),
             sums,
             image_settings(config, image),
-            (INTERPOLATIONS.index(config.interpolation), POWERS[config.weight_mode]),
-            self._channels(stamp_ns),
+            POWERS[config.weight_mode],
+            (self.blocks.color, self.blocks.votes),
         )
-
-        lost: list[int] = []
 
         def fuse(part: slice) -> None:
             where = tuple(values[part] for values in each)
-            lost.append(int(integrate_blocks(where, *common, found[part])))
+            integrate_blocks(where, *common, found[part])
 
         share(fuse, len(rows), self._threads)
-        return found, sum(lost)
+        return found
 
     def _free_for_long(self, rows: Int64) -> npt.NDArray[np.bool_]:
         """
@@ -252,9 +237,9 @@ class Integrator:
         """
         config = self.blocks.config
         self._num_images += 1
-        if config.tracking or not config.carve:
+        if not config.carve:
             return np.zeros(len(rows), bool)
-        visits = np.where(rows >= 0, self.blocks.head[rows, FREE_VISITS], 0)
+        visits = self.blocks.head[rows, FREE_VISITS]
         settled: npt.NDArray[np.bool_] = visits >= SETTLED
         settled &= (rows + self._num_images) % RECHECK != 0
         return settled
@@ -273,14 +258,11 @@ class Integrator:
             )
 
     def _labelled(self, image: RangeImage) -> RangeImage:
-        """Return an image with labels after label_map; those that leave no surface are masked."""
-        if image.label is None:
+        """Return an image in which labels of moving objects are masked."""
+        if image.label is None or not len(self._dynamic_labels):
             return image
-        label, mask = remapped(image.label, self.blocks.config), image.mask
-        if len(self._masked_labels):
-            masked = np.isin(label, self._masked_labels).astype(np.uint8)
-            mask = masked if mask is None else masked | mask
-        return replace(image, label=label, mask=mask)
+        mask = np.isin(image.label, self._dynamic_labels).astype(np.uint8)
+        return replace(image, mask=mask if image.mask is None else mask | image.mask)
 
     def _images(self, image: RangeImage) -> tuple[npt.NDArray[Any], ...]:
         """Return ranges in pairs, cosines, colours, labels, mask; missing ones have no rows."""
@@ -293,19 +275,6 @@ class Integrator:
             NO_COLOR if image.color is None else image.color,
             NO_LABEL if label is None else label,
             NO_MASK if mask is None else mask,
-        )
-
-    def _channels(self, stamp_ns: int) -> tuple[Any, ...]:
-        """Return the channels beside distance and weight in the form that the kernel takes."""
-        config, blocks = self.blocks.config, self.blocks
-        return (
-            blocks.color,
-            blocks.votes,
-            blocks.stamps,
-            SEMANTICS.index(config.semantics),
-            np.array(config.extra_labels, np.int32),
-            config.skip_extra_channels,
-            stamp_ns,
         )
 
 
@@ -325,9 +294,6 @@ def image_settings(config: TsdfConfig, image: RangeImage) -> Float32:
     found[kernels.MAX_RANGE] = sensor.max_range_m
     found[kernels.LIMIT] = image.largest_m + reach_behind_m(config, image)
     found[kernels.MAX_DIFFERENCE] = config.max_difference_m
-    found[kernels.MAX_DIFFERENCE_RATIO] = config.max_difference_ratio
     found[kernels.MAX_OFFSET] = config.ray_offset_voxels * config.voxel_size_m * is_lidar
     found[kernels.COLUMN_RAD] = sensor.pitch_rad[1]
-    if config.weight_mode.startswith('ray_density'):
-        found[kernels.WEIGHT] = sensor.density * config.voxel_size_m**2
     return found

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Input and result of an integration, whether of an image or of points: pose, labels, settings."""
+"""Input and result of an integration, whether of an image or of points: pose, settings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Largest entries of R R^T - I: of rotations taken as they are, and of those taken
 Rotations in text files of public datasets have determinants down to 0.9995.
 """
 
-POWERS = {'constant': 0, 'inverse_square': 1, 'ray_density': 1, 'ray_density_inv_sq': 2}
+POWERS = {'constant': 0, 'inverse_square': 1}
 """Exponent p of each weight mode: weights are proportional to depth^(-2 p)."""
 
 
@@ -48,12 +48,8 @@ class Integrated:
         Blocks that were free for long and are free in the image, so nothing would have changed.
     num_added : int
         Updated blocks that are new in the map.
-    num_refused : int
-        Blocks not added because of max_blocks.
     num_voxels : int
         Voxels observed.
-    num_labels_lost : int
-        Label observations dropped because a voxel had no free slot.
 
     """
 
@@ -61,20 +57,16 @@ class Integrated:
     num_updated: int
     num_skipped: int
     num_added: int
-    num_refused: int
     num_voxels: int
-    num_labels_lost: int
 
 
 def settings(config: TsdfConfig) -> Float32:
     """Return the settings that any integration needs, in the order of kernels/lookup.py."""
     found = np.zeros(kernels.NUM_SETTINGS, np.float32)
     found[kernels.TAU] = config.truncation_m
-    found[kernels.EXTRA] = config.extra_distance_m
     found[kernels.MIN_RANGE] = config.min_range_m
     found[kernels.MAX_RANGE] = config.max_range_m
-    found[kernels.WEIGHT] = 1.0
-    found[kernels.DROPOFF] = config.dropoff_start_m if config.weight_dropoff else np.inf
+    found[kernels.DROPOFF] = config.voxel_size_m
     found[kernels.MIN_WEIGHT] = config.min_measurement_weight
     found[kernels.MAX_WEIGHT] = config.max_weight
     found[kernels.CONTRADICTS] = 0.5 * config.voxel_size_m
@@ -109,18 +101,6 @@ def checked_column(
         expected = f'{kind.__name__} {" or ".join(map(str, shapes))}, one for each point'
         raise CloudFormatError(f'{name}: {found.dtype} {found.shape}, expected {expected}')
     return found
-
-
-def remapped(labels: npt.NDArray[Any], config: TsdfConfig) -> npt.NDArray[np.int32]:
-    """Return labels, of any shape, after label_map."""
-    found: npt.NDArray[np.int32] = np.asarray(labels, np.int32)
-    if not config.label_map:
-        return found
-    pairs: npt.NDArray[np.int32] = np.array(config.label_map, np.int32).reshape(-1, 2)
-    pairs = pairs[np.argsort(pairs[:, 0])]
-    place = np.minimum(np.searchsorted(pairs[:, 0], found), len(pairs) - 1)
-    chosen: npt.NDArray[np.int32] = np.where(pairs[place, 0] == found, pairs[place, 1], found)
-    return chosen
 
 
 @cache

@@ -51,7 +51,7 @@ class Mesh:
     triangles : (F, 3) int32
         Vertex numbers of each, counter-clockwise as seen from free space.
     colors : (V, 3) uint8
-        Red, green, blue, as ``mesh_color`` says; no rows for ``slope``.
+        Red, green, blue of the voxels, else of their labels; no rows if neither is kept.
     labels : (V,) int32
         Label of the nearer voxel that has one, -1 for none; no rows if the map keeps no labels.
 
@@ -108,7 +108,7 @@ class Changes:
         Rows, in the arrays below, of each block and of those above it; -1 if missing.
     field : (R, 2, N) float32
     color : (R, 4, N) float32, or no rows
-    votes : (R, V, N) float32, or no rows
+    votes : (R, 2, N) float32, or no rows
 
     """
 
@@ -254,12 +254,6 @@ class Mesher:
         """Return the keys of the blocks that have triangles."""
         return self._meshes.keys()
 
-    def block_mesh(self, index: npt.ArrayLike) -> Mesh:
-        """Return the triangles of one block, by (3,) index."""
-        (row,) = self._blocks.find(np.asarray(index)[None])
-        found = self._meshes.get(int(self._blocks.head[row, KEY])) if row >= 0 else None
-        return EMPTY if found is None else found
-
     def _marched(self, changes: Changes) -> list[BlockMesh | None]:
         """Run marching cubes over blocks and return their meshes; None without triangles."""
         config = self._blocks.config
@@ -291,14 +285,11 @@ class Mesher:
         vertices[np.arange(len(edges)), edges[:, 3]] += places
         vertices *= config.voxel_size_m
         colors, labels = EMPTY.colors, EMPTY.labels
-        if config.color or config.votes_per_voxel:
+        if config.color or config.semantics != 'none':
             block = np.repeat(np.arange(num), num_vertices)
             ends = ends_of(edges, neighbours[block], index[block], side)
             labels = self._labels(changes, ends, places)
-            if config.mesh_colors == 'label':
-                colors = label_colors(labels)
-            elif config.mesh_colors == 'color':
-                colors = self._colors(changes, ends, places)
+            colors = self._colors(changes, ends, places) if config.color else label_colors(labels)
         return [
             BlockMesh(
                 vertices=vertices[bounds[i] : bounds[i + 1]],
@@ -325,10 +316,10 @@ class Mesher:
     def _labels(self, changes: Changes, ends: tuple[Int64, Int64], places: Float64) -> Int32:
         """Return the label at the nearer end of each edge that has one."""
         config = self._blocks.config
-        if not config.votes_per_voxel:
+        if config.semantics == 'none':
             return np.empty(0, np.int32)
         votes = np.moveaxis(changes.votes[ends[0], :, ends[1]], -1, 0)
-        labels, _ = labels_of(config.semantics, votes, min_weight=config.min_label_weight)
+        labels, _ = labels_of(votes)
         second = places > 0.5
         near = np.where(second, labels[:, 1], labels[:, 0])
         return np.where(near >= 0, near, np.where(second, labels[:, 0], labels[:, 1]))

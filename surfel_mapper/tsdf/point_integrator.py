@@ -6,8 +6,7 @@ PointIntegrator: fuses clouds into a block map ray by ray, without a projection 
 For clouds that are no range image: merged from several sensors, from solid-state lidars with
 irregular patterns, or in a frame that is not at the optical centre. Slower than Integrator, which
 looks each voxel up in a range image, and independent of the order and the density of points. The
-distances are along rays; ``allocation``, ``distance``, ``interpolation`` and the settings of range
-images do not apply.
+distances are along rays; ``distance`` and the settings of range images do not apply.
 
 Source: voxel by voxel along each ray as voxblox (Oleynikova et al. 2017), with eight voxels about
 samples near the surface; see kernels/point_fusion.py.
@@ -20,7 +19,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config import SEMANTICS
 from surfel_mapper.errors import CloudFormatError, MapLimitError
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.kernels import point_fusion as kernels
@@ -30,7 +28,6 @@ from surfel_mapper.tsdf.measurements import (
     checked_pose,
     Integrated,
     POWERS,
-    remapped,
     settings,
 )
 from surfel_mapper.tsdf.selection import listed, MAX_SIDE, NO_COSINE
@@ -57,7 +54,7 @@ class PointIntegrator:
         self.blocks = blocks
         config = blocks.config
         self._bits = config.voxels_per_side.bit_length() - 1
-        self._masked = np.array(sorted({*config.dynamic_labels, *config.invalid_labels}), np.int32)
+        self._dynamic_labels = np.array(config.dynamic_labels, np.int32)
 
     def integrate(
         self,
@@ -82,8 +79,8 @@ class PointIntegrator:
         colors : (N, 3 or 4) uint8, optional
             Red, green, blue of each point; a fourth channel of 0 means unknown.
         labels : (N,) int, optional
-            Label of each point, -1 for unknown. Points of dynamic and invalid labels only free
-            the space in front of them.
+            Label of each point, -1 for unknown. Points of dynamic labels only free the space in
+            front of them.
 
         Returns
         -------
@@ -112,8 +109,8 @@ class PointIntegrator:
         places = (local @ T[:3, :3].T + T[:3, 3]) / voxel_m
         solid: npt.NDArray[Any] = np.ones(len(local), bool)
         if labels is not None:
-            labels = remapped(labels[used], self.blocks.config)
-            solid = ~np.isin(labels, self._masked)
+            labels = np.asarray(labels[used], np.int32)
+            solid = ~np.isin(labels, self._dynamic_labels)
             labels = labels[solid]
         if colors is not None:
             colors = np.ascontiguousarray(colors[used][solid])
@@ -121,21 +118,20 @@ class PointIntegrator:
         index = self._touched(local, ranges, surfaces, T)
         before = blocks.num_blocks
         rows = blocks.place(index)
-        there = rows[rows >= 0]
         try:
             slots = np.full(len(blocks.head), -1, np.int64)
-            slots[there] = np.arange(len(there))
-            rates = blocks.forgetting_rates(there, stamp_ns)
-            found = self._fuse(places, surfaces, T[:3, 3] / voxel_m, stamp_ns, there, slots, rates)
+            slots[rows] = np.arange(len(rows))
+            rates = blocks.forgetting_rates(rows, stamp_ns)
+            found = self._fuse(places, surfaces, T[:3, 3] / voxel_m, rows, slots, rates)
             images = (
                 NO_COLORS if colors is None else colors,
                 NO_LABELS if labels is None else labels,
             )
-            lost = self._fuse_channels(surfaces, ranges[solid], rates, slots, images)
+            self._fuse_channels(surfaces, ranges[solid], rates, slots, images)
             changed = found[:, OBSERVED] > 0
             if changed.any():
                 figures = (found[changed, column] for column in (MOVED, SOLID, INSIDE))
-                blocks.touch_fused(there[changed], stamp_ns, *figures)
+                blocks.touch_fused(rows[changed], stamp_ns, *figures)
         finally:
             blocks.drop_new(rows)
         return Integrated(
@@ -143,9 +139,7 @@ class PointIntegrator:
             num_updated=int(changed.sum()),
             num_skipped=0,
             num_added=blocks.num_blocks - before,
-            num_refused=len(rows) - len(there),
             num_voxels=int(found[:, OBSERVED].sum()),
-            num_labels_lost=lost,
         )
 
     def _fuse(
@@ -153,7 +147,6 @@ class PointIntegrator:
         places: Float64,
         surfaces: Float64,
         origin: Float64,
-        stamp_ns: int,
         rows: Int64,
         slots: Int64,
         rates: Float32,
@@ -171,10 +164,7 @@ class PointIntegrator:
         if config.carve:
             kernels.sum_free(places, origin, *content, blocks.lookup, slots, sums)
         found = np.empty((len(rows), NUM_FOUND), np.int64)
-        arrays = blocks.field, blocks.stamps
-        kernels.fuse_sums(
-            rows, sums, rates, stamp_ns, settings(self.blocks.config), *arrays, found
-        )
+        kernels.fuse_sums(rows, sums, rates, settings(config), blocks.field, found)
         return found
 
     def _touched(
@@ -185,7 +175,7 @@ class PointIntegrator:
         valid = ranges >= config.min_range_m
         if not valid.any():
             return np.empty((0, 3), np.int64)
-        reach_m = min(float(ranges[valid].max()), config.max_range_m) + config.reach_behind_m
+        reach_m = min(float(ranges[valid].max()), config.max_range_m) + config.truncation_m
         half = int(reach_m / config.block_size_m) + 2
         side = 2 * half + 1
         if side > MAX_SIDE:
@@ -203,7 +193,7 @@ class PointIntegrator:
         reach = np.zeros(9)
         reach[:4] = (
             config.truncation_m,
-            config.reach_behind_m,
+            config.truncation_m,
             config.min_range_m,
             config.max_range_m,
         )
@@ -221,8 +211,8 @@ class PointIntegrator:
         rates: Float32,
         slots: Int64,
         images: tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32]],
-    ) -> int:
-        """Fuse colours and labels of points; return the number of lost labels."""
+    ) -> None:
+        """Fuse colours and labels of points."""
         config, blocks = self.blocks.config, self.blocks
         valid = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)
         depth = np.maximum(ranges, config.min_range_m)
@@ -231,8 +221,6 @@ class PointIntegrator:
         )
         weights = np.where(valid, weights, 0.0).astype(np.float32)
         most = np.float32(config.max_weight)
-        channels = blocks.color, blocks.votes, SEMANTICS.index(config.semantics)
+        channels = blocks.color, blocks.votes
         where = self._bits, blocks.lookup, slots
-        return int(
-            kernels.fuse_point_channels(points, weights, rates, most, *where, images, channels)
-        )
+        kernels.fuse_point_channels(points, weights, rates, most, *where, images, channels)

@@ -166,7 +166,7 @@ def checked_size(size: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.int32], Float32]:
     """
-    Return the label of the voxel at each point, and its weight.
+    Return the label of the voxel at each point, and its lead.
 
     Parameters
     ----------
@@ -186,8 +186,7 @@ def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.i
         If points are of another shape, or the map keeps no labels.
 
     """
-    config = blocks.config
-    if config.semantics == 'none':
+    if blocks.config.semantics == 'none':
         raise ValueError("semantics: 'none', expected a map that keeps labels")
     places, bits = in_voxels(blocks, points)
     near = np.abs(places).max(axis=1) < 1e12  # false for nan and for indices beyond int64
@@ -196,56 +195,13 @@ def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.i
     x, y, z = (voxel & ((1 << bits) - 1)).T
     votes = blocks.votes[rows, :, x + ((y + (z << bits)) << bits)]
     votes[rows < 0] = 0.0  # as in a voxel without labels
-    return labels_of(config.semantics, votes.T, min_weight=config.min_label_weight)
+    return labels_of(votes.T)
 
 
-def labels_of(
-    semantics: str, votes: Float32, *, min_weight: float = 0.0
-) -> tuple[npt.NDArray[np.int32], Float32]:
+def labels_of(votes: Float32) -> tuple[npt.NDArray[np.int32], Float32]:
     """
-    Return the label of each voxel, and its weight.
+    Return the label of each voxel, -1 for none, and its lead, from votes (2, ...).
 
-    Parameters
-    ----------
-    semantics : str
-        As in the setting layers.tsdf.semantics.
-    votes : (V, ...) float32
-        Votes of voxels, see tsdf/kernels/channels.py.
-    min_weight : float
-        first_k: labels of at most this weight are ignored.
-
-    Returns
-    -------
-    (...) int32
-        -1 for none; on a tie the smaller label, with first_k the one seen first.
-    (...) float32
-        Number of observations (majority, binary), weight (first_k) or lead (single).
-
+    See tsdf/kernels/channels.py for the votes.
     """
-    if semantics in ('majority', 'binary'):
-        label, weight = votes.argmax(axis=0), votes.max(axis=0)
-        return np.where(weight > 0.0, label, -1).astype(np.int32), weight
-    if semantics == 'single':
-        return votes[0].astype(np.int32) - 1, votes[1]
-    best = votes[1::2].argmax(axis=0)[None]
-    label = np.take_along_axis(votes[::2], best, axis=0)[0]
-    weight = np.take_along_axis(votes[1::2], best, axis=0)[0]
-    return np.where(weight > min_weight, label - 1, -1).astype(np.int32), weight
-
-
-def log_odds(votes: Float32, confidence: float) -> Float32:
-    """
-    Return the log-likelihoods of labels, up to a constant, from counts, (V, ...).
-
-    Parameters
-    ----------
-    votes : (V, ...) float32
-        Counts kept with semantics ``majority``.
-    confidence : float
-        Probability that an observed label is correct, in (0, 1).
-
-    """
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f'confidence: {confidence}, expected more than 0 and less than 1')
-    odds: Float32 = votes * np.float32(math.log(confidence / (1.0 - confidence)))
-    return odds
+    return votes[0].astype(np.int32) - 1, votes[1]

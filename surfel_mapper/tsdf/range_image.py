@@ -154,7 +154,6 @@ def from_depth(
     sensor: CameraModel,
     depth: npt.NDArray[Any],
     *,
-    scale: float | None = None,
     unknown: float | None = None,
 ) -> RangeImage:
     """
@@ -167,16 +166,13 @@ def from_depth(
     depth : (rows, columns) float32, float64 or uint16
         Depth along z. Floats are in m; 0, negative and nan mean unknown, inf free up to
         max_range_m. uint16 is in mm; 0 means unknown.
-    scale : float, optional
-        Metres of one unit, if different from the above.
     unknown : float, optional
         A further value that means unknown: 65535 with some cameras.
 
     Raises
     ------
     CloudFormatError
-        If the size differs from the sensor model, the type is not supported, or scale is not
-        positive.
+        If the size differs from the sensor model, or the type is not supported.
 
     """
     if depth.shape != (sensor.rows, sensor.columns):
@@ -187,10 +183,7 @@ def from_depth(
     native_type = depth.dtype.newbyteorder('=')
     if native_type not in (np.float32, np.float64, np.uint16):
         raise CloudFormatError(f'depth: {depth.dtype}, expected float32, float64 or uint16')
-    if scale is None:
-        scale = 1e-3 if native_type == np.uint16 else 1.0
-    if not 0.0 < scale < np.inf:
-        raise CloudFormatError(f'depth scale: {scale}, expected positive and finite')
+    scale = 1e-3 if native_type == np.uint16 else 1.0
     image = np.empty((sensor.rows, sensor.columns), np.float32)
     native = np.ascontiguousarray(depth, native_type)
     absent = np.nan if unknown is None else float(unknown)

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Selection of the blocks that a range image updates: touched by its rays, or in its field of view.
+Selection of the blocks that a range image updates: those that its rays touch.
 
-The cost of the first grows with the number of rays, of the second with the volume in view. Blocks
-are fused independently, so a block that both select gets the same values. Blocks through which
-rays only pass, which need no fusion if they are free already, are found here too.
+Blocks through which rays only pass, which need no fusion if they are free already, are found here
+too.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ class BlockSelection:
     Parameters
     ----------
     config : TsdfConfig
-        Size of voxels and blocks, truncation, allocation, carving.
+        Size of voxels and blocks, truncation, carving.
 
     """
 
@@ -120,8 +119,6 @@ class BlockSelection:
         if thin is not None and len(thin):
             around = self._about(thin, image.sensor, T_map_sensor, low, side)
         index = listed(marks[TOUCHED], low, side)
-        if config.allocation == 'frustum':
-            index = in_view(config, image, T_map_sensor, half)
         near = np.ones(len(index), bool)
         if config.carve:
             look_up_marks(marks[NEAR], side, low, index, near)
@@ -166,7 +163,7 @@ def listed(marks: Int64, low: Int64, side: int) -> Int64:
 def reach_behind_m(config: TsdfConfig, image: RangeImage) -> float:
     """Return the distance behind a surface up to which voxels change, along the ray, m."""
     longer = 1.0 if image.cosine is None else 1.0 / LEAST_COSINE
-    return config.reach_behind_m * longer
+    return config.truncation_m * longer
 
 
 def half_side(config: TsdfConfig, image: RangeImage) -> int:
@@ -181,23 +178,5 @@ def reach(config: TsdfConfig, image: RangeImage) -> Float64:
     sensor = image.sensor
     free = [config.block_size_m / 8.0 / pitch for pitch in sensor.pitch_rad]
     band = [SPACING_VOXELS * config.voxel_size_m / pitch for pitch in sensor.pitch_rad]
-    ends = [config.truncation_m, config.reach_behind_m, sensor.min_range_m, sensor.max_range_m]
+    ends = [config.truncation_m, config.truncation_m, sensor.min_range_m, sensor.max_range_m]
     return np.array([*ends, float(config.carve), *free, *band])
-
-
-def in_view(config: TsdfConfig, image: RangeImage, T_map_sensor: Float64, half: int) -> Int64:
-    """Return the blocks that intersect the field of view up to the largest range, (K, 3)."""
-    size_m, sensor = config.block_size_m, image.sensor
-    radius_m = np.sqrt(0.75) * size_m
-    middle = np.floor(T_map_sensor[:3, 3] / size_m).astype(np.int64)
-    along = np.arange(-half, half + 1)
-    found = []
-    for layer in along:  # by layers, because the whole cube may be large
-        grid = np.meshgrid([layer], along, along, indexing='ij')
-        index = middle + np.stack(grid, axis=-1).reshape(-1, 3)
-        centres = ((index + 0.5) * size_m - T_map_sensor[:3, 3]) @ T_map_sensor[:3, :3]
-        distance = np.linalg.norm(centres, axis=1)
-        near = distance >= sensor.min_range_m - radius_m
-        far = distance <= image.largest_m + reach_behind_m(config, image) + radius_m
-        found.append(index[near & far & sensor.sees(centres, radius_m)])
-    return np.concatenate(found)

@@ -162,26 +162,9 @@ class CameraModel:
         return self.kind, self.parameters, NO_ELEVATIONS
 
     @property
-    def density(self) -> float:
-        """Number of rays through a face of 1 m^2 at depth 1 m."""
-        return self.fx * self.fy
-
-    @property
     def pitch_rad(self) -> tuple[float, float]:
         """Largest angles between neighbouring rows and columns."""
         return 1.0 / self.fy, 1.0 / self.fx
-
-    def sees(self, centres: Float64, inflation_m: float) -> npt.NDArray[np.bool_]:
-        """Return which balls about (K, 3) centres, sensor frame, m, touch the field of view."""
-        corners = [(0.0, 0.0), (self.columns, 0.0), (self.columns, self.rows), (0.0, self.rows)]
-        rays = np.array(
-            [((u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0) for u, v in corners]
-        )
-        normals = np.cross(rays, np.roll(rays, -1, axis=0))
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        within = centres[:, 2] >= -inflation_m
-        inside: npt.NDArray[np.bool_] = within & (centres @ normals.T >= -inflation_m).all(axis=1)
-        return inside
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,38 +234,6 @@ class LidarModel:
         ]
         refuse_unless(self, checks)
 
-    @classmethod
-    def from_resolution(
-        cls,
-        *,
-        vertical_fov_deg: float,
-        vertical_resolution_deg: float,
-        horizontal_resolution_deg: float,
-        **properties: Any,
-    ) -> LidarModel:
-        """
-        Return the model of a lidar from the angles between neighbouring rays.
-
-        H beams span H - 1 gaps: 30 deg in steps of 2 deg are 16 beams.
-
-        Raises
-        ------
-        ConfigError
-            If an angle is not positive and finite, or another property is out of bounds.
-
-        """
-        angles = (vertical_fov_deg, vertical_resolution_deg, horizontal_resolution_deg)
-        if not all(0.0 < angle < math.inf for angle in angles):
-            raise ConfigError(f'LidarModel: angles {angles} deg, expected positive ones')
-        across = properties.get('horizontal_fov_deg', 360.0)
-        gaps = round(across / horizontal_resolution_deg)
-        return cls(
-            rows=round(vertical_fov_deg / vertical_resolution_deg) + 1,
-            columns=gaps if across == 360.0 else gaps + 1,
-            vertical_fov_deg=vertical_fov_deg,
-            **properties,
-        )
-
     @property
     def wraps(self) -> bool:
         """Whether the last column is the neighbour of the first."""
@@ -351,26 +302,9 @@ class LidarModel:
         return self.kind, self.parameters, self.elevations
 
     @property
-    def density(self) -> float:
-        """Number of rays through a face of 1 m^2 at range 1 m, from virtual focal lengths."""
-        across = self.columns * 90.0 / self.horizontal_fov_deg / 2.0
-        return across * self.rows * 90.0 / self.vertical_fov_deg / 2.0
-
-    @property
     def pitch_rad(self) -> tuple[float, float]:
         """Largest angles between neighbouring rows and columns."""
         return float(-np.diff(self.elevations_rad).min()), self._column_rad
-
-    def sees(self, centres: Float64, inflation_m: float) -> npt.NDArray[np.bool_]:
-        """Return which balls about (K, 3) centres, sensor frame, m, touch the field of view."""
-        distance = np.linalg.norm(centres, axis=1)
-        ball = np.arcsin(np.minimum(inflation_m / np.maximum(distance, inflation_m), 1.0))
-        half_top, half_bottom = -np.diff(self.elevations_rad)[[0, -1]] / 2.0
-        elevation = np.arcsin(np.clip(centres[:, 2] / np.maximum(distance, 1e-12), -1.0, 1.0))
-        above = elevation - ball > self.elevations_rad[0] + half_top
-        below = elevation + ball < self.elevations_rad[-1] - half_bottom
-        seen: npt.NDArray[np.bool_] = ~(above | below) | (distance <= inflation_m)
-        return seen
 
 
 Sensor = CameraModel | LidarModel

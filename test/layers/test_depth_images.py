@@ -16,7 +16,7 @@ from test.pipeline.test_scan_images import mapped, mapper_with
 
 CAMERA = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
 LABELS = {
-    'layers.tsdf.semantics': 'first_k',
+    'layers.tsdf.semantics': 'single',
     'layers.tsdf.label_topic': 'labels',
 }
 

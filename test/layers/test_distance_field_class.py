@@ -11,9 +11,7 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.tsdf.queries import FREE, OCCUPIED, UNKNOWN
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
-CONFIG = TsdfConfig(
-    voxel_size_m=0.1, truncation_m=0.3, color=True, semantics='majority', num_labels=5
-)
+CONFIG = TsdfConfig(voxel_size_m=0.1, truncation_m=0.3, color=True, semantics='single')
 LIDAR = LidarModel(rows=64, columns=360, vertical_fov_deg=60.0)
 SPHERE = 2.0 * LIDAR.directions.reshape(-1, 3)
 

@@ -114,7 +114,7 @@ def test_labels_are_joined_like_colours():
     mapper.add_scan(wall(1000 * MS))
     mapped(mapper)
     blocks = mapper.tsdf.blocks
-    labels, _ = labels_of('single', blocks.votes[blocks.rows()].swapaxes(0, 1))
+    labels, _ = labels_of(blocks.votes[blocks.rows()].swapaxes(0, 1))
     assert set(np.unique(labels)) == {-1, 3, 7}
 
 

@@ -28,21 +28,22 @@ def interior(sensor, points):
 
 
 @pytest.mark.parametrize(
-    ('interpolation', 'bounds'),
-    [('adaptive', (1e-4, 1e-4, 1e-4)), ('nearest', (0.002, 0.008, 0.015))],
+    ('max_difference_m', 'bounds'),
+    [(0.2, (1e-4, 1e-4, 1e-4)), (-1.0, (0.002, 0.008, 0.015))],
+    ids=['adaptive', 'nearest'],
 )
-def test_distances_to_a_plane_are_those_along_the_rays(interpolation, bounds):
+def test_distances_to_a_plane_are_those_along_the_rays(max_difference_m, bounds):
     for angle, bound in zip(ANGLES, bounds, strict=True):
         range_m, normal = plane(VGA, angle)
         sizes = dict(voxel_size_m=0.05, truncation_m=0.15)
-        blocks = fused(image_of(VGA, range_m), **sizes, interpolation=interpolation)
+        blocks = fused(image_of(VGA, range_m), **sizes, max_difference_m=max_difference_m)
         points, D, _ = voxels(blocks)
         d = np.linalg.norm(points, axis=1)
         truth = 2.0 * normal[2] / (points @ normal) * d - d
         inside = interior(VGA, points) & (abs(truth) < 0.14)
         error = abs(D - truth)[inside]
         assert inside.sum() > 50
-        found = np.percentile(error, 99) if interpolation == 'adaptive' else error.max()
+        found = np.percentile(error, 99) if max_difference_m > 0.0 else error.max()
         assert found <= bound, angle
 
 
@@ -134,19 +135,19 @@ def test_no_false_surface_joins_a_near_and_a_far_wall_unless_all_is_mixed():
     row, column = np.indices((480, 640))  # a slanted edge, so that voxels lie about it anyhow
     depth = np.where(column + 0.37 * row < 400, 1.0, 3.0)
     curtain = {}
-    for interpolation in ('adaptive', 'bilinear'):
+    for max_difference_m in (0.2, 1e9):
         blocks = fused(
             image_of(VGA, depth * VGA.ray_length),
             voxel_size_m=0.02,
             truncation_m=0.1,
-            interpolation=interpolation,
+            max_difference_m=max_difference_m,
         )
         points, D, _ = voxels(blocks)
         # Surface between the walls: 1 + tau < z + s < 3 - tau.
         z = points[:, 2] * (1.0 + D / np.linalg.norm(points, axis=1))
-        curtain[interpolation] = ((abs(D) < 0.09) & (z > 1.1) & (z < 2.9)).sum()
-    assert curtain['adaptive'] == 0
-    assert curtain['bilinear'] > 0
+        curtain[max_difference_m] = ((abs(D) < 0.09) & (z > 1.1) & (z < 2.9)).sum()
+    assert curtain[0.2] == 0
+    assert curtain[1e9] > 0
 
 
 def test_far_from_the_origin_distances_are_as_exact():

@@ -17,7 +17,7 @@ from test.tsdf.scenes import image_of, integrator
 
 
 def every_channel(**settings):
-    channels = dict(color=True, tracking=True, semantics='first_k', first_k=3)
+    channels = dict(color=True, semantics='single')
     return BlockMap(TsdfConfig(voxels_per_side=2, **channels, **settings))
 
 
@@ -93,18 +93,6 @@ def test_changed_since_lists_changes_after_any_version():
     assert np.array_equal(blocks.changed_since(seen), np.sort(rows[4:8]))
     assert blocks.drop_new(rows) == 2
     assert np.array_equal(blocks.rows(), np.sort(rows[:8]))
-
-
-def test_beyond_the_budget_there_is_no_row():
-    blocks = every_channel(max_blocks=10)
-    rows = blocks.place(indices(30))
-    assert (rows[:10] >= 0).all()
-    assert (rows[10:] == -1).all()
-    assert np.array_equal(blocks.place(indices(30)), rows)
-    full = every_channel()
-    full.touch(full.place(indices(30)), 1)
-    with pytest.raises(MapLimitError, match='max_blocks = 10'):
-        every_channel(max_blocks=10).insert(full.copied(full.rows()))
 
 
 def test_index_beyond_20_bits_is_refused():

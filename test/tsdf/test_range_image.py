@@ -58,20 +58,9 @@ def test_points_fall_where_the_equations_say(sensor):
 
 
 def test_sixteen_beams_are_sixteen_rows():
-    made = LidarModel.from_resolution(
-        vertical_fov_deg=30.0, vertical_resolution_deg=2.0, horizontal_resolution_deg=0.2
-    )
-    assert (made.rows, made.columns, made.wraps) == (16, 1800, True)
-    half = LidarModel.from_resolution(
-        vertical_fov_deg=33.2,
-        vertical_resolution_deg=0.527,
-        horizontal_resolution_deg=0.5,
-        horizontal_fov_deg=180.0,
-    )
-    assert (half.rows, half.columns, half.wraps) == (64, 361, False)
     angles = np.deg2rad(np.arange(15.0, -16.0, -2.0))
     points = 5.0 * np.stack([np.cos(angles), 0.0 * angles, np.sin(angles)], axis=1)
-    image = from_points(made, points)
+    image = from_points(LidarModel(rows=16, columns=1800, vertical_fov_deg=30.0), points)
     assert ((image.range_m[:, :-1] > 0).sum(axis=1) == 1).all()
 
 
@@ -141,7 +130,6 @@ def test_whole_numbers_are_millimetres_unless_told():
     [
         (lambda: from_depth(SMALL, np.zeros((80, 60), np.float32)), r'\(80, 60\), expected'),
         (lambda: from_depth(SMALL, np.zeros((60, 80), np.int32)), 'int32, expected float32'),
-        (lambda: from_depth(SMALL, np.zeros((60, 80), np.uint16), scale=0.0), 'depth scale: 0'),
         (lambda: from_ranges(VLP16, np.zeros((16, 361))), r'expected floats \(16, 360\)'),
         (lambda: from_points(VLP16, np.zeros((5, 2))), r'expected \(N, 3\)'),
         (lambda: from_points(VLP16, np.zeros((5, 3), int)), r'expected \(N, 3\) float'),

@@ -41,46 +41,29 @@ def everywhere(T, reach_m, size_m):
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
-def test_the_view_holds_every_block_with_a_voxel_observed(sensor):
+def test_a_new_block_beside_the_chosen_ones_has_no_voxel_near_a_surface(sensor):
     rng, sensor = np.random.default_rng(5), SENSORS[sensor]
-    config = TsdfConfig(**SIZES, allocation='frustum')
-    for _ in range(20):
-        T, image = random_pose(rng), random_image(sensor, rng)
+    config = TsdfConfig(**SIZES)
+    for _ in range(5):
+        T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)
         chosen = {*map(tuple, BlockSelection(config).blocks(image, T).index)}
         one = Integrator(BlockMap(config))
         index = everywhere(T, 5.4, config.block_size_m)
         rows = one.blocks.place(index)
         none = np.full(len(one.blocks.head), -1), np.zeros((0, 64, 3), np.float32)
-        found, _ = one._fuse(image, T, 0, index, rows, none)
-        observed = found[:, OBSERVED]
-        assert (observed > 0).sum() > 100
-        assert {*map(tuple, index[observed > 0])} <= chosen
-        touched = BlockSelection(TsdfConfig(**SIZES)).blocks(image, T).index
-        assert {*map(tuple, touched)} <= chosen
+        found = one._fuse(image, T, 0, index, rows, none)
+        near = (abs(one.blocks.distance[rows]) < 0.06) & (one.blocks.weight[rows] > 0)
+        assert near.sum() > 100
+        share = near.any(axis=1).sum()
+        missed = {*map(tuple, index[near.any(axis=1)])} - chosen
+        assert (found[:, OBSERVED] > 0).sum() > 100
+        assert len(missed) <= 0.02 * share
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
-def test_blocks_of_both_ways_hold_the_same(sensor):
-    rng, sensor = np.random.default_rng(6), SENSORS[sensor]
-    T, image = random_pose(rng), random_image(sensor, rng)
-    maps = {}
-    for allocation in ('band', 'frustum'):
-        one = Integrator(BlockMap(TsdfConfig(**SIZES, allocation=allocation)))
-        one.integrate(image, T)
-        maps[allocation] = one.blocks
-    band, frustum = maps.values()
-    rows = band.rows()
-    other = frustum.find(band.index(rows))
-    assert len(rows) > 100
-    assert (other >= 0).all()
-    assert np.array_equal(band.field[rows], frustum.field[other])
-
-
-@pytest.mark.parametrize('sensor', SENSORS)
-@pytest.mark.parametrize('extra_m', [0.0, 0.4])
-def test_rays_touch_every_block_of_their_band(sensor, extra_m):
+def test_rays_touch_every_block_of_their_band(sensor):
     rng, sensor = np.random.default_rng(7), SENSORS[sensor]
-    config = TsdfConfig(**SIZES, carve=False, extra_distance_m=extra_m)
+    config = TsdfConfig(**SIZES, carve=False)
     for _ in range(5):
         # So far away pixels are more than half a voxel apart, and none is passed over.
         T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)
@@ -88,31 +71,11 @@ def test_rays_touch_every_block_of_their_band(sensor, extra_m):
         range_m = image.range_m[:, : sensor.columns]
         rays = sensor.directions.astype(float) @ T[:3, :3].T
         sampled = set()
-        for along in np.linspace(-0.3, 0.3 + extra_m, 40):
+        for along in np.linspace(-0.3, 0.3, 40):
             at = np.maximum(range_m + along, sensor.min_range_m)[..., None] * rays + T[:3, 3]
             sampled |= {*map(tuple, np.floor(at[range_m > 0] / config.block_size_m).astype(int))}
         assert sampled <= chosen
         assert len(chosen) < 1.2 * len(sampled)
-
-
-def test_through_a_dense_image_rays_are_thinned_but_no_voxel_of_the_surface_is_lost():
-    sensor = CameraModel(columns=320, rows=240, fx=260.0, fy=260.0, cx=160.0, cy=120.0)
-    row, column = np.indices((240, 320))
-    image = image_of(sensor, 2.0 + 0.3 * np.sin(column / 30.0) + 0.2 * np.cos(row / 20.0))
-    counts = {}
-    for allocation in ('band', 'frustum'):
-        one = Integrator(
-            BlockMap(
-                TsdfConfig(
-                    voxel_size_m=0.04, truncation_m=0.12, carve=False, allocation=allocation
-                )
-            )
-        )
-        one.integrate(image, np.eye(4))
-        rows = one.blocks.rows()
-        near = (abs(one.blocks.distance[rows]) < 0.04) & (one.blocks.weight[rows] > 0)
-        counts[allocation] = near.sum()
-    assert counts['band'] == counts['frustum'] > 4000
 
 
 def test_carving_reaches_all_but_corners_of_blocks_along_the_rays():
@@ -138,18 +101,15 @@ def test_carving_reaches_all_but_corners_of_blocks_along_the_rays():
 
 
 def test_without_a_measurement_there_is_no_block():
-    for allocation in ('band', 'frustum'):
-        image = image_of(SENSORS['lidar'], np.full((16, 90), np.nan))
-        config = TsdfConfig(**SIZES, allocation=allocation)
-        found = BlockSelection(config).blocks(image, np.eye(4))
-        assert (found.index.shape, found.near.shape, found.thin.shape) == ((0, 3), (0,), (0, 3))
+    image = image_of(SENSORS['lidar'], np.full((16, 90), np.nan))
+    found = BlockSelection(TsdfConfig(**SIZES)).blocks(image, np.eye(4))
+    assert (found.index.shape, found.near.shape, found.thin.shape) == ((0, 3), (0,), (0, 3))
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
-@pytest.mark.parametrize('allocation', ['band', 'frustum'])
-def test_blocks_near_the_surface_are_those_of_the_band(sensor, allocation):
+def test_blocks_near_the_surface_are_those_of_the_band(sensor):
     rng, sensor = np.random.default_rng(9), SENSORS[sensor]
-    config = TsdfConfig(**SIZES, carve=True, allocation=allocation)
+    config = TsdfConfig(**SIZES, carve=True)
     selection = BlockSelection(config)  # its marks are used again
     for _ in range(5):
         T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)

@@ -70,12 +70,11 @@ def look_up(config, sensor, image, p, u, v):
         (v0 + 1, u0 + 1, du * dv),
     ]
     inside = all(0 <= j < sensor.rows and 0 <= i < columns for j, i, _ in quad)
-    if config.interpolation != 'nearest' and inside:
+    if inside:
         q = np.array([float(image[j, i]) for j, i, _ in quad])
-        allowed = max(config.max_difference_m, config.max_difference_ratio * q.min())
         clear = q > sensor.max_range_m
         alike = (q > 0).all() and (clear.all() or not clear.any())
-        if alike and (config.interpolation == 'bilinear' or q.max() - q.min() <= allowed):
+        if alike and q.max() - q.min() <= config.max_difference_m:
             return float(np.dot(q, [share for _, _, share in quad])), quad
     j, i = int(np.floor(v + 0.5)), int(np.floor(u + 0.5))
     if not (0 <= j < sensor.rows and 0 <= i < columns):
@@ -87,15 +86,11 @@ def look_up(config, sensor, image, p, u, v):
     return float(image[j, i]), [(j, i, 1.0)]
 
 
-def weight(config, sensor, depth, s):
+def weight(config, depth, s):
     """Return the weight of one measurement."""
-    w = 1.0
-    if config.weight_mode.startswith('ray_density'):
-        w = sensor.density * (config.voxel_size_m / depth) ** 2
-    if config.weight_mode in ('inverse_square', 'ray_density_inv_sq'):
-        w /= depth**2
-    start, tau = config.dropoff_m or config.voxel_size_m, config.truncation_m
-    if config.weight_dropoff and s < -start:
+    w = 1.0 if config.weight_mode == 'constant' else depth**-2
+    start, tau = config.voxel_size_m, config.truncation_m
+    if s < -start:
         w *= (tau + s) / (tau - start)
     return max(w, config.min_measurement_weight)
 
@@ -106,27 +101,24 @@ def measurements(config, image, T_map_sensor, block):
     R, t = T_map_sensor[:3, :3], T_map_sensor[:3, 3]
     points = (voxel_centres(config, block) - t) @ R
     u, v = place_in_image(sensor, points)
-    masked = {*config.dynamic_labels, *config.invalid_labels}
+    masked = set(config.dynamic_labels)
     for n, p in enumerate(points):
         d = np.linalg.norm(p)
         longer = 1.0 if image.cosine is None else 1.0 / 0.35
-        farthest = image.largest_m + config.reach_behind_m * longer
+        farthest = image.largest_m + tau * longer
         if np.isnan(u[n]) or not sensor.min_range_m <= d <= farthest:
             continue
         value, pixels = look_up(config, sensor, image.range_m, p, u[n], v[n])
         if value <= 0 or (value > sensor.max_range_m and d > sensor.max_range_m):
             continue
         s = (value - d) * slant(image, u[n], v[n])
-        if s < -tau - config.extra_distance_m:
+        if s < -tau:
             continue
-        s = min(max(s, -tau), tau)
+        s = min(s, tau)
         if s < tau and share_of(pixels, image, masked) > 0.5:
             continue
-        label = voted(pixels, image.label)
-        if s <= -tau and config.extra_labels and label not in config.extra_labels:
-            continue
         depth = p[2] if hasattr(sensor, 'fx') else d
-        yield n, s, weight(config, sensor, depth, s), pixels
+        yield n, s, weight(config, depth, s), pixels
 
 
 def slant(image, u, v):
@@ -144,16 +136,6 @@ def share_of(pixels, image, masked):
         by_mask = image.mask is not None and image.mask[j, i] != 0
         total += share * (by_label or by_mask)
     return total
-
-
-def voted(pixels, labels):
-    """Return the label with the largest share, the smaller on a tie."""
-    if labels is None:
-        return -1
-    shares = {}
-    for j, i, share in pixels:
-        shares[labels[j, i]] = shares.get(labels[j, i], 0.0) + share
-    return max(sorted(shares), key=shares.get)
 
 
 def integrate(config, blocks, image, T_map_sensor, index):

@@ -252,8 +252,6 @@ class DistanceField:
         FileFormatError
             If the file cannot be read, is damaged, or has another voxel size, block, truncation
             or channels than the configuration.
-        MapLimitError
-            If it does not fit into max_blocks.
 
         """
         check_kind('config', config, TsdfConfig, hint='TsdfConfig(voxel_size_m=0.1)')

@@ -107,8 +107,7 @@ class TsdfLayer(Layer):
         self._esdf = EuclideanField(self.blocks, max_m=esdf.max_m, radius_m=esdf.radius_m)
         self._position: npt.NDArray[np.float64] = np.zeros(3)
         self._waiting: dict[tuple[str, int], Scan] = {}
-        self._num_scans = self._num_refused = self._num_labels_lost = 0
-        self._num_by_points = 0
+        self._num_scans = self._num_by_points = 0
 
     def follow(self, inserted: InsertedScan) -> list[Integrated]:
         """
@@ -165,8 +164,6 @@ class TsdfLayer(Layer):
         self._position = T_map_sensor[:3, 3].copy()
         self.blocks.evict(self._position, scan.stamp_ns)
         self._num_scans += 1
-        self._num_refused += done.num_refused
-        self._num_labels_lost += done.num_labels_lost
         return done
 
     @property
@@ -232,8 +229,6 @@ class TsdfLayer(Layer):
             'scans': self._num_scans,
             'waiting': len(self._waiting),
             'blocks': self.blocks.num_blocks,
-            'blocks_refused': self._num_refused,
-            'labels_lost': self._num_labels_lost,
             'bytes': self.blocks.nbytes,
             'voxel_size_m': self.config.tsdf.voxel_size_m,
             'scans_by_points': self._num_by_points,

@@ -60,13 +60,12 @@ def find_blocks(keys, head, table, state, rows):
 
 
 @njit(cache=True, nogil=True)
-def place_blocks(keys, head, table, state, limit, start, rows):
+def place_blocks(keys, head, table, state, start, rows):
     """
     Look up the row of every block from start on; place missing blocks.
 
-    keys   (K,) int64
-    limit  largest number of blocks
-    rows   (K,) int64, out: row, -1 for blocks beyond the limit
+    keys  (K,) int64
+    rows  (K,) int64, out
 
     Returns the number of blocks done; fewer than K if rows, segments or the directory are full:
     make room and continue from there.
@@ -76,7 +75,7 @@ def place_blocks(keys, head, table, state, limit, start, rows):
     for place in range(start, len(keys)):
         key = keys[place]
         row = find_row(key, head, table, depth)
-        if row < 0 and state[VOXELS] < limit:
+        if row < 0:
             hashed = hash_key(key)
             if not makes_room(hashed, table, state, entries):
                 return place

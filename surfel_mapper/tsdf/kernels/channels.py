@@ -1,27 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Masks, colours, labels and stamps of the voxels of a block.
+Masks, colours and labels of the voxels of a block.
 
 A voxel samples these images at the pixels of its range: four pixels with the same interpolation
 weights, or the nearest one. Colours are interpolated; masks and labels are voted on. A voxel is
-inside the band if its signed distance is below the truncation tau; -tau also stands for the extra
-band behind it, and tau for free space.
+inside the band if its signed distance is below the truncation tau, which stands for free space.
 
-Votes for labels of a voxel, ``votes`` (V, N) float32:
-
-    MAJORITY  V = labels      number of observations of each label
-    FIRST_K   V = 2 k         label + 1 (0: empty) and weight of each slot, the first k labels seen
-    SINGLE    V = 2           label + 1 and its lead: Boyer and Moore's majority vote, weighted
-    BINARY    V = 2           number of observations of label 0, and of other labels
-
-A label is stored as float32, exact up to 2^24. Label -1 means unknown.
-
-Totals obey the cap of the map, ``max_weight``: votes beyond it scale the other votes of the voxel
-down, so at a cap of 10 a new label observed 50 times replaces one observed 500 times.
-
-MAJORITY equals adding log-likelihoods if every label but the observed one gets the same
-likelihood: differences are those of the counts times log(c / (1 - c)), c the confidence.
+The label of a voxel is kept as two numbers, ``votes`` (2, N) float32: label + 1, 0 for none, and
+its lead over all other labels by Boyer and Moore's majority vote, weighted. A lead obeys the cap
+of the map, ``max_weight``. A label is stored as float32, exact up to 2^24. Label -1 means unknown.
 """
 
 from numba import njit
@@ -85,14 +73,14 @@ def fuse_color(image, bounds, u, v, mixed, signed, weight, color):
     Fuse the colours of the image into the mean colours of voxels in the band, in place.
 
     image   (rows, columns, 3 or 4) uint8; pixels whose fourth channel is 0 have no colour
-    bounds  (tau, skip_extra, max_weight, rate): the band; largest weight of a colour, and least
-            share of a measurement
+    bounds  (tau, max_weight, rate): the band; largest weight of a colour, and least share of a
+            measurement
     color   (4, N) float32: red, green, blue, and their weight
     """
-    tau, skip_extra, max_weight, rate = bounds
+    tau, max_weight, rate = bounds
     for n in range(len(signed)):
         w, s = weight[n], signed[n]
-        if w == _ZERO or s >= tau or (skip_extra and s <= -tau):
+        if w == _ZERO or s >= tau:
             continue
         i, j, du, dv = pixel(u[n], v[n], mixed[n])
         if image.shape[2] > 3 and not all_known(image[j : j + 2, i : i + 2, 3], mixed[n]):
@@ -109,30 +97,6 @@ def fuse_color(image, bounds, u, v, mixed, signed, weight, color):
                 value = upper + dv * (left + du * (right - left) - upper)
             color[channel, n] += (value - color[channel, n]) * gain
         color[3, n] = min(together, max_weight)
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def fuse_stamps(stamp, weight, total, stamps):
-    """
-    Record the first and last stamp of each observed voxel.
-
-    stamp   int64 ns
-    weight  (N,) float32, of this measurement
-    total   (N,) float32, of earlier measurements
-    stamps  (2, N) int64 ns: first, last
-    """
-    for n in range(len(weight)):
-        if weight[n] > _ZERO:
-            if total[n] == _ZERO:
-                stamps[0, n] = stamp
-            stamps[1, n] = stamp
-
-
-NONE = 0
-MAJORITY = 1
-FIRST_K = 2
-SINGLE = 3
-BINARY = 4
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -167,92 +131,24 @@ def vote_labels(image, tau, u, v, mixed, signed, label):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def keep_labels(wanted, tau, label, signed):
+def fuse_labels(tau, max_weight, rate, label, signed, weight, votes):
     """
-    Skip the voxels of the extra band without a wanted label; return their number.
+    Fuse the labels of a measurement into the votes of a block.
 
-    wanted  (L,) int32
-    """
-    left_out = 0
-    for n in range(len(signed)):
-        if signed[n] == SKIP or signed[n] > -tau:
-            continue
-        found = False
-        for one in wanted:
-            found = found or one == label[n]
-        if not found:
-            signed[n] = SKIP
-            left_out += 1
-    return left_out
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def fuse_labels(semantics, tau, skip_extra, caps, label, signed, weight, votes):
-    """
-    Fuse the labels of a measurement into the votes of a block; return how many found no slot.
-
-    caps                   (max_weight, rate): largest vote, and least share of a measurement
+    max_weight, rate       largest lead, and least share of a measurement
     label, signed, weight  (N,)
-    votes                  (V, N) float32, see the module docstring
+    votes                  (2, N) float32, see the module docstring
     """
-    overflow = 0
     for n in range(len(label)):
-        if label[n] < 0 or weight[n] == _ZERO or signed[n] >= tau:
-            continue
-        if skip_extra and signed[n] <= -tau:
-            continue
-        overflow += vote(semantics, label[n], weight[n], caps, votes, n)
-    return overflow
+        if label[n] >= 0 and weight[n] > _ZERO and signed[n] < tau:
+            vote(label[n], weight[n], max_weight, rate, votes, n)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def vote(semantics, label, weight, caps, votes, n):
-    """
-    Add a label to the votes of a voxel; return 1 if it found no slot.
-
-    label, weight  of the measurement
-    caps           (max_weight, rate), see fuse_labels
-    votes          (V, N) float32; n is the number of the voxel
-    """
-    max_weight, rate = caps
-    if semantics in (MAJORITY, BINARY):
-        place = label if semantics == MAJORITY else (1 if label > 0 else 0)
-        if place < votes.shape[0]:
-            most = max(min(max_weight, _ONE / rate if rate > _ZERO else max_weight), _ONE)
-            add_vote(_ONE, most, 0, 1, place, votes, n)
-        return 0
+def vote(label, weight, max_weight, rate, votes, n):
+    """Add weight to the stored label, or reduce its lead; a larger weight replaces it."""
     most = min(max_weight, weight / rate if rate > _ZERO else max_weight)
     name = np.float32(label + 1)
-    if semantics == SINGLE:
-        vote_single(name, weight, most, votes, n)
-        return 0
-    for slot in range(votes.shape[0] // 2):
-        if votes[2 * slot, n] == name or votes[2 * slot, n] == _ZERO:
-            votes[2 * slot, n] = name
-            add_vote(weight, most, 1, 2, slot, votes, n)
-            return 0
-    return 1
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def add_vote(weight, most, first, step, place, votes, n):
-    """
-    Add weight to one vote of a voxel; beyond the largest one, scale the others down instead.
-
-    first, step  rows first, first + step, ... of votes are the votes; place counts among them
-    """
-    together = votes[first + step * place, n] + weight
-    if together > most:
-        share = most / together
-        for row in range(first, votes.shape[0], step):
-            votes[row, n] *= share
-        together = most
-    votes[first + step * place, n] = together
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def vote_single(name, weight, most, votes, n):
-    """Add weight to the stored label, or reduce its lead; a larger weight replaces it."""
     if votes[0, n] == name:
         votes[1, n] = min(votes[1, n] + weight, most)
     elif weight >= votes[1, n]:

@@ -29,9 +29,6 @@ from surfel_mapper.tsdf.kernels.channels import (
     apply_mask,
     fuse_color,
     fuse_labels,
-    fuse_stamps,
-    keep_labels,
-    NONE,
     SKIP,
     vote_labels,
 )
@@ -39,7 +36,6 @@ from surfel_mapper.tsdf.kernels.lookup import (
     CONTRADICTS,
     drop_far,
     DROPOFF,
-    EXTRA,
     gather,
     has_single,
     LEAST,
@@ -52,7 +48,6 @@ from surfel_mapper.tsdf.kernels.lookup import (
     row_gaps,
     slant,
     TAU,
-    WEIGHT,
 )
 
 _ZERO = np.float32(0.0)
@@ -79,10 +74,10 @@ JUMP = np.int32(2**31 - 1)
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def integrate_blocks(
-    blocks, offsets, field, sensor, images, sums, settings, modes, channels, found
+    blocks, offsets, field, sensor, images, sums, settings, power, channels, found
 ):
     """
-    Fuse a range image into blocks; return the number of labels without a slot.
+    Fuse a range image into blocks.
 
     blocks    (rows, corners, rates, slots) of K blocks: (K,) int64, their rows; (K, 3) float32 m,
               centres of their first voxels in the sensor's frame; (K,) float32, least shares of
@@ -95,10 +90,8 @@ def integrate_blocks(
               no rows
     sums      (S, N, 3) float32, distances of thin objects, see kernels/point_fusion.py
     settings  (NUM_SETTINGS,) float32
-    modes     (interpolation, power): weights fall by depth^-(2 power)
-    channels  (color, votes, stamps, semantics, extra_labels, skip_extra, stamp): rows of all
-              blocks, no rows for channels not kept; kind of semantics; labels of the extra band,
-              empty for all; whether the extra band has distances only; the stamp, ns
+    power     weights fall by depth^-(2 power): 0 or 1
+    channels  (color, votes): rows of all blocks, no rows for channels not kept
     found     (K, NUM_FOUND) int64, out: see OBSERVED, MOVED, SOLID, INSIDE
     """
     num_voxels = offsets.shape[1]
@@ -112,9 +105,9 @@ def integrate_blocks(
     kind, parameters, elevations, gaps = sensor
     pairs, cosine, color_image, label_image, mask = images
     stride = pairs.shape[1]
-    color, votes, stamps, semantics, extra_labels, skip_extra, stamp = channels
+    color, votes = channels
     rows, corners, rates, slots = blocks
-    tau, most, overflow = settings[TAU], settings[MAX_WEIGHT], 0
+    tau, most = settings[TAU], settings[MAX_WEIGHT]
     for b in range(len(rows)):
         row, rate = rows[b], rates[b]
         if b + 1 < len(rows):
@@ -125,7 +118,7 @@ def integrate_blocks(
         project(x, y, z, kind, parameters, elevations, distance, u, v)
         locate(distance, u, v, stride, settings, place)
         gather(pairs.ravel(), stride, place, upper, lower)
-        mix(upper.view(np.float32), lower.view(np.float32), u, v, modes[0], settings, value)
+        mix(upper.view(np.float32), lower.view(np.float32), u, v, settings, value)
         if settings[MAX_OFFSET] > _ZERO and has_single(value):
             row_gaps(kind, gaps, v, weight)
             drop_far(x, y, u, v, distance, weight, settings, value)
@@ -138,8 +131,6 @@ def integrate_blocks(
         if count > 0 and label_image.shape[0] > 0:
             flag_mixed(value, mixed)
             vote_labels(label_image, tau, u, v, mixed, signed, label)
-            if len(extra_labels) > 0:
-                count -= keep_labels(extra_labels, tau, label, signed)
         merged = signed
         if slots[b] >= 0:
             merged = summed
@@ -150,24 +141,18 @@ def integrate_blocks(
         if count == 0:
             found[b, MOVED] = 0
             continue
-        weigh(distance if kind > 0 else z, merged, settings, modes[1], weight)
-        if label_image.shape[0] > 0 and semantics != NONE:
-            caps = most, rate
-            overflow += fuse_labels(
-                semantics, tau, skip_extra, caps, label, signed, weight, votes[row]
-            )
+        weigh(distance if kind > 0 else z, merged, settings, power, weight)
+        if label_image.shape[0] > 0 and votes.shape[0] > 0:
+            fuse_labels(tau, most, rate, label, signed, weight, votes[row])
         if color.shape[0] > 0 and color_image.shape[0] > 0:
             flag_mixed(value, mixed)
-            bounds = tau, skip_extra, most, rate
+            bounds = tau, most, rate
             fuse_color(color_image, bounds, u, v, mixed, signed, weight, color[row])
-        if stamps.shape[0] > 0:
-            fuse_stamps(stamp, weight, field[row, 1], stamps[row])
         mean, total = field[row, 0], field[row, 1]
         fuse(merged, weight, settings[CONTRADICTS], rate, mean, total, fused)
         found[b, MOVED] = largest_step(mean, fused, total, weight, settings[LEAST])
         replace(fused, weight, most, mean, total)
         found[b, SOLID], found[b, INSIDE] = count_solid(mean, total, tau)
-    return overflow
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -187,12 +172,12 @@ def shift(values, by, shifted):
 @njit(cache=True, nogil=True, error_model='numpy')
 def subtract(value, distance, factor, settings, signed):
     """Find the signed distance of every voxel, (N,) float32 m; SKIP if it is not observed."""
-    tau, extra, reach = settings[TAU], settings[EXTRA], settings[MAX_RANGE]
+    tau, reach = settings[TAU], settings[MAX_RANGE]
     for n in range(len(value)):
         range_m, d = abs(value[n]), distance[n]
         s = (range_m - d) * factor[n]
         # A clearing pixel says nothing beyond the range of the sensor.
-        seen = (range_m > _ZERO) & (s >= -tau - extra) & ((range_m <= reach) | (d <= reach))
+        seen = (range_m > _ZERO) & (s >= -tau) & ((range_m <= reach) | (d <= reach))
         signed[n] = min(max(s, -tau), tau) if seen else SKIP
 
 
@@ -235,23 +220,17 @@ def weigh(depth, signed, settings, power, weight):
 
     depth, signed, weight  (N,) float32; weight is written
     """
-    constant, least = settings[WEIGHT], settings[MIN_WEIGHT]
-    tau, dropoff = settings[TAU], settings[DROPOFF]
+    least, tau, dropoff = settings[MIN_WEIGHT], settings[TAU], settings[DROPOFF]
     if power == 0:
         for n in range(len(weight)):
-            weight[n] = constant
-    elif power == 1:
-        for n in range(len(weight)):
-            weight[n] = constant / (depth[n] * depth[n])
+            weight[n] = _ONE
     else:
         for n in range(len(weight)):
-            square = depth[n] * depth[n]
-            weight[n] = constant / (square * square)
-    if dropoff < tau:
-        per_metre = _ONE / (tau - dropoff)
-        for n in range(len(weight)):
-            s = signed[n]
-            weight[n] = weight[n] * ((tau + s) * per_metre) if s < -dropoff else weight[n]
+            weight[n] = _ONE / (depth[n] * depth[n])
+    per_metre = _ONE / (tau - dropoff)
+    for n in range(len(weight)):
+        s = signed[n]
+        weight[n] = weight[n] * ((tau + s) * per_metre) if s < -dropoff else weight[n]
     for n in range(len(weight)):
         w = weight[n] if weight[n] > least else least
         weight[n] = w if signed[n] > SKIP else _ZERO

@@ -15,30 +15,24 @@ from surfel_mapper.kernels.projection import LIDAR_TABLE, MOST_CORRECTED
 
 # Settings of an integration, float32.
 TAU = 0
-EXTRA = 1
-MIN_RANGE = 2
-MAX_RANGE = 3
-LIMIT = 4
+MIN_RANGE = 1
+MAX_RANGE = 2
+LIMIT = 3
 """Largest distance of an observed voxel from the sensor, m."""
-MAX_DIFFERENCE = 5
-MAX_DIFFERENCE_RATIO = 6
-MAX_OFFSET = 7
+MAX_DIFFERENCE = 4
+"""Pixels that differ by more are not interpolated, m."""
+MAX_OFFSET = 5
 """Largest distance from the ray of the nearest pixel, m; 0 means no limit."""
-COLUMN_RAD = 8
-WEIGHT = 9
-DROPOFF = 10
-"""Distance behind the surface at which weights begin to fall, m; TAU or more: never."""
-MIN_WEIGHT = 11
-MAX_WEIGHT = 12
-LEAST = 13
+COLUMN_RAD = 6
+DROPOFF = 7
+"""Distance behind the surface at which weights begin to fall, m; less than TAU."""
+MIN_WEIGHT = 8
+MAX_WEIGHT = 9
+LEAST = 10
 """Least weight of a voxel in the mesh; positive."""
-CONTRADICTS = 14
+CONTRADICTS = 11
 """Difference from which a measurement contradicts a voxel, m."""
-NUM_SETTINGS = 15
-
-NEAREST = 0
-BILINEAR = 1
-ADAPTIVE = 2
+NUM_SETTINGS = 12
 
 BORDER = ((2, 2), (1, 2))
 """Rows above and below the image, and columns left and right of it, that hold 0."""
@@ -47,7 +41,6 @@ _ZERO = np.float32(0.0)
 _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
-_LARGE = np.float32(1e30)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -81,7 +74,7 @@ def gather(pairs, stride, place, upper, lower):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def mix(above, under, u, v, method, settings, value):
+def mix(above, under, u, v, settings, value):
     """
     Find the range at every voxel: interpolated, or that of the nearest pixel.
 
@@ -89,10 +82,7 @@ def mix(above, under, u, v, method, settings, value):
     value         (N,) float32, out: range if interpolated; -range if of the nearest pixel; 0 if
                   unknown
     """
-    reach, ratio = settings[MAX_RANGE], settings[MAX_DIFFERENCE_RATIO]
-    allowed = _LARGE if method == BILINEAR else settings[MAX_DIFFERENCE]
-    allowed = -_ONE if method == NEAREST else allowed
-    ratio = -_ONE if method == NEAREST else ratio
+    reach, allowed = settings[MAX_RANGE], settings[MAX_DIFFERENCE]
     for n in range(len(value)):
         right, below = u[n] + _ONE, v[n] + _ONE
         du, dv = right - np.float32(np.int32(right)), below - np.float32(np.int32(below))
@@ -104,9 +94,8 @@ def mix(above, under, u, v, method, settings, value):
         upper_near = q00 if du < _HALF else q10
         lower_near = q01 if du < _HALF else q11
         nearest = upper_near if dv < _HALF else lower_near
-        alike = (high - low <= allowed) | (high - low <= ratio * low)
         # Clearing pixels are not interpolated with measurements.
-        alike = alike & (low > _ZERO) & ((high <= reach) | (low > reach))
+        alike = (high - low <= allowed) & (low > _ZERO) & ((high <= reach) | (low > reach))
         value[n] = upper + dv * (lower - upper) if alike else -nearest
 
 

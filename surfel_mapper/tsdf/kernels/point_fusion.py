@@ -28,14 +28,12 @@ from surfel_mapper.tsdf.kernels.integration import INSIDE, JUMP, MOVED, OBSERVED
 from surfel_mapper.tsdf.kernels.lookup import (
     CONTRADICTS,
     DROPOFF,
-    EXTRA,
     LEAST,
     MAX_RANGE,
     MAX_WEIGHT,
     MIN_RANGE,
     MIN_WEIGHT,
     TAU,
-    WEIGHT,
 )
 from surfel_mapper.tsdf.kernels.queries import find_voxel
 
@@ -116,11 +114,11 @@ def next_voxel(places, steps, reached, spacing):
 @njit(cache=True, nogil=True, error_model='numpy')
 def weight_at(depth_m, signed_m, settings, power):
     """Return the weight of a measurement at a depth and signed distance, m."""
-    weight = np.float64(settings[WEIGHT])
-    for _ in range(power):
+    weight = 1.0
+    if power > 0:
         weight /= depth_m * depth_m
     tau, start = settings[TAU], settings[DROPOFF]
-    if start < tau and signed_m < -start:
+    if signed_m < -start:
         weight *= max(tau + signed_m, 0.0) / (tau - start)
     return max(weight, settings[MIN_WEIGHT])
 
@@ -144,11 +142,10 @@ def sum_surfaces(points, origin, core_only, voxel_m, bits, settings, power, look
     """
     head, table, state = lookup
     recent, depth = np.array([1 << 40, 0, 0, -1]), state[DEPTH]
-    tau, behind = settings[TAU] / voxel_m, (settings[TAU] + settings[EXTRA]) / voxel_m
+    tau = settings[TAU] / voxel_m
     near, far = settings[MIN_RANGE] / voxel_m, settings[MAX_RANGE] / voxel_m
     start_m, least = settings[DROPOFF], settings[MIN_WEIGHT]
-    per_metre = 1.0 / (settings[TAU] - start_m) if start_m < settings[TAU] else 0.0
-    start_m = start_m if start_m < settings[TAU] else np.inf
+    per_metre = 1.0 / (settings[TAU] - start_m)
     mask = (1 << bits) - 1
     places, steps = np.empty(3, np.int64), np.empty((2, 3), np.int64)
     along, reached, spacing = np.empty(3), np.empty(3), np.empty(3)
@@ -160,7 +157,7 @@ def sum_surfaces(points, origin, core_only, voxel_m, bits, settings, power, look
             continue
         used += 1
         x, y, z = x / measured, y / measured, z / measured
-        start, end = max(measured - tau, near), measured + behind
+        start, end = max(measured - tau, near), measured + tau
         if core_only:
             start = end = measured
         along[0], along[1], along[2] = x, y, z
@@ -170,7 +167,7 @@ def sum_surfaces(points, origin, core_only, voxel_m, bits, settings, power, look
             signed = measured - (x * u + y * v + z * w)
             if abs(signed) > CORE:  # nearer voxels follow below
                 row, voxel = find_voxel(i, j, k, bits, recent, head, table, depth)
-                if row >= 0 and slots[row] >= 0 and signed >= -behind:
+                if row >= 0 and slots[row] >= 0 and signed >= -tau:
                     slot, signed_m = slots[row], min(max(signed, -tau), tau) * voxel_m
                     weight = weight_at((measured - signed) * voxel_m, signed_m, settings, power)
                     sums[slot, voxel, 0] += weight * signed_m
@@ -262,17 +259,15 @@ def sum_free(points, origin, voxel_m, bits, settings, power, lookup, slots, sums
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def fuse_sums(rows, sums, rates, stamp, settings, field, stamps, found):
+def fuse_sums(rows, sums, rates, settings, field, found):
     """
     Fuse the summed measurements of a scan into blocks: each voxel once, with its mean weight.
 
     rows      (K,) int64
     sums      (K, N, 3) float32
     rates     (K,) float32, least share of contradicting measurements
-    stamp     int64 ns
     settings  (NUM_SETTINGS,) float32, see kernels/lookup.py
     field     (R, 2, N) float32
-    stamps    (R, 2, N) int64, or no rows
     found     (K, NUM_FOUND) int64, out: as of integrate_blocks
     """
     tau, least = settings[TAU], settings[LEAST]
@@ -284,10 +279,6 @@ def fuse_sums(rows, sums, rates, stamp, settings, field, stamps, found):
             if sums[slot, voxel, 2] != 0.0:
                 value = sums[slot, voxel, 0] / sums[slot, voxel, 1]
                 weight = sums[slot, voxel, 1] / abs(sums[slot, voxel, 2])
-                if stamps.shape[0] > 0:
-                    if total == 0.0:
-                        stamps[row, 0, voxel] = stamp
-                    stamps[row, 1, voxel] = stamp
                 gain = weight / (total + weight)
                 if abs(value - mean) >= settings[CONTRADICTS]:
                     gain = max(gain, rates[slot])
@@ -314,15 +305,12 @@ def fuse_point_channels(points, weights, rates, max_weight, bits, lookup, slots,
     max_weight  float32, largest weight of a colour, or of a vote
     images      (colors, labels): (N, 3 or 4) uint8, those whose fourth value is 0 have no colour;
                 (N,) int32, -1 for unknown; no rows if not given
-    channels    (color, votes, semantics), see kernels/channels.py; no rows if not kept
-
-    Returns how many labels found no slot.
+    channels    (color, votes), see kernels/channels.py; no rows if not kept
     """
     head, table, state = lookup
     colors, labels = images
-    color, votes, semantics = channels
+    color, votes = channels
     recent, depth = np.array([1 << 40, 0, 0, -1]), state[DEPTH]
-    overflow = 0
     for p in range(len(points)):
         w = weights[p]
         has_color = color.shape[0] > 0 and colors.shape[0] > 0
@@ -347,6 +335,4 @@ def fuse_point_channels(points, weights, rates, max_weight, bits, lookup, slots,
                     color[row, channel, voxel] += change * gain
                 color[row, 3, voxel] = min(together, max_weight)
             if has_label:
-                caps = max_weight, rate
-                overflow += vote(semantics, labels[p], w, caps, votes[row], voxel)
-    return overflow
+                vote(labels[p], w, max_weight, rate, votes[row], voxel)

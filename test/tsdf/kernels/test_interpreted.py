@@ -19,12 +19,10 @@ rng = np.random.default_rng(1)
 camera = CameraModel(columns=24, rows=18, fx=20.0, fy=20.0, cx=12.0, cy=9.0, max_range_m=4.0)
 lidar = LidarModel(rows=5, columns=40, beam_elevations_deg=(20.0, 8.0, 0.0, -6.0, -21.0))
 found = []
-for semantics in ('majority', 'first_k', 'single', 'binary'):
+for distance in ('along_ray', 'to_plane'):
     config = TsdfConfig(
-        voxel_size_m=0.3, truncation_m=0.7, voxels_per_side=4, color=True, tracking=True,
-        semantics=semantics, num_labels=4, dynamic_labels=[1.0], threads=1, max_radius_m=4.0,
-        distance='to_plane' if semantics == 'single' else 'along_ray',
-        extra_distance_m=0.3, extra_labels=[2.0],
+        voxel_size_m=0.3, truncation_m=0.7, voxels_per_side=4, color=True,
+        semantics='single', dynamic_labels=[1.0], threads=1, max_radius_m=4.0, distance=distance,
     )
     one = Integrator(BlockMap(config))
     depth = 2.0 + 0.1 * rng.standard_normal((18, 24))
@@ -46,7 +44,7 @@ for semantics in ('majority', 'first_k', 'single', 'binary'):
     places = rng.normal(size=(50, 3)) + [0.0, -2.0, 1.0]
     sampled = sample(blocks, places)
     content = blocks.copied(blocks.rows())
-    found += [content.index, content.field, content.color, content.votes, content.stamps]
+    found += [content.index, content.field, content.color, content.votes]
     found += [sampled.distance, sampled.gradient, states(blocks, places)]
 np.savez(sys.argv[1], *found)
 """
