@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -82,7 +81,7 @@ class EuclideanField:
         self.max_m, self.radius_m = max_m, radius_m
         self._blocks = blocks
         self._low: Int64 = np.zeros(3, np.int64)
-        self._squared = np.empty((0, 0, 0), np.uint16)
+        self._squared: npt.NDArray[np.uint16] = np.empty((0, 0, 0), np.uint16)
         self._known: Flags = np.empty((0, 0, 0), bool)
         self._state: tuple[float, ...] = ()
 
@@ -124,7 +123,7 @@ class EuclideanField:
     def _transform(self, occupied: Flags) -> npt.NDArray[np.uint16]:
         """Return the squared distances of voxels to occupied ones, (nz, ny, nx) both."""
         reach = int(self.max_m / self._blocks.config.voxel_size_m * (1.0 + 1e-9))
-        squared: Any = np.where(occupied, np.uint16(0), FAR)
+        squared = np.where(occupied, np.uint16(0), FAR)
         for axes in ((0, 1, 2), (0, 2, 1), (1, 0, 2)):  # along y, x and z
             source = np.ascontiguousarray(squared.transpose(axes))
             squared = source.copy()
