@@ -19,13 +19,6 @@ import numpy.typing as npt
 
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.models.bspline import fit_cells, HeightField
-from surfel_mapper.models.bspline_incremental import (
-    DEGREE,
-    fit_field,
-    FittedField,
-    is_large,
-    SMOOTHING,
-)
 from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.kernels.surfel_classes import FLAT
 from surfel_mapper.models.kernels.surfel_groups import mean_normals, merge_voxels, sample_voxels
@@ -48,8 +41,8 @@ STILL = 0.1
 STILL_RAD = math.radians(1.0)
 """A frame stays while its normal turns by less."""
 
-STILL_HEIGHT = 0.01
-"""Heights of a field are resolved to this share of the thickness of a flat voxel."""
+DEGREE, SMOOTHING = 3, 1e-2
+"""Degree of the splines, and weight of their second differences."""
 
 MOST_TURN_RAD = math.radians(45.0)
 """A frame that turns farther is rebuilt; below, its x is kept."""
@@ -72,8 +65,6 @@ class Tracked:
         Mean normal; least and greatest coordinates of its surfels, m.
     origin : (3,) float64, m
         Anchor of the lattice of its grid.
-    fitted : FittedField, optional
-        Height field of a surface, relative to the anchor.
 
     """
 
@@ -83,7 +74,6 @@ class Tracked:
     normal: Array
     box: Array
     origin: Array
-    fitted: FittedField | None
 
     @property
     def is_surface(self) -> bool:
@@ -136,7 +126,6 @@ class PatchFitter:
         self._graph = graph
         self._size_m = graph.map.voxel_size_m
         self._surface_pitch_m = max(self._size_m, 3.0 * graph.thickness_m)
-        self._still_m = STILL_HEIGHT * graph.thickness_m
 
     def describe(self, rows: list[Rows]) -> Described:
         """Return moments, frames and kind of groups of voxels."""
@@ -178,17 +167,16 @@ class PatchFitter:
 
         """
         samples, frames, curved, means = groups.samples, groups.frames, groups.curved, groups.means
-        origins, stays = self._steadied(before, groups)
+        origins = self._steadied(before, groups)
         pitches = np.where(curved, self._surface_pitch_m, PLANE_PITCH_VOXELS * self._size_m)
         placed = origins, frames, pitches
-        cells, _ = cells_of(samples, placed, 0.5 * self._size_m, snapped=True)
-        known = [t.fitted if t and stay else None for t, stay in zip(before, stays, strict=True)]
+        cells, _ = cells_of(samples, placed, 0.5 * self._size_m)
         ends = np.array([len(part) for part in beyond])
-        fields = self._fields(cells, np.flatnonzero(curved & (ends == 0)), known)
+        fields = fields_of(cells, np.flatnonzero(curved & (ends == 0)))
         seams = np.flatnonzero(curved & (ends > 0))
         if len(seams):
             wider = self._wider_cells(seams, samples, beyond, (origins, frames, pitches))
-            found = self._fields(wider, np.arange(len(seams)), [known[k] for k in seams])
+            found = fields_of(wider, np.arange(len(seams)))
             fields.update((int(seams[k]), field) for k, field in found.items())
         shifts = np.einsum('kij,kj->ki', frames, means - origins)
         cells.origins[:] -= shifts[:, :2]  # published grids are relative to the mean
@@ -199,10 +187,10 @@ class PatchFitter:
             common = ids[k], int(groups.total[k]), means[k], groups.covariances[k], frames[k]
             patch = Plane(*common, float(rms_m[k]), grid)
             if field is not None:
-                error_m = self._rms_m(field.field, frames[k], origins[k], rows)
-                patch = Surface(*common, error_m, grid, moved(field.field, shifts[k]))
+                error_m = self._rms_m(field, frames[k], origins[k], rows)
+                patch = Surface(*common, error_m, grid, moved(field, shifts[k]))
             place = samples.normals[k], groups.boxes[k], origins[k]
-            patches.append(Tracked(patch, rows, beyond[k], *place, field))
+            patches.append(Tracked(patch, rows, beyond[k], *place))
         return patches
 
     def _wider_cells(
@@ -225,21 +213,7 @@ class PatchFitter:
         starts = np.concatenate([[0], ends])
         groups = PatchPoints(points, starts, samples.normals[chosen], samples.thickness[chosen])
         origins, axes, pitches = (part[chosen] for part in frames)
-        return cells_of(groups, (origins, axes, pitches), 0.5 * self._size_m, snapped=True)[0]
-
-    def _fields(
-        self, cells: Cells, chosen: Indices, before: list[FittedField | None]
-    ) -> dict[int, FittedField]:
-        """Return the fields of chosen patches: small ones anew, large ones near changes."""
-        found = {}
-        for k in chosen.tolist():
-            if is_large(cells.sizes[k]):
-                sums = cells.sums[cells.of(k)].reshape(*cells.sizes[k], 4)
-                pitch_m, origin = float(cells.pitches[k]), cells.origins[k].copy()
-                found[k] = fit_field(pitch_m, origin, sums, before[k], self._still_m)
-            else:
-                found[k] = FittedField(*fit_cells(cells, k, DEGREE, SMOOTHING))
-        return found
+        return cells_of(groups, (origins, axes, pitches), 0.5 * self._size_m)[0]
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
         """Return number, mean and covariance of all points of groups of voxels."""
@@ -261,23 +235,21 @@ class PatchFitter:
 
     def _frames(self, groups: PatchPoints) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Return the frames (K, 3, 3) of groups as surfaces, and whether they are curved."""
-        rules = groups.thickness, self._surface_pitch_m, True, True
+        rules = groups.thickness, self._surface_pitch_m, True
         _, _, frames, curved = described(groups, np.zeros(3), rules)
         return frames, curved
 
-    def _steadied(
-        self, before: list[Tracked | None], groups: Described
-    ) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Return anchors, and whether frames stay; frames are changed in place."""
+    def _steadied(self, before: list[Tracked | None], groups: Described) -> Array:
+        """Return anchors; frames that turned little stay, and are changed in place."""
         frames, means, curved = groups.frames, groups.means, groups.curved
-        origins, stays = means.copy(), np.zeros(len(means), np.bool_)
+        origins = means.copy()
         known = {
             k: tracked
             for k, tracked in enumerate(before)
             if tracked is not None and tracked.is_surface == curved[k]
         }
         if not known:
-            return origins, stays
+            return origins
         rows = np.array(list(known))
         was = np.array([tracked.patch.R_patch_map for tracked in known.values()])
         anchors = np.array([tracked.origin for tracked in known.values()])
@@ -288,12 +260,11 @@ class PatchFitter:
         near = curved[rows] | (turn * radius < STILL * self._graph.thickness_m)
         still = (turn < STILL_RAD) & near
         frames[rows[still]], origins[rows[still]] = was[still], anchors[still]
-        stays[rows] = still
         turns = ~still & (turn < MOST_TURN_RAD)
         frames[rows[turns]] = turned(was[turns, 0], normals[turns])
         height = np.einsum('ij,ij->i', anchors - means[rows], normals)
         origins[rows[turns]] = (anchors - height[:, None] * normals)[turns]
-        return origins, stays
+        return origins
 
     def _rms_m(self, field: HeightField, frame: Array, origin: Array, rows: Rows) -> float:
         """Return the root mean square distance of the points of voxels from a field, m."""
@@ -302,6 +273,11 @@ class PatchFitter:
         away = local[:, 2] - field.heights(local[:, :2])
         squares = away**2 + graph.eigenvalues[rows, 0]
         return float(np.sqrt(np.average(squares, weights=graph.count[rows])))
+
+
+def fields_of(cells: Cells, chosen: Indices) -> dict[int, HeightField]:
+    """Return the fields of chosen patches."""
+    return {k: fit_cells(cells, k, DEGREE, SMOOTHING) for k in chosen.tolist()}
 
 
 def turned(x: Array, normals: Array) -> Array:

@@ -100,7 +100,7 @@ def test_a_voxel_size_of_zero_is_refused(tmp_path, capsys):
 def test_settings_are_options(tmp_path, capsys, size):
     cloud, out = tmp_path / 'a.ply', tmp_path / 'out'
     write_cloud(cloud, sheet(1.0, 1.0, 0.02).astype(np.float32))
-    arguments = [*size, '--set', 'models.kinds=gaussians']
+    arguments = [*size, '--set', 'models.min_surface_points=100000']
     assert main(['extract', str(cloud), '-o', str(out), '--json', *arguments]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert 10**2 <= figures['thinned'] <= 11**2  # a square of 1 m in voxels of 0.1 m
@@ -111,7 +111,7 @@ def test_settings_are_options(tmp_path, capsys, size):
     ('setting', 'message'),
     [
         ('models.kind=all', 'models.kind: no such setting'),
-        ('models.profile=best', "models.profile: 'best'"),
+        ('models.degree=9', 'models.degree: 9'),
     ],
 )
 def test_settings_are_checked_before_anything_is_read(tmp_path, capsys, setting, message):
