@@ -26,9 +26,7 @@ from surfel_mapper.errors import escaped
 
 if TYPE_CHECKING:
     from surfel_mapper.viz.contents import Content
-    from surfel_mapper.viz.gltf import GltfScene
     from surfel_mapper.viz.scene import Scene
-    from surfel_mapper.viz.show import Shown
 
 SUMMARY = 'Show maps, clouds, meshes, models, trajectories, bags or a running node.'
 
@@ -79,9 +77,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument('--browser', action='store_true', help='serve a page until Ctrl-C')
     where.add_argument('--rrd', type=Path, metavar='FILE', help='write a file for rerun instead')
-    where.add_argument(
-        '--glb', type=Path, metavar='FILE', help='write glTF instead, for Blender and web pages'
-    )
     add(
         '--port',
         type=page_port,
@@ -116,19 +111,15 @@ def shown(args: argparse.Namespace) -> int:
 
     if bool(args.what) == (args.live is not None):
         raise UsageError('expected WHAT to show, or --live')
-    for path in filter(None, (args.rrd, args.glb)):
-        check_free(path, args.overwrite)
+    if args.rrd is not None:
+        check_free(args.rrd, args.overwrite)
     if args.live is not None:
-        if args.glb is not None:
-            raise UsageError('--glb writes what files hold, not a live node')
         refuse_settings(args)
         show_live(args)
         return 0
-    many = len(args.what) > 1
     recordings = [path for path in args.what if path.exists() and not is_shown(path)]
-    if recordings and (many or args.glb is not None):
-        reason = 'a recording is shown alone' if many else 'for --glb map it with replay first'
-        raise UsageError(f'{recordings[0]}: {reason}')
+    if recordings and len(args.what) > 1:
+        raise UsageError(f'{recordings[0]}: a recording is shown alone')
     if recordings:
         with opened(args) as scene:
             announce(scene)
@@ -148,7 +139,7 @@ def refuse_settings(args: argparse.Namespace) -> None:
 
 
 def show_files(args: argparse.Namespace) -> None:
-    """Read files, show them or write them as glTF, and wait if there is a page to serve."""
+    """Read files, show them, and wait if there is a page to serve."""
     from surfel_mapper.viz.contents import contents
     from surfel_mapper.viz.server import import_rerun
 
@@ -161,30 +152,21 @@ def show_files(args: argparse.Namespace) -> None:
 
     with ThreadPoolExecutor(1) as reader:  # a large map takes longer to read than rerun to start
         reading = reader.submit(read)
-        if args.glb is not None:
-            from surfel_mapper.viz.gltf import GltfScene
-
-            show_all(GltfScene(args.glb), reading.result(), args)
-            return
         import_rerun()
         if args.rrd is not None or reading.done():
             reading.result()  # if it is refused, nothing is opened and no file overwritten
         with opened(args) as scene:
             announce(scene)
             with ended_by_interrupt(scene):
-                found_maps = show_all(scene, reading.result(), args)
-                if scene.window and found_maps.is_coarse:
-                    follow(scene, found_maps)
+                show_all(scene, reading.result(), args)
                 scene.wait()
 
 
-def show_all(
-    scene: Scene | GltfScene, found: Sequence[Content], args: argparse.Namespace
-) -> Shown:
+def show_all(scene: Scene, found: Sequence[Content], args: argparse.Namespace) -> None:
     """Show contents as the arguments ask for, and print a sentence about each."""
     from surfel_mapper.viz.show import show_contents
 
-    shown = show_contents(
+    about = show_contents(
         scene,
         found,
         colouring=args.color,
@@ -192,9 +174,8 @@ def show_all(
         most_discs=args.discs,
         min_points=args.min_points,
     )
-    for name, sentence in shown.about.items():
+    for name, sentence in about.items():
         show_lines(escaped(f'{name}: {sentence}'))
-    return shown
 
 
 def opened(args: argparse.Namespace) -> Scene:
@@ -227,14 +208,6 @@ def ended_by_interrupt(scene: Scene) -> Iterator[None]:
         if not scene.is_watched:
             raise
         print(file=sys.stderr)
-
-
-def follow(scene: Scene, shown: Shown) -> None:
-    """Give the place looked at in a window the full detail, until it closes."""
-    from surfel_mapper.viz.eye import followed
-
-    print('the detail follows the eye until the window closes, or Ctrl-C', file=sys.stderr)
-    followed(scene, shown)
 
 
 def show_live(args: argparse.Namespace) -> None:

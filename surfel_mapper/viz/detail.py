@@ -121,26 +121,16 @@ class DetailedMap:
         """Return the surfels of a tile at a level."""
         return coarse_surfels(self._moments, level, self._voxels(tile), self._min_points)
 
-    def all_surfels(
-        self, level: npt.NDArray[np.int64], tiles: npt.NDArray[np.int64] | None = None
-    ) -> list[Surfels]:
-        """Return the surfels of some tiles (K,), by default of all, each at its level (T,)."""
-        chosen = np.arange(len(self.tiles)) if tiles is None else tiles
+    def all_surfels(self, level: npt.NDArray[np.int64]) -> list[Surfels]:
+        """Return the surfels of all tiles, each at its level (T,)."""
         by_tile: dict[int, Surfels] = {}
 
         def sum_up(chunk: slice) -> None:
-            for tile in chosen[chunk].tolist():
+            for tile in range(chunk.start, chunk.stop):
                 by_tile[tile] = self.surfels(tile, int(level[tile]))
 
-        share(sum_up, len(chosen), usable_cores())
-        return [by_tile[tile] for tile in chosen.tolist()]
-
-    def nearest_first(
-        self, tiles: npt.NDArray[np.int64], target: npt.ArrayLike
-    ) -> npt.NDArray[np.int64]:
-        """Return tiles (K,) in the order of their distance from a target, (3,) m."""
-        distance = self._distances(np.asarray(target, np.float64))
-        return np.asarray(tiles[np.argsort(distance[tiles], kind='stable')])
+        share(sum_up, len(self.tiles), usable_cores())
+        return [by_tile[tile] for tile in range(len(self.tiles))]
 
     def _voxels(self, tile: int) -> npt.NDArray[np.int64]:
         """Return the rows of the moments in a tile."""

@@ -64,8 +64,6 @@ class Scene:
         Address of the page in a browser.
     server : Server, optional
         The server of the page, which ends with the scene.
-    window : str, optional
-        Address of the window, which can be asked for the place that it looks at.
     file : RecordingFile, optional
         The file that is written, which gets its name with the end of the scene.
 
@@ -77,12 +75,10 @@ class Scene:
         address: str = '',
         server: Server | None = None,
         *,
-        window: str = '',
         file: RecordingFile | None = None,
     ) -> None:
         self.address = address
         self._file = file
-        self.window = window
         self.colouring = Colouring()
         self.origin_m: Array = np.zeros(3)
         self._rerun = import_rerun()
@@ -108,9 +104,8 @@ class Scene:
         port = port or PORT
         stream = rerun.RecordingStream('surfel_mapper')
         rerun_bindings.spawn(port=port, extra_args=['--bind', LOOPBACK])
-        window = f'rerun+http://{LOOPBACK}:{port}/proxy'
-        stream.connect_grpc(window)
-        return cls(stream, window=window)
+        stream.connect_grpc(f'rerun+http://{LOOPBACK}:{port}/proxy')
+        return cls(stream)
 
     @classmethod
     def to_browser(cls, port: int = 0, memory: str = WHOLE) -> Scene:
@@ -160,8 +155,8 @@ class Scene:
 
     @property
     def is_watched(self) -> bool:
-        """Whether a window or page shows things as they come, so that coarse ones go first."""
-        return bool(self.address or self.window)
+        """Whether a window or page shows things as they come, and no file is written."""
+        return self._file is None
 
     def wait(self) -> None:
         """Return when the server of the page ends; at once if there is none."""

@@ -10,7 +10,7 @@ place near the first content that lies far from zero: float32, in which rerun dr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,6 @@ from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.contents import Cloud, Content, ExactMap, ShownMesh, Way
 from surfel_mapper.viz.detail import DetailedMap
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
-from surfel_mapper.viz.gltf import GltfScene
 from surfel_mapper.viz.scene import ORANGE, RED, Scene
 
 Array = npt.NDArray[np.float64]
@@ -41,20 +40,20 @@ ROUND_M = 1000.0
 
 
 def show_contents(
-    scene: Scene | GltfScene,
+    scene: Scene,
     contents: Sequence[Content],
     *,
     colouring: str = 'normal',
     target: npt.ArrayLike | None = None,
     most_discs: int = MOST_DISCS,
     min_points: int = 5,
-) -> Shown:
+) -> dict[str, str]:
     """
-    Show contents, and return a sentence about each.
+    Show contents, and return a sentence about each, by name.
 
     Parameters
     ----------
-    scene : Scene or GltfScene
+    scene : Scene
         Where they are shown.
     contents : sequence of Content
         As ``contents`` of contents.py yields them.
@@ -79,25 +78,28 @@ def show_contents(
     looked_at = np.asarray(place_of(contents) if target is None else target, np.float64) - origin_m
     maps = [content for content in contents if isinstance(content, ExactMap)]
     shares = most_discs // max(len(maps), 1)
-    tiled = [RefinedMap(content, min_points, origin_m, shares) for content in maps]
-    tiles = [refined.refine(looked_at) for refined in tiled]
+    tiles: dict[str, DrawnDiscs] = {}
+    about: dict[str, str] = {}
+    for exact in maps:
+        shift_m = exact.origin_m - origin_m
+        by_path, about[exact.name] = map_tiles(
+            exact, min_points, shift_m, looked_at - shift_m, shares
+        )
+        tiles.update(by_path)
     clouds = [
         shifted_cloud(content, origin_m) for content in contents if isinstance(content, Cloud)
     ]
-    drawn = [discs for by_path in tiles for discs in by_path.values()]
+    drawn = list(tiles.values())
     drawn += [cloud.discs for cloud in clouds if cloud.discs is not None]
     if any(map(len, drawn)):
         scene.colouring = Colouring.over(colouring, drawn)
     positions = [discs.position for discs in drawn] + [cloud.position for cloud in clouds]
     box = box_of(positions if any(map(len, positions)) else vertices(contents, origin_m))
     meshes = [f'map/{content.name}' for content in contents if isinstance(content, ShownMesh)]
-    hidden = meshes if any(map(len, drawn)) and isinstance(scene, Scene) else []
+    hidden = meshes if any(map(len, drawn)) else []
     scene.look(*box, looked_at, hidden)
-    if scene.is_watched:  # a first picture, while the rest is on its way
-        log([refined.coarsest() for refined in tiled], scene)
-        scene.flush()
-    log(tiles, scene)
-    about = {refined.name: refined.about() for refined in tiled}
+    for path, discs in tiles.items():
+        scene.discs(path, discs, static=True)
     for cloud in clouds:
         about[cloud.name] = show_cloud(scene, cloud)
     for content in contents:
@@ -110,50 +112,14 @@ def show_contents(
         elif isinstance(content, Way):
             about[content.name] = show_way(scene, content, origin_m)
     scene.flush()
-    return Shown(about, tiled)
+    return about
 
 
-class Shown:
+def map_tiles(
+    shown: ExactMap, min_points: int, shift_m: Array, target: Array, most_discs: int
+) -> tuple[dict[str, DrawnDiscs], str]:
     """
-    Contents in a scene.
-
-    Attributes
-    ----------
-    about : dict of str to str
-        A sentence about each content, by name.
-
-    """
-
-    def __init__(self, about: dict[str, str], tiled: list[RefinedMap]) -> None:
-        self.about = about
-        self._tiled = tiled
-
-    @property
-    def is_coarse(self) -> bool:
-        """Whether some tiles are shown by larger voxels, so that another place has other ones."""
-        return any(refined.level.any() for refined in self._tiled)
-
-    def look(self, scene: Scene, target: npt.ArrayLike) -> int:
-        """
-        Give another target the full detail; return the number of tiles of a changed level.
-
-        Parameters
-        ----------
-        scene : Scene
-            Where the contents are shown.
-        target : (3,) float, m
-            In the frame of the scene.
-
-        """
-        changed = [refined.refine(np.asarray(target, np.float64)) for refined in self._tiled]
-        log(changed, scene)
-        scene.flush()
-        return sum(map(len, changed))
-
-
-class RefinedMap:
-    """
-    A map in the tiles of its detail, and the levels at which they are shown.
+    Return the discs of a map in tiles, by path, finest about a target, and a sentence about it.
 
     Parameters
     ----------
@@ -161,63 +127,30 @@ class RefinedMap:
         The map.
     min_points : int
         Voxels with fewer points are not shown.
-    origin_m : (3,) float64, m
-        Origin of the scene in the fixed frame.
+    shift_m : (3,) float64, m
+        Origin of the map in the frame of the scene.
+    target : (3,) float64, m
+        Place looked at, in the frame of the map.
     most_discs : int
         Limit of its discs.
 
     """
-
-    def __init__(self, shown: ExactMap, min_points: int, origin_m: Array, most_discs: int) -> None:
-        self.name = shown.name
-        self._shown, self._most_discs = shown, most_discs
-        self._shift = shown.origin_m - origin_m
-        self._whole = DetailedMap(shown.moments, min_points)
-        self.level: npt.NDArray[np.int64] = np.full(len(self._whole), -1)
-
-    def refine(self, target: Array) -> dict[str, DrawnDiscs]:
-        """Return the discs of tiles of a changed level for a target, nearest first, by path."""
-        whole = self._whole
-        level = whole.choose(target - self._shift, self._most_discs)
-        tiles = whole.nearest_first(np.flatnonzero(level != self.level), target - self._shift)
-        self.level = level
-        return self._discs(tiles)
-
-    def coarsest(self) -> dict[str, DrawnDiscs]:
-        """Return the discs of all tiles at the last level, by path, for a first picture."""
-        return self._discs(np.arange(len(self._whole)), len(self._whole.counts) - 1)
-
-    def _discs(
-        self, tiles: npt.NDArray[np.int64], level: int | None = None
-    ) -> dict[str, DrawnDiscs]:
-        """Return the discs of tiles by path, at one level or each at its own."""
-        whole, by_path = self._whole, {}
-        levels = self.level if level is None else np.full_like(self.level, level)
-        for tile, surfels in zip(tiles, whole.all_surfels(levels, tiles), strict=True):
-            i, j = whole.tiles[tile]
-            discs = with_age(surfels, self._shown, int(levels[tile]))
-            values = {**discs.values, 'level': np.full(len(discs), levels[tile])}
-            name = f'tile_{i}_{j}'.replace('-', 'm')
-            by_path[f'map/{self.name}/{name}'] = DrawnDiscs(
-                discs.position + self._shift, discs.normal, discs.radius_m, values
-            )
-        return by_path
-
-    def about(self) -> str:
-        """Return a sentence about the map."""
-        counts, size_m = self._whole.counts, self._shown.moments.voxel_size_m
-        about = f'{counts[0].sum():,} surfels in voxels of {size_m:g} m'
-        if self.level.any():
-            drawn = counts[self.level, np.arange(len(self._whole))].sum()
-            about += f', shown as {drawn:,} on levels {self.level.min()} to {self.level.max()}'
-        return about
-
-
-def log(tiles: Sequence[Mapping[str, DrawnDiscs]], scene: Scene | GltfScene) -> None:
-    """Show tiles of maps, each in place of its earlier discs."""
-    for by_path in tiles:
-        for path, discs in by_path.items():
-            scene.discs(path, discs, static=True)
+    whole = DetailedMap(shown.moments, min_points)
+    level = whole.choose(target, most_discs)
+    tiles = {}
+    for tile, surfels in enumerate(whole.all_surfels(level)):
+        i, j = whole.tiles[tile]
+        discs = with_age(surfels, shown, int(level[tile]))
+        values = {**discs.values, 'level': np.full(len(discs), level[tile])}
+        name = f'tile_{i}_{j}'.replace('-', 'm')
+        tiles[f'map/{shown.name}/{name}'] = DrawnDiscs(
+            discs.position + shift_m, discs.normal, discs.radius_m, values
+        )
+    about = f'{whole.counts[0].sum():,} surfels in voxels of {shown.moments.voxel_size_m:g} m'
+    if level.any():
+        drawn = whole.counts[level, np.arange(len(whole))].sum()
+        about += f', shown as {drawn:,} on levels {level.min()} to {level.max()}'
+    return tiles, about
 
 
 def with_age(surfels: Surfels, shown: ExactMap, level: int) -> DrawnDiscs:
@@ -229,7 +162,7 @@ def with_age(surfels: Surfels, shown: ExactMap, level: int) -> DrawnDiscs:
     return DrawnDiscs.of(surfels, {'age': ages_s(seen_ns, newest_ns)})
 
 
-def show_cloud(scene: Scene | GltfScene, cloud: Cloud) -> str:
+def show_cloud(scene: Scene, cloud: Cloud) -> str:
     """Show surfels of a file as discs, or points."""
     path = f'map/{cloud.name}'
     if cloud.discs is None:
@@ -239,7 +172,7 @@ def show_cloud(scene: Scene | GltfScene, cloud: Cloud) -> str:
     return f'{len(cloud.discs):,} surfels, without their moments: at one level of detail'
 
 
-def show_way(scene: Scene | GltfScene, way: Way, origin_m: Array) -> str:
+def show_way(scene: Scene, way: Way, origin_m: Array) -> str:
     """Show a trajectory as a line, and as a sensor that moves if it has stamps."""
     poses = way.trajectory
     xyz = poses.xyz - origin_m

@@ -17,11 +17,7 @@ from surfel_mapper.files.mesh_ply import write_mesh
 from surfel_mapper.files.parquet_tiles import write_tiles
 from surfel_mapper.files.ply import write_points
 from surfel_mapper.mapping.window import WindowedScan
-from surfel_mapper.viz.contents import contents
-from surfel_mapper.viz.detail import LEVELS
 from surfel_mapper.viz.discs import CORNERS
-from surfel_mapper.viz.scene import Scene
-from surfel_mapper.viz.show import show_contents
 from test import extras
 from test.bags.recorded import drive, write_rosbag2
 from test.viz.test_mesh import sphere
@@ -117,36 +113,6 @@ def test_a_large_map_is_shown_as_exact_coarser_maps(tmp_path):
         assert rows.issuperset(map(tuple, places[level == each].tolist()))
     distance = np.linalg.norm(places[:, :2] - [-20.0, -10.0], axis=1)
     assert distance[level == level.min()].mean() < distance[level == level.max()].mean()
-
-
-class WatchedFile(Scene):
-    """A file that is given what a window is given."""
-
-    is_watched = True
-
-
-def test_a_window_gets_the_coarsest_map_first(tmp_path):
-    from rerun import chunk as reader
-
-    surfel_map = ground_map()
-    surfel_map.save(tmp_path / 'map.npz')
-    with WatchedFile.to_file(tmp_path / 'shown.rrd') as scene:
-        show_contents(scene, list(contents(tmp_path / 'map.npz')), most_discs=600)
-
-    rows = []  # of each chunk in the order of the file: tile, levels and positions
-    for chunk in reader.RrdReader(str(tmp_path / 'shown.rrd')).stream().to_chunks():
-        batch = chunk.to_record_batch()
-        if 'level' in batch.schema.names:
-            parts = zip(batch['level'], batch['Points3D:positions'], strict=True)
-            rows += [(chunk.entity_path, *(part.as_py() for part in row)) for row in parts]
-    tiles = {path for path, *_ in rows}
-    first, then = rows[: len(tiles)], rows[len(tiles) :]
-    assert {path for path, *_ in first} == {path for path, *_ in then} == tiles
-    assert {level for _, levels, _ in first for level in levels} == {LEVELS}
-    places = np.concatenate([positions for *_, positions in first])
-    expected = surfel_map.coarsen(LEVELS).surfels(5).position.astype(np.float32)
-    np.testing.assert_array_equal(in_order(places), in_order(expected))
-    assert max(level for _, levels, _ in then for level in levels) < LEVELS
 
 
 def test_files_of_a_replay_share_the_frame_of_the_map_far_from_zero(tmp_path):
