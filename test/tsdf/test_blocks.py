@@ -51,12 +51,12 @@ def test_blocks_are_found_after_any_growth_and_removal():
 def test_reused_row_is_zero():
     blocks = every_channel()
     rows = blocks.place(indices(300))
-    for array in (blocks.field, blocks.color, blocks.votes, blocks.stamps):
+    for array in (blocks.field, blocks.color, blocks.votes):
         array[rows] = 7
     blocks.remove(rows[:200])
     fresh = blocks.place(indices(200, seed=3) + 1000)
     assert {*fresh} == {*rows[:200]}
-    for array in (blocks.field, blocks.color, blocks.votes, blocks.stamps):
+    for array in (blocks.field, blocks.color, blocks.votes):
         assert not array[fresh].any()
         assert (array[rows[200:]] == 7).all()
 
@@ -68,8 +68,7 @@ def test_removed_blocks_can_be_inserted_again():
     blocks.touch(rows, 123)
     blocks.field[rows] = rng.random((50, 2, 8))
     blocks.color[rows] = rng.random((50, 4, 8))
-    blocks.votes[rows] = rng.random((50, 6, 8))
-    blocks.stamps[rows] = rng.integers(0, 1000, (50, 2, 8))
+    blocks.votes[rows] = rng.random((50, 2, 8))
     before = blocks.copied(rows)
     removed = blocks.remove(rows)
     assert blocks.num_blocks == 0
@@ -77,7 +76,7 @@ def test_removed_blocks_can_be_inserted_again():
     other = every_channel()
     other.insert(removed)
     after = other.copied(other.find(index))
-    for name in ('index', 'stamp_ns', 'field', 'color', 'votes', 'stamps'):
+    for name in ('index', 'stamp_ns', 'field', 'color', 'votes'):
         assert np.array_equal(getattr(after, name), getattr(before, name)), name
     assert len(other.changed_since(0)) == 50
 

@@ -101,7 +101,7 @@ def test_fifty_blue_after_500_red_are_blue_at_a_cap_of_ten(by_points):
     assert labels_at(one.blocks, PLACE)[0].tolist() == [1]
     row = one.blocks.find(np.floor(np.array(PLACE) / 0.8).astype(int))[0]
     color = one.blocks.color[row]
-    seen = color[3] > 0
+    seen = (color[3] > 0) & (one.blocks.distance[row] > -0.05)  # of full weight
     red, blue, weight = color[0, seen], color[2, seen], color[3, seen]
     # 200 (10 / 11)^50 red is left; less with several points of a scan at a voxel
     left = 200.0 * (10.0 / 11.0) ** 50

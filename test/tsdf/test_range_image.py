@@ -110,12 +110,11 @@ def test_depths_become_ranges_and_say_what_they_know():
     assert image.range_m[59, 0] == pytest.approx(expected, rel=1e-6)
 
 
-def test_whole_numbers_are_millimetres_unless_told():
+def test_whole_numbers_are_millimetres():
     depth = np.full((60, 80), 2000, np.uint16)
     depth[0, 0] = 0
-    image, scaled = from_depth(SMALL, depth), from_depth(SMALL, depth, scale=1 / 5000)
+    image = from_depth(SMALL, depth)
     assert image.range_m[30, 40] == pytest.approx(2.0)
-    assert scaled.range_m[30, 40] == pytest.approx(0.4)
     assert image.range_m[0, 0] == 0.0
     depth[1, 1] = 65535
     assert from_depth(SMALL, depth).range_m[1, 1] > SMALL.max_range_m
