@@ -11,7 +11,6 @@ A lidar driving through an analytic world: scans, poses and bags with known trut
     load_simulation('street')                   the simulation that a bag was recorded from
 """
 
-from surfel_mapper.simulation.circuit import Route
 from surfel_mapper.simulation.drive import Drive, Simulation
 from surfel_mapper.simulation.lidar import Lidar
 from surfel_mapper.simulation.primitives import Primitive
@@ -22,7 +21,6 @@ __all__ = [
     'Drive',
     'Lidar',
     'Primitive',
-    'Route',
     'Simulation',
     'World',
     'load_simulation',

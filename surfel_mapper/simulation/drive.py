@@ -28,7 +28,6 @@ from surfel_mapper.geometry import (
     Transform,
 )
 from surfel_mapper.scan import Scan
-from surfel_mapper.simulation.circuit import route_along
 from surfel_mapper.simulation.lidar import Lidar
 from surfel_mapper.simulation.world import World
 
@@ -72,8 +71,6 @@ class Drive:
         Stamp at the start pose; at earlier stamps the vehicle is behind it.
     base_to_sensor : (7,) float
         Pose of the lidar on the vehicle, as in the setting frames.base_to_sensor.
-    corners : sequence of (float, float)
-        Corners of the route in the frame of ``start``, m; straight ahead without any.
 
     Raises
     ------
@@ -86,7 +83,6 @@ class Drive:
     speed_m_s: float = 5.0
     start_ns: int = START_NS
     base_to_sensor: tuple[float, ...] = field(default_factory=base_to_sensor)
-    corners: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -94,10 +90,6 @@ class Drive:
             raise ConfigError(f'speed_m_s: {self.speed_m_s}, expected a value in [0, 100]')
         if not 0 <= self.start_ns < END_NS:
             raise ConfigError(f'start_ns: {self.start_ns}, expected a value in [0, {END_NS})')
-        if self.corners:
-            corners = tuple((float(x), float(y)) for x, y in self.corners)
-            object.__setattr__(self, 'corners', corners)
-            route_along(corners)
         for name in ('start', 'base_to_sensor'):
             pose = getattr(self, name)
             try:
@@ -118,11 +110,7 @@ class Drive:
         roll, _ = _sines(along, (ROLL_DEG,))
         pitch, _ = _sines(along, (PITCH_DEG,))
         turn = np.array([0.0, 0.0, 0.0, math.radians(roll), math.radians(pitch), math.atan(slope)])
-        if not self.corners:
-            T_start_base = pose_matrix((along, aside, up), q_xyzw(se3_exp(turn)))
-        else:
-            T_route_base = pose_matrix((0.0, aside, up), q_xyzw(se3_exp(turn)))
-            T_start_base = compose(route_along(self.corners).T_start_at(along), T_route_base)
+        T_start_base = pose_matrix((along, aside, up), q_xyzw(se3_exp(turn)))
         T_odom_base = compose(pose_matrix(self.start[:3], self.start[3:]), T_start_base)
         return T_odom_base[:3, 3].copy(), q_xyzw(T_odom_base)
 

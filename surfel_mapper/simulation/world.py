@@ -26,7 +26,6 @@ from surfel_mapper.budget import read_small_file
 from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import write_json
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.simulation.circuit import circuit_primitives, Corners
 from surfel_mapper.simulation.kernels import raycast, surfaces
 from surfel_mapper.simulation.primitives import KINDS, Primitive
 from surfel_mapper.simulation.street import street_pose, street_primitives
@@ -159,27 +158,6 @@ class World:
 
         """
         return cls(street_primitives(seed, length_m), street_pose())
-
-    @classmethod
-    def circuit(cls, corners: Corners, *, seed: int = 0) -> World:
-        """
-        Return the streets between corners; see Route for drives through them.
-
-        Parameters
-        ----------
-        corners : sequence of (float, float)
-            Places x y in the frame of the street, m; a street runs between consecutive ones.
-        seed : int
-            Seed of the positions and rotations of objects.
-
-        Raises
-        ------
-        ConfigError
-            If the seed is negative, there are fewer than two corners, or two legs lie on one
-            another without the same corners.
-
-        """
-        return cls(circuit_primitives(seed, corners), street_pose())
 
     def raycast(
         self, origins: npt.ArrayLike, directions: npt.ArrayLike, max_range_m: float = np.inf

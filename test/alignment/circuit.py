@@ -11,7 +11,8 @@ from itertools import pairwise
 import numpy as np
 
 from surfel_mapper.geometry import pose_matrix, q_xyzw, se3_exp
-from surfel_mapper.simulation import Drive, Lidar, Simulation, World
+from surfel_mapper.simulation import Lidar, Simulation
+from test.simulation.circuit import circuit_world, CircuitDrive
 
 STEP_M = 1.5
 
@@ -54,8 +55,8 @@ def circuit(corners) -> Circuit:
     """Return the scans of a lidar of few beams on a drive along corners, STEP_M apart."""
     lidar = Lidar(beams=24, columns=400, range_noise_m=0.02)
     # the corners of the second pass are on streets of the first
-    world = World.circuit(corners[:-1], seed=3)
-    drive = Drive(start=world.start, speed_m_s=10.0 * STEP_M, corners=corners)
+    world = circuit_world(corners[:-1], seed=3)
+    drive = CircuitDrive(start=world.start, speed_m_s=10.0 * STEP_M, corners=corners)
     length_m = sum(np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(corners))
     simulation = Simulation(world, lidar, drive, num_scans=int(length_m / STEP_M) - 10)
     found = [scan.points[np.isfinite(scan.points).all(axis=1)] for scan in simulation.scans()]

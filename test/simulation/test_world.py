@@ -150,30 +150,3 @@ def test_a_file_that_holds_no_world_is_refused_by_name(text, says, tmp_path):
 def test_a_missing_file_is_refused_by_name(tmp_path):
     with pytest.raises(FileFormatError, match=r'no\.json: cannot be read'):
         World.load(tmp_path / 'no.json')
-
-
-@pytest.mark.parametrize(
-    'corners',
-    [
-        ((0.0, 0.0), (60.0, 0.0), (60.0, 50.0), (0.0, 50.0), (0.0, 0.0), (55.0, 0.0)),
-        ((0.0, 0.0), (60.0, 0.0), (60.0, 300.0), (0.0, 300.0), (0.0, 10.0), (50.0, 10.0)),
-        ((20.0, 0.0), (0.0, 0.0), (200.0, 20.0)),  # a long street at 6 deg leaves a short one
-        ((-200.0, 20.0), (0.0, 0.0), (-20.0, 0.0)),
-    ],
-)
-def test_streets_on_one_another_are_refused(corners):
-    with pytest.raises(ConfigError, match=r'share .* m of street'):
-        World.circuit(corners)
-
-
-def test_streets_may_cross_meet_and_be_driven_again():
-    corners = ((0.0, 0.0), (60.0, 0.0), (60.0, 50.0), (0.0, 50.0), (0.0, 0.0), (60.0, 0.0))
-    assert len(World.circuit(corners).primitives) > 10
-    crossing = ((0.0, 0.0), (90.0, 0.0), (45.0, 60.0), (45.0, -60.0))
-    assert len(World.circuit(crossing).primitives) > 10
-
-
-@pytest.mark.parametrize('kind', [np.array, lambda corners: [list(corner) for corner in corners]])
-def test_corners_may_be_an_array_or_lists(kind):
-    corners = ((0.0, 0.0), (60.0, 0.0), (60.0, 50.0))
-    assert World.circuit(kind(corners)).primitives == World.circuit(corners).primitives

@@ -11,9 +11,9 @@ corners on arcs; legs may be driven several times and in both directions.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise, permutations
+from itertools import pairwise
 import math
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw, se3_exp, Transform
-from surfel_mapper.simulation.primitives import Primitive
+from surfel_mapper.simulation import Drive, Primitive, World
 from surfel_mapper.simulation.street import (
     BEYOND_M,
     PAVEMENT_Y_M,
@@ -32,14 +32,8 @@ from surfel_mapper.simulation.street import (
 Corners = Sequence[tuple[float, float]]
 """Places x y in the frame of the street, m."""
 
-Leg = tuple[tuple[float, float], ...]
-"""The two ends of a street."""
-
 TURN_RADIUS_M = 7.0
 """Radius of the arc at a corner, m."""
-
-OVERLAP_WIDTH_M, OVERLAP_LENGTH_M = 2.0 * PAVEMENT_Y_M[1], 1.0
-"""Legs so near and so long beside each other would be one street, m."""
 
 MIN_STEP_M = 1e-6
 """Two arcs that touch share a point; the heading of a shorter step, m, is rounding."""
@@ -108,6 +102,28 @@ class Route:
         return pose_matrix((x, y, 0.0), q_xyzw(turn))
 
 
+@dataclass(frozen=True, kw_only=True)
+class CircuitDrive(Drive):
+    """A drive along corners, places x y in the frame of ``start``, m."""
+
+    corners: tuple[tuple[float, float], ...]
+
+    def pose(self, stamp_ns):
+        """Return position (3,), m, and quaternion (4,) xyzw of base_link in odom at a stamp."""
+        along = self.speed_m_s * (stamp_ns - self.start_ns) * 1e-9
+        T_odom_start = pose_matrix(self.start[:3], self.start[3:])
+        T_route_base = compose(inverse(T_odom_start), pose_matrix(*super().pose(stamp_ns)))
+        T_route_base[0, 3] -= along
+        T_start_base = compose(route_along(self.corners).T_start_at(along), T_route_base)
+        T_odom_base = compose(T_odom_start, T_start_base)
+        return T_odom_base[:3, 3].copy(), q_xyzw(T_odom_base)
+
+
+def circuit_world(corners: Corners, *, seed: int = 0) -> World:
+    """Return the streets between corners."""
+    return World(circuit_primitives(seed, corners), street_pose())
+
+
 @cache
 def route_along(corners: tuple[tuple[float, float], ...]) -> Route:
     """Return the route along corners, made once."""
@@ -121,15 +137,13 @@ def circuit_primitives(seed: int, corners: Corners) -> list[Primitive]:
     Raises
     ------
     ConfigError
-        If the seed is negative, there are fewer than two corners, or two different legs lie on one
-        another.
+        If the seed is negative, or there are fewer than two corners.
 
     """
     points = [(float(x), float(y)) for x, y in corners]
     legs = sorted({tuple(sorted(leg)) for leg in pairwise(points)})
     if not legs:
         raise ConfigError(f'corners: {len(corners)}, expected two or more')
-    check_overlap(legs)
     pose = street_pose()
     T_world_street = pose_matrix(pose[:3], pose[3:])
     T_street_world = inverse(T_world_street)
@@ -151,26 +165,6 @@ def circuit_primitives(seed: int, corners: Corners) -> list[Primitive]:
                 continue
             kept.append(_moved(primitive, move))
     return kept
-
-
-def check_overlap(legs: Sequence[Leg]) -> None:
-    """
-    Raise ConfigError if different legs share more than a corner or a crossing.
-
-    Both would have houses of their own in one street. A leg that is driven again has to have the
-    same corners.
-    """
-    for (a, b), (c, d) in permutations(legs, 2):
-        way = np.subtract(b, a) / math.dist(a, b)
-        aside = np.array([-way[1], way[0]])
-        ends = np.subtract((c, d), a)
-        along, across = ends @ way, ends @ aside
-        shared_m = min(max(along), math.dist(a, b)) - max(min(along), 0.0)
-        if np.abs(across).max() < OVERLAP_WIDTH_M and shared_m > OVERLAP_LENGTH_M:
-            raise ConfigError(
-                f'corners: the legs {a} to {b} and {c} to {d} share {shared_m:g} m of street, '
-                'expected the same corners, or other streets'
-            )
 
 
 def _leg_pose(first: tuple[float, float], last: tuple[float, float]) -> Transform:
