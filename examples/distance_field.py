@@ -6,15 +6,13 @@ A distance field without a mapper: fuse scans, mesh them, and ask how far obstac
     python examples/distance_field.py street.ply
 
 A simulated lidar drives along a street. The mesh is written, and the distance from the lidar to
-the nearest obstacle printed twice: that of ``field.esdf``, and that of a box by scipy.
+the nearest obstacle printed.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-
-import numpy as np
 
 from surfel_mapper import DistanceField
 from surfel_mapper.config import TsdfConfig
@@ -42,9 +40,7 @@ def main() -> None:
 
     place = pose[:3, 3]
     near = field.esdf(max_m=3.0).sample([place])[0]
-    box = field.obstacle_distances(place - 5.0, place + 5.0)
-    voxel = tuple(np.floor((place - box.origin) / box.voxel_size_m).astype(int))
-    print(f'nearest obstacle: {near:.3f} m, by scipy {box.distance_m[voxel]:.3f} m')
+    print(f'nearest obstacle: {near:.3f} m')
 
 
 if __name__ == '__main__':

@@ -1,17 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Slices and distance fields of small fields, against brute force over their voxels."""
+"""Slices of small fields, against brute force over their voxels."""
 
 import numpy as np
 import pytest
 
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.errors import MapLimitError
-from surfel_mapper.layers.distance_field.obstacles import (
-    clearance_slice,
-    obstacle_distances,
-    slice_at,
-)
+from surfel_mapper.layers.distance_field.obstacles import clearance_slice, slice_at
 from surfel_mapper.tsdf.blocks import BlockMap
 from test.tsdf.test_mesh import blocks_of, centers, VOXEL_M
 
@@ -70,38 +65,3 @@ def test_the_slice_of_costs_is_limited_to_the_radius(scene):
     found = clearance_slice(blocks, (0.2, 0.45), 0.5, center=(0.2, 1.0), radius_m=0.3)
     assert found.cost.shape == (4, 4)  # the block about (0.2, 1.0)
     assert clearance_slice(blocks, (5.0, 6.0), 0.5).cost.shape == (0, 0)
-
-
-def test_distances_are_those_to_the_nearest_obstacle(scene):
-    blocks, distance, weight, places = scene
-    field = obstacle_distances(blocks)
-    occupied = places[states_of(distance, weight) == 100]
-    expected = np.linalg.norm(places.reshape(-1, 1, 3) - occupied, axis=-1).min(axis=1)
-    assert np.abs(field.distance_m.ravel() - expected).max() <= 1e-6
-    assert np.array_equal(field.known, weight > 0.0)
-    assert field.origin == pytest.approx([-0.4, 0.8, 0.0])
-    assert np.array_equal(field.at_height(0.55), field.distance_m[:, :, 5])
-
-
-def test_a_box_counts_the_obstacles_in_it_alone(scene):
-    blocks, *_ = scene
-    free = obstacle_distances(blocks, (0.0, 0.8, 0.0), (0.2, 0.9, 0.3))
-    assert free.distance_m.shape == (2, 1, 3)
-    assert np.isinf(free.distance_m).all()
-    assert free.known.all()
-    beyond = obstacle_distances(blocks, (5.0, 5.0, 5.0), (5.3, 5.3, 5.3))
-    assert not beyond.known.any()
-
-
-def test_an_empty_field_has_no_distances():
-    assert obstacle_distances(BlockMap(TsdfConfig())).distance_m.shape == (0, 0, 0)
-
-
-def test_boxes_that_are_none_or_too_large_are_refused(scene):
-    blocks, *_ = scene
-    with pytest.raises(ValueError, match='expected low below high'):
-        obstacle_distances(blocks, (0.0, 0.0, 0.0), (1.0, -1.0, 1.0))
-    with pytest.raises(MapLimitError, match='voxels; at most'):
-        obstacle_distances(blocks, (-1e3, -1e3, -1e3), (1e3, 1e3, 1e3))
-    with pytest.raises(ValueError, match=r'height 9.0 m, expected one within \[0, 0.8\)'):
-        obstacle_distances(blocks).at_height(9.0)

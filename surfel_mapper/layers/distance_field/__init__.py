@@ -4,18 +4,11 @@
 
 from surfel_mapper.layers.distance_field.field import DistanceField
 from surfel_mapper.layers.distance_field.layer import TsdfLayer
-from surfel_mapper.layers.distance_field.obstacles import (
-    clearance_slice,
-    obstacle_distances,
-    ObstacleDistances,
-    slice_at,
-)
+from surfel_mapper.layers.distance_field.obstacles import clearance_slice, slice_at
 
 __all__ = [
     'DistanceField',
-    'ObstacleDistances',
     'TsdfLayer',
     'clearance_slice',
-    'obstacle_distances',
     'slice_at',
 ]

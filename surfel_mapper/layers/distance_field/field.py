@@ -18,7 +18,6 @@ import numpy.typing as npt
 from surfel_mapper.arguments import as_path, as_whole, check_kind
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
-from surfel_mapper.layers.distance_field.obstacles import obstacle_distances, ObstacleDistances
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.euclidean import EuclideanField
 from surfel_mapper.tsdf.integrator import Integrator
@@ -181,27 +180,6 @@ class DistanceField:
     def states(self, points: npt.ArrayLike) -> npt.NDArray[np.uint8]:
         """Return the states at (P, 3) points: UNKNOWN, FREE or OCCUPIED of tsdf.queries, (P,)."""
         return states(self.blocks, points)
-
-    def obstacle_distances(
-        self, low_m: npt.ArrayLike | None = None, high_m: npt.ArrayLike | None = None
-    ) -> ObstacleDistances:
-        """
-        Return the Euclidean distances to obstacles in a box.
-
-        Parameters
-        ----------
-        low_m, high_m : (3,) float, optional
-            Corners of the box, map frame, m; by default it spans all blocks.
-
-        Raises
-        ------
-        ValueError
-            If a corner is not (3,) or low is not below high.
-        MapLimitError
-            If the box has too many voxels.
-
-        """
-        return obstacle_distances(self.blocks, low_m, high_m)
 
     def esdf(self, *, max_m: float = 2.0) -> EuclideanField:
         """
