@@ -352,9 +352,6 @@ class ModelsLayerConfig(Stage):
     )
 
     # No settings: callers of the library may change the fields.
-    reach_voxels: int = 1
-    """Largest distance of neighbours, in voxels, 1 or 2."""
-
     min_points: int = 10
     """Voxels of fewer points are not used yet."""
 
@@ -378,9 +375,6 @@ class ModelsLayerConfig(Stage):
     min_voxels: int = 4
     """Planes and surfaces of fewer voxels become Gaussians; curved ones of fewer than 15 voxels
     and 1,000 points, too."""
-
-    absorb: bool = True
-    """Patches grow over sparse and rough voxels that lie on them, and join across these."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

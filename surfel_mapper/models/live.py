@@ -238,8 +238,6 @@ class LiveModels:
         charts = [chart for parts in self._charts.values() for chart in parts]
         if charts:
             owner[np.concatenate(charts)] = np.repeat(np.arange(len(charts)), [*map(len, charts)])
-        if not self.config.absorb:
-            return owner
         hosted = np.flatnonzero(graph.host >= 0)
         owner[hosted] = owner[graph.host[hosted]]
         return self._joining.update(owner, changed)

@@ -102,8 +102,7 @@ class SurfelGraph:
         )
         self._config = config
         self._report_rules = ((MOVED * self.thickness_m) ** 2, TURNED, GREW)
-        self._absorbs = config.absorb
-        steps = half_neighbourhood(config.reach_voxels)
+        steps = half_neighbourhood()
         self._neighbour_steps = np.concatenate([steps, -steps])
         self.clear()
         self.assume_noise(config.noise_m)
@@ -115,7 +114,7 @@ class SurfelGraph:
         offset_m = max(self.thickness_m, 3.0 * noise_m)
         self.limit_m = math.hypot(self.thickness_m, 6.0 * noise_m)
         variance = (self.limit_m / 6.0) ** 2
-        far_sq = 12.5 * (config.reach_voxels * size_m) ** 2  # just over twice the diagonal
+        far_sq = 12.5 * size_m**2  # just over twice the diagonal
         self._class_rules = (float(config.min_points), variance, size_m)
         self._link_rules = (
             math.cos(math.radians(config.max_angle_deg)),
@@ -168,7 +167,7 @@ class SurfelGraph:
             self.map.find(keys).reshape(len(came), len(self._neighbour_steps)),
             self.neighbours,
         )
-        changed, here = here, self._around(here, near, 1) if self._absorbs else here
+        changed, here = here, self._around(here, near, 1)
         here, was = self._measure(changed, here)
         is_flat = self.kind[here] == FLAT
         relinked.append(self.component[here[(was == FLAT) != is_flat]])
@@ -288,25 +287,16 @@ class SurfelGraph:
             self.own_kind,
             self.axes,
         )
-        if self._absorbs:
-            alone = (
-                self.count,
-                self.position,
-                self.own_normal,
-                self.covariance,
-                self.eigenvalues,
-            )
-            classify_sparse(
-                around,
-                self.neighbours,
-                self.own_kind,
-                alone,
-                self._class_rules,
-                self.kind,
-                self.normal,
-            )
-        else:
-            self.kind[rows], self.normal[rows] = self.own_kind[rows], surfels.normal
+        alone = self.count, self.position, self.own_normal, self.covariance, self.eigenvalues
+        classify_sparse(
+            around,
+            self.neighbours,
+            self.own_kind,
+            alone,
+            self._class_rules,
+            self.kind,
+            self.normal,
+        )
         self.is_material[:] = False
         reported = (self._reported_count, self._reported_position, self._reported_normal)
         mark_material(
@@ -336,8 +326,6 @@ class SurfelGraph:
 
     def _find_hosts(self, here: Rows, emptied: Rows) -> None:
         """Recompute the hosts of voxels around changes."""
-        if not self._absorbs:
-            return
         around = self._around(here, emptied, ROUNDS)
         rows = around[(self.kind[around] != FLAT) & (self.kind[around] != NONE)]
         flat = here[self.kind[here] == FLAT]
@@ -347,9 +335,9 @@ class SurfelGraph:
         find_hosts(rows, self.neighbours, state, self.covariance, rules, self.host, self.level)
 
 
-def half_neighbourhood(reach: int) -> npt.NDArray[np.int64]:
-    """Return the key differences (H,) to neighbours of greater key within a reach."""
-    offsets = [step for step in product(range(-reach, reach + 1), repeat=3) if step > (0, 0, 0)]
+def half_neighbourhood() -> npt.NDArray[np.int64]:
+    """Return the key differences (13,) to neighbours of greater key."""
+    offsets = [step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)]
     x, y, z = np.array(offsets, np.int64).T
     steps: npt.NDArray[np.int64] = (x << (2 * INDEX_BITS)) + (y << INDEX_BITS) + z
     return steps

@@ -145,9 +145,7 @@ def test_warming_up_changes_nothing():
     assert mapper.map == SurfelMap(0.5)
 
 
-@pytest.mark.parametrize(
-    ('name', 'value'), [('min_points', 2), ('reach_voxels', 3), ('extract_period_s', -1.0)]
-)
+@pytest.mark.parametrize(('name', 'value'), [('min_points', 2), ('extract_period_s', -1.0)])
 def test_values_out_of_bounds_are_refused_by_name(name, value):
     with pytest.raises(ConfigError, match=f'layers.models.{name}'):
         Config.from_mapping({f'layers.models.{name}': value})

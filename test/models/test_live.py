@@ -94,9 +94,7 @@ def test_incremental_models_equal_a_batch_after_random_changes(noisy, seed):
     settings = ModelsLayerConfig(
         min_points=4,
         noise_m=float(rng.choice([0.0, 0.01])),
-        reach_voxels=1 + seed % 2,
         min_voxels=int(rng.integers(1, 6)),
-        absorb=seed % 3 > 0,
     )
     surfel_map = SurfelMap(VOXEL_M)
     models, held, known = LiveModels(settings, surfel_map), [], set()
@@ -376,9 +374,6 @@ def test_sparse_voxels_join_the_plane_that_they_lie_on():
     few = np.array([[1.26, 0.5, 0.002], [1.3, 0.55, 0.0]]) + 1e-3
     _, models = of_points(np.concatenate([cells((0, 1.2), (0, 1.2)), few]))
     assert id_at(models, few[0]) == models.model.planes[0].id
-    apart = ModelsLayerConfig(min_points=4, noise_m=0.005, absorb=False)
-    _, models = of_points(np.concatenate([cells((0, 1.2), (0, 1.2)), few]), settings=apart)
-    assert id_at(models, few[0]) == -1
     above = few + rng.uniform(0.04, 0.05)
     _, models = of_points(np.concatenate([cells((0, 1.2), (0, 1.2)), above]))
     assert id_at(models, above[0]) == -1
