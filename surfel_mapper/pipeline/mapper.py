@@ -206,13 +206,10 @@ class Mapper:
         check_kind('scan', scan, Scan, hint='Scan(points=..., stamp_ns=..., frame_id=...)')
         check_kind('topic', topic, str)
         self.counters.received += 1
-        pipeline, queue = self._pipeline, self._pipeline.queue
-        if topic and pipeline.drops.topics.get(scan.frame_id) != topic:
-            pipeline.drops.name_topic(scan.frame_id, topic)
-        queue.ended = False
-        pipeline.arrived.append(scan)
-        if len(pipeline.arrived) + len(queue.waiting) > self.config.pose.max_waiting_scans:
-            pipeline.judge_stamps()  # else insert_ready does
+        drops = self._pipeline.drops
+        if topic and drops.topics.get(scan.frame_id) != topic:
+            drops.name_topic(scan.frame_id, topic)
+        self._pipeline.add_scan(scan)
 
     def refuse_clouds(
         self, cause: str, topic: str, reason: str, number: int = 1, frame_id: str = ''

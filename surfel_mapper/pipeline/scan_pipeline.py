@@ -166,16 +166,20 @@ class ScanPipeline:
                     yield update
                 laps = Laps()
 
+    def add_scan(self, scan: Scan) -> None:
+        """Take a scan that can be mapped; ``run`` judges its stamp."""
+        self.queue.ended = False
+        try:
+            self.arrived.append(self._checked(scan))
+        except ScanRefusedError as refusal:
+            self.drops.failure(scan, refusal)
+        if len(self.arrived) + len(self.queue.waiting) > self.queue.max_scans:
+            self.judge_stamps()  # no more scans may wait
+
     def judge_stamps(self) -> None:
         """Use the scans that arrived, hold one until the next message, or drop them."""
         while self.arrived:
-            scan = self.arrived.popleft()
-            try:
-                scan = self._checked(scan)
-            except ScanRefusedError as refusal:
-                self.drops.failure(scan, refusal)
-            else:
-                self._settle(self.guard.judge(scan))
+            self._settle(self.guard.judge(self.arrived.popleft()))
 
     def add_pose(self, pose: StampedPose, *, static: bool) -> None:
         """Use a pose, hold it until the next message, or ignore it, by its stamp."""

@@ -42,6 +42,8 @@ class ScanQueue:
 
     Attributes
     ----------
+    max_scans : int
+        See above.
     waiting : deque of Scan
         The scans that wait for their poses.
     posed : deque of (Scan, (4, 4) float64)
@@ -56,7 +58,7 @@ class ScanQueue:
     def __init__(
         self, max_scans: int, poses: ScanPoses, images: ScanImages | None, drops: Drops
     ) -> None:
-        self._max_scans = max_scans
+        self.max_scans = max_scans
         self._poses = poses
         self._images = images
         self._drops = drops
@@ -68,8 +70,8 @@ class ScanQueue:
     def push(self, scan: Scan) -> None:
         """Add a scan; beyond the limit the oldest is dropped."""
         self.waiting.append(scan)
-        if len(self.waiting) > self._max_scans:
-            reason = f'{self._max_scans} newer scans wait for their poses'
+        if len(self.waiting) > self.max_scans:
+            reason = f'{self.max_scans} newer scans wait for their poses'
             self._drops.scan(self.waiting.popleft(), 'queue_full', reason)
 
     def drop_odd(self, scan: Scan, odd_ns: int) -> None:
