@@ -9,6 +9,7 @@ and so is missing if the recorder was killed. Files compressed as a whole end in
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from functools import lru_cache
 import os
@@ -18,11 +19,19 @@ from typing import Any
 from surfel_mapper.config import read_yaml
 from surfel_mapper.errors import BagError
 from surfel_mapper.files.atomic import by_number
+from surfel_mapper.files.scan_files import SUFFIXES
 
 STORAGE_SUFFIXES = ('.mcap', '.db3')
 PACKED_SUFFIX = '.zstd'
 ROS1_SUFFIXES = ('.bag', '.bag.active')
 METADATA = 'metadata.yaml'
+
+READ = (
+    f'a bag: a directory with {METADATA} or files ending in .mcap or .db3 (perhaps .zstd), or a '
+    f'.bag of ROS 1; or scans: files ending in {", ".join(SUFFIXES)}, a folder of them, or an '
+    'Ouster .pcap'
+)
+"""Formats of recordings, for errors."""
 
 
 def files_of(path: Path) -> list[Path]:
@@ -43,10 +52,7 @@ def files_of(path: Path) -> list[Path]:
     if not path.is_file():
         raise BagError(f'{path}: no such file or directory; expected a bag or scans')
     if not is_storage(path) and not is_ros1(path):
-        raise BagError(
-            f'{path}: not a bag; expected a rosbag2 directory, or a file ending in .mcap, .db3 '
-            '(perhaps .zstd) or .bag'
-        )
+        raise BagError(f'{path}: {path.suffix or "no ending"} is not read; expected {READ}')
     return [path]
 
 
@@ -141,9 +147,9 @@ def loose_files(directory: Path) -> list[Path]:
     names = {file.name for file in files}
     files = [file for file in files if not is_packed(file) or unpacked_name(file) not in names]
     if not files:
-        raise BagError(
-            f'{directory}: not a bag: neither {METADATA} nor an .mcap or .db3 file in it'
-        )
+        endings = Counter(file.suffix for file in directory.iterdir() if file.is_file())
+        found = ', '.join(f'{n} {ending or "without ending"}' for ending, n in endings.items())
+        raise BagError(f'{directory}: files in it: {found or "none"}; expected {READ}')
     return sorted(files, key=by_number)
 
 

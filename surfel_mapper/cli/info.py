@@ -17,7 +17,7 @@ import json
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import CUT
+from surfel_mapper.cli._arguments import add_bin_columns, CUT
 from surfel_mapper.cli._output import printable, show_lines
 from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
 from surfel_mapper.errors import escaped
@@ -49,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument(
         '--parameters', action='store_true', help='print all settings of node and replay instead'
     )
+    add_bin_columns(parser)
     parser.add_argument('--json', action='store_true', help='print as JSON')
     parser.add_argument(
         '--strict', action='store_true', help='exit with 3 if the bag is cut off or damaged'
@@ -68,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.offline.survey import offers, survey, surveyed_topics
 
     if is_scans(args.bag):
-        content = folder_content(args.bag)
+        content = folder_content(args.bag, args.bin_columns)
         show_lines(json.dumps(content) if args.json else folder_report(printable(content)))
         return 0
     with BagReader(args.bag) as reader:
@@ -152,14 +153,14 @@ def chosen(path: Path) -> dict[str, Any]:
     return {name: found[name] for name in CHOICE}
 
 
-def folder_content(path: Path) -> dict[str, Any]:
+def folder_content(path: Path, bin_columns: int | None) -> dict[str, Any]:
     """Return the number, times and columns of scans in files as plain values."""
     from surfel_mapper.config import Config
     from surfel_mapper.errors import FileFormatError
     from surfel_mapper.offline.request import Request
     from surfel_mapper.offline.scan_folder import ScanFolder
 
-    folder = ScanFolder(Request(path=path), Config(), None)
+    folder = ScanFolder(Request(path=path, bin_columns=bin_columns), Config(), None)
     first = folder.first_scan()
     if first is None:
         raise FileFormatError(folder.first_error)

@@ -21,6 +21,7 @@ from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.arguments import is_unit
 from surfel_mapper.cli._arguments import (
+    add_bin_columns,
     add_formats,
     add_overwrite,
     add_workers,
@@ -86,7 +87,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_input_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options for input."""
-    add = parser.add_argument_group('input').add_argument
+    group = parser.add_argument_group('input')
+    add = group.add_argument
     add(
         '--topic',
         action='append',
@@ -122,6 +124,7 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
     add('--start', type=seconds, default=0.0, metavar='S', help='leave out the first S seconds')
     add('--duration', type=positive_float, default=math.inf, metavar='S', help='map S seconds')
     add('--every', type=positive_int, default=1, metavar='N', help='map one cloud of every N')
+    add_bin_columns(group)
     add(
         '--window',
         action='store_true',
@@ -272,4 +275,5 @@ def request_of(args: argparse.Namespace, bag: Path) -> Request:
         start_s=args.start,
         duration_s=args.duration,
         every=args.every,
+        bin_columns=args.bin_columns,
     )

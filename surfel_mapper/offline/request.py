@@ -46,6 +46,8 @@ class Request:
         Pose of the sensor of each topic in frames.base, x y z qx qy qz qw.
     start_s, duration_s, every : float, float, int
         The part to map; see ``part``.
+    bin_columns : int, optional
+        Number of columns of .bin files; without, that which fits their values.
 
     """
 
@@ -59,6 +61,7 @@ class Request:
     start_s: float = 0.0
     duration_s: float = math.inf
     every: int = 1
+    bin_columns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

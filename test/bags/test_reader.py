@@ -153,8 +153,8 @@ def test_a_path_without_a_bag_is_refused(tmp_path):
     (tmp_path / 'empty').mkdir()
     for name, says in (
         ('nothing', 'no such file or directory'),
-        ('notes.txt', 'not a bag; expected a rosbag2 directory'),
-        ('empty', 'neither metadata.yaml nor'),
+        ('notes.txt', '.txt is not read; expected a bag'),
+        ('empty', 'files in it: none; expected a bag: a directory with metadata.yaml'),
     ):
         with pytest.raises(BagError, match=f'{name}: .*{says}'):
             BagReader(tmp_path / name)
