@@ -23,6 +23,9 @@ _log = logging.getLogger(__name__)
 WARN_EVERY_S = 1.0
 """Shortest time between two warnings of one cause, s; every drop is counted."""
 
+MAX_CAUSES = 200
+"""Causes whose last warning is kept; some name a frame."""
+
 MAX_TOPICS = 64
 """Frames whose topics are kept; frame names may change without end."""
 
@@ -143,5 +146,7 @@ class Drops:
         """Log a warning, unless one of the same cause was logged just before."""
         now_s = time.monotonic()
         if not self.is_silent and now_s - self._warned_s.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
+            if len(self._warned_s) >= MAX_CAUSES:
+                self._warned_s.clear()
             self._warned_s[cause] = now_s
             _log.warning('%s', message)

@@ -331,6 +331,12 @@ class Mapper:
         """Drop all scans, waiting ones too (counted); poses, counts and a frozen map stay."""
         self._pipeline.clear()
 
+    @property
+    def mount_changes(self) -> str:
+        """Sensors that have moved on the robot since the oldest scan of the map, in words."""
+        oldest = next(iter(self.window), None)
+        return self._pipeline.poses.mounts.warning(0 if oldest is None else oldest.stamp_ns)
+
     def align(self) -> Alignment:
         """
         Move the scans of the window to poses at which they agree; see the settings ``align``.

@@ -513,6 +513,7 @@ class ScanPipeline:
     def _clear_map(self) -> None:
         """Empty map, window and layers, unless the map is frozen."""
         self._clears_map = False
+        self.poses.forget_mounts()
         if self.config.map.mode != 'frozen':
             self._empty()
 

@@ -58,6 +58,8 @@ class Interval:
         The missing publisher, and the topics that could be read instead; empty if none.
     poses : str
         The poses that are missing, and the remedy; empty if none.
+    mounts : str
+        The sensors that have moved on the robot, and the remedy; empty if none.
 
     """
 
@@ -74,6 +76,7 @@ class Interval:
     loss: str = ''
     alternatives: str = ''
     poses: str = ''
+    mounts: str = ''
 
 
 def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
@@ -83,6 +86,8 @@ def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[in
         yield WARN, interval.loss
     if interval.poses:
         yield WARN, interval.poses
+    if interval.mounts:
+        yield WARN, interval.mounts
     if interval.paused:
         yield WARN, 'paused: clouds are dropped until ~/pause is called with false'
     for name, error in interval.layers_off.items():
