@@ -29,7 +29,7 @@ from std_msgs.msg import Header
 from surfel_mapper.compilation import PROGRESS
 from surfel_mapper.config import Config
 from surfel_mapper.pipeline.reduction import standing_sensor
-from surfel_mapper.ros.base_node import CountedPublisher, steady_timer
+from surfel_mapper.ros.base_node import CountedPublisher, Ticker
 from surfel_mapper.ros.health import ERROR, findings, Interval, OFF_S, OK
 from surfel_mapper.ros.messages import time_message
 from surfel_mapper.ros.publishers import mismatch, publishers_of
@@ -60,8 +60,14 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._asked_s: float | None = None
         self._last = Totals()
+        self._ticker: Ticker | None = None
         if rate_hz:
-            steady_timer(node, rate_hz, self._on_timer)
+            self._ticker = Ticker(node, 'diagnostics', 1.0 / rate_hz, self._on_timer)
+
+    def stop(self) -> None:
+        """Publish no more."""
+        if self._ticker is not None:
+            self._ticker.stop()
 
     def watch(self, session: Session | None) -> None:
         """Report about a session from now on; None: the state alone."""

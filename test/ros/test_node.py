@@ -218,7 +218,7 @@ def test_parameters_have_descriptions_and_only_live_ones_change(start, peer):
         return response.results[0]
 
     assert 'read-only' in change('map.voxel_size_m', 0.3).reason
-    assert 'range' in change('window.max_scans', -1).reason
+    assert 'expected a value in [0, ' in change('window.max_scans', -1).reason
     assert change('window.max_scans', 2).successful
     peer.advertise('/odom', '/points')
     send(peer, drive(4))
