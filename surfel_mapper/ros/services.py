@@ -208,9 +208,10 @@ class Services:
         return self._clear_region(Ball((x, y, z), radius_m), where)
 
     def _clear_polygons(self) -> None:
-        """Clear the regions of all polygons received on ~/clear_polygon."""
-        while self._polygons:
-            self._clear_polygon(self._polygons.popleft())
+        """Clear the region of the next polygon; those behind it follow after other work."""
+        self._clear_polygon(self._polygons.popleft())
+        if self._polygons:
+            self._thread.post(self._clear_polygons)
 
     def _clear_polygon(self, msg: PolygonStamped) -> None:
         topic, log = self._node.resolve_topic_name('~/clear_polygon'), self._node.get_logger()
