@@ -58,6 +58,8 @@ class Interval:
         The missing publisher, and the topics that could be read instead; empty if none.
     poses : str
         The poses that are missing, and the remedy; empty if none.
+    checkpoints : str
+        Why checkpoints fail, and the age of the last good one; empty if none failed.
     mounts : str
         The sensors that have moved on the robot, and the remedy; empty if none.
 
@@ -76,6 +78,7 @@ class Interval:
     loss: str = ''
     alternatives: str = ''
     poses: str = ''
+    checkpoints: str = ''
     mounts: str = ''
 
 
@@ -86,6 +89,8 @@ def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[in
         yield WARN, interval.loss
     if interval.poses:
         yield WARN, interval.poses
+    if interval.checkpoints:
+        yield ERROR, interval.checkpoints
     if interval.mounts:
         yield WARN, interval.mounts
     if interval.paused:

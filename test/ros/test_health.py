@@ -56,6 +56,11 @@ def test_other_topics_of_clouds_are_the_remedy_if_the_default_has_no_publisher()
     ]
 
 
+def test_failing_checkpoints_are_an_error():
+    text = 'checkpoints fail (no space); the last good one is 70 s old'
+    assert found(received=20, checkpoints=text) == [(ERROR, text)]
+
+
 def test_missing_poses_are_a_warning():
     text = 'pose.source auto takes registration: no topic gives the poses of the clouds'
     assert found(received=20, poses=text) == [(WARN, text)]

@@ -22,8 +22,9 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config, TsdfConfig
 from surfel_mapper.files.mesh_ply import write_mesh_parts
+from surfel_mapper.files.state import save_state
 from surfel_mapper.files.tsdf_archive import BlockArchive, joined
-from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf, save_tsdf_parts
+from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf_parts, tsdf_content
 from surfel_mapper.layers.distance_field.field import DistanceField
 from surfel_mapper.layers.distance_field.live_mesh import LiveMesh, WholeMesh
 from surfel_mapper.layers.distance_field.obstacles import clearance_slice, slice_at
@@ -298,13 +299,13 @@ class TsdfLayer(Layer):
             ),
         )
 
-    def save(self, path: Path) -> None:
-        """Write the field, and the archive region by region."""
+    def save(self, path: Path) -> Callable[[], object] | None:
+        """Copy the field, to be written; with an archive write it now, region by region."""
         if self._archive is None or not self._archive.num_blocks:
-            save_tsdf(path, self.blocks)
-        else:
-            parts = partial(merged_parts, self.blocks, self._archive)
-            save_tsdf_parts(path, self.config.tsdf, parts)
+            return partial(save_state, path, *tsdf_content(self.blocks))
+        parts = partial(merged_parts, self.blocks, self._archive)
+        save_tsdf_parts(path, self.config.tsdf, parts)
+        return None
 
     def load(self, path: Path) -> Callable[[], None]:
         """Read a field that ``save`` wrote; return the function that puts it in place."""
