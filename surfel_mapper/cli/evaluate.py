@@ -27,9 +27,6 @@ SUMMARY = 'Compare a map with the truth or another map, or a trajectory with ano
 
 EXAMPLE = 'surfel-mapper evaluate street_surfels --truth street'
 
-TRAJECTORIES = ('.tum', '.txt', '.csv', '.kitti')
-"""Endings of trajectories."""
-
 DEFAULT_M = 0.5
 """Default of --max-distance and --radius for maps without a voxel size, m."""
 
@@ -90,7 +87,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare and report."""
-    is_trajectory = args.map.suffix in TRAJECTORIES
+    from surfel_mapper.files.trajectory import SUFFIXES
+
+    is_trajectory = args.map.suffix.lower() in SUFFIXES
     result = finite_or_none(trajectories(args) if is_trajectory else maps(args))
     content = {'map': str(args.map), 'truth': str(args.truth), **result}
     lines = trajectory_lines(result) if is_trajectory else map_lines(result)

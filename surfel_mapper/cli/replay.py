@@ -118,7 +118,7 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         '--poses-format',
-        choices=('tum', 'kitti', 'csv'),
+        choices=('tum', 'kitti', 'csv', 'g2o'),
         help='its format (default: recognised by its first line)',
     )
     add('--start', type=seconds, default=0.0, metavar='S', help='leave out the first S seconds')

@@ -49,7 +49,7 @@ class PosePath:
     path : Path
         A trajectory; see read_trajectory.
     format_ : str, optional
-        tum, kitti or csv.
+        tum, kitti, csv or g2o.
     trajectory : Trajectory, optional
         The poses, if they have been read from the file.
 
@@ -65,6 +65,8 @@ class PosePath:
     ) -> None:
         self.path = path
         self.trajectory = trajectory or read_trajectory(path, format_)
+        number = self.trajectory.number
+        self._rows = None if number is None else {n: row for row, n in enumerate(number.tolist())}
         self._next: int | None = None
 
     @property
@@ -83,7 +85,8 @@ class PosePath:
         stamp_ns : int
             Stamp of the scan.
         number : int
-            Number of the pose of the scan, from 0, if poses have no stamps.
+            Number of the pose of the scan, from 0, if poses have no stamps. A scan without one
+            waits for those of others.
 
         Raises
         ------
@@ -94,7 +97,9 @@ class PosePath:
         self.check_scan(number)
         stamps = self.trajectory.stamp_ns
         if stamps is None:
-            self._add(mapper, number, stamp_ns)
+            row = number if self._rows is None else self._rows.get(number)
+            if row is not None:
+                self._add(mapper, row, stamp_ns)
             return
         if self._next is None:
             self._next = int(np.searchsorted(stamps, stamp_ns - MARGIN_NS))
@@ -107,7 +112,7 @@ class PosePath:
 
     def check_scan(self, number: int) -> None:
         """Raise BagError if the poses have no stamps, and there is none for a scan's number."""
-        if not self.has_stamps and number >= len(self.trajectory):
+        if not self.has_stamps and self._rows is None and number >= len(self.trajectory):
             raise BagError(
                 f'{self.path}: {len(self.trajectory)} poses, none for scan {number + 1}; '
                 'expected one for every scan, or a times.txt beside it'

@@ -38,7 +38,7 @@ class Request:
     poses : Path, optional
         A file of poses of frames.base instead.
     poses_format : str, optional
-        tum, kitti or csv.
+        tum, kitti, csv or g2o.
     poses_from : str, optional
         Source of the poses: auto, tf, odometry, pose, file, registration or identity; without,
         the configuration decides.

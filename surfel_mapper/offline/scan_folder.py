@@ -39,6 +39,7 @@ from surfel_mapper.offline.scan_times import (
     is_gapless,
     numbered,
     rows_of,
+    stem,
     times_beside,
     times_in_names,
 )
@@ -254,6 +255,9 @@ class ScanFolder:
         """Return the number of the pose of every scan, for poses without times, and its reason."""
         num_scans = len(self.files)
         num_poses = 0 if self.poses is None else len(self.poses.trajectory)
+        numbers = None if self.poses is None else self.poses.trajectory.number
+        if numbers is not None:
+            return self._numbered_rows(set(numbers.tolist()))
         if self.poses is None or self.poses.has_stamps or num_poses <= num_scans:
             return list(range(num_scans)), ''
         rows = rows_of(self.files, num_poses)
@@ -264,6 +268,19 @@ class ScanFolder:
                 '(TUM)'
             )
         return rows, f'{self.files[0].name} has pose {rows[0]}, counted from 0, of {num_poses}'
+
+    def _numbered_rows(self, numbers: set[int]) -> tuple[list[int], str]:
+        """Return the number of every scan, by its name or its place, for poses of some scans."""
+        names = [stem(file) for file in self.files]
+        is_named = all(map(str.isdecimal, names))
+        rows = [int(name) for name in names] if is_named else list(range(len(names)))
+        posed = numbers.intersection(rows)
+        if not posed:
+            raise BagError(
+                f'{self.path}: scans {rows[0]} to {rows[-1]}, poses of {min(numbers)} to '
+                f'{max(numbers)}; expected scans named by the numbers of their poses'
+            )
+        return rows, f'{len(posed)} of {len(rows)} scans have a pose of their number'
 
 
 def is_scans(path: Path) -> bool:
