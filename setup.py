@@ -61,6 +61,7 @@ CLUSTER = [
 
 LAS = [
     'laspy[lazrs]>=2.5',  # scans in LAS and LAZ files; lazrs unpacks LAZ
+    'pyproj>=3.6',  # units of coordinate systems in them; MIT
 ]
 
 OUSTER = [
