@@ -118,11 +118,12 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
     lines += [f'damaged: {cut}' for cut in content['cut']]
     if content['undecodable']:
         lines.append(f'{content["undecodable"]} messages of clouds or poses are damaged')
+    is_choice = len({offer.clouds for offer in made}) > 1
     for clouds in dict.fromkeys(offer.clouds for offer in made):
         with_a_pose = f'clouds of {clouds} with a pose, and the settings for --config:'
         lines += ['', escaped(with_a_pose)]
         for offer in made:
-            lines += offered(offer) if offer.clouds == clouds else []
+            lines += offered(offer, is_choice) if offer.clouds == clouds else []
     if not made:
         lines += ['', 'no poses; if the clouds are in a fixed frame, use --poses-from identity']
     lines += ['', replay_line(content['replay'])] if content['replay'] else []
@@ -212,8 +213,8 @@ def table(topics: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-def offered(offer: Offer) -> list[str]:
-    """Return the number of clouds with a pose from a source, and the settings to use it."""
+def offered(offer: Offer, is_choice: bool) -> list[str]:
+    """Return the clouds with a pose from a source, and settings, if a choice options, to use it."""
     import yaml
 
     from surfel_mapper.config import Config
@@ -226,7 +227,8 @@ def offered(offer: Offer) -> list[str]:
             stages.setdefault(stage, {})[key] = value
     text = yaml.safe_dump(stages, default_flow_style=None, sort_keys=False, width=1000)
     fixed = offer.settings['frames.fixed']
-    lines = [f'  {offer.poses}: {offer.covered} of {offer.total}, in the frame {fixed}']
+    options = f' (--topic {offer.clouds} --pose-topic {offer.poses})' if is_choice else ''
+    lines = [f'  {offer.poses}: {offer.covered} of {offer.total}, in the frame {fixed}{options}']
     if offer.missing:
         lines.append(f'    {offer.missing}')
     return [*map(escaped, lines), *(f'      {line}' for line in text.splitlines())]

@@ -6,9 +6,9 @@
 Ctrl-C or SIGTERM ends the recording early, and the scans mapped until then are written; Ctrl-C
 pressed again ends at once. Several bags, --workers and --scheduler map parts that are added up.
 
-Exit code 3: done, but the recording is cut off and --strict was given. 4: done, but registration
-could not place some scans on the map, which became maps of their own, or the surroundings seem to
-move along.
+Exit code 3: done, but the recording is cut off and --strict was given. 4: done, but the map is in
+doubt: less than 95 % of the scans are in it, registration could not place some scans, or their
+surroundings seem to move along. The last lines say which, with counts by cause.
 """
 
 from __future__ import annotations
@@ -104,6 +104,14 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
         help='pose of the sensor of a topic in frames.base, m; repeatable',
     )
     add('--pose-topic', metavar='TOPIC', help='topic of the poses (/tf, /odom or /pose)')
+    add(
+        '--static-topic',
+        action='append',
+        default=[],
+        metavar='TOPIC',
+        help='topic of static transforms (default: every tf_static in the namespaces of the '
+        'clouds and poses); repeatable',
+    )
     add(
         '--poses-from',
         choices=('auto', 'tf', 'odometry', 'pose', 'file', 'registration', 'identity'),
@@ -268,6 +276,7 @@ def request_of(args: argparse.Namespace, bag: Path) -> Request:
         path=bag,
         topics=tuple(args.topic),
         pose_topic=args.pose_topic,
+        static_topics=tuple(args.static_topic),
         poses=args.poses,
         poses_format=args.poses_format,
         poses_from=args.poses_from,

@@ -25,7 +25,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.memory import keep_freed_memory
-from surfel_mapper.offline.bag_recording import add_cloud, add_poses, BagRecording
+from surfel_mapper.offline.bag_recording import add_cloud, add_poses, add_static, BagRecording
 from surfel_mapper.offline.outputs import ScanTrajectory
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import all_scans
@@ -249,14 +249,12 @@ def replay_middle(
         raise BagError(f'{recording.reader.path}: depth images are mapped by one process alone')
     reader, poses, clouds = recording.reader, recording.poses, set(recording.topics)
     mapper.passes_over = shard.start_ns is not None
-    for topic, mount in poses.mounts.items():
-        base = mapper.config.frames.base
-        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
+    static = add_static(reader, mapper, poses)
     for message in messages_of(recording, shard):
         if mapper.passes_over and message.record_ns >= (shard.start_ns or 0):
             start.record(mapper)
         if message.topic not in clouds:
-            add_poses(reader, mapper, message, poses)
+            add_poses(reader, mapper, message, poses, static)
         elif recording.span.holds(message.record_ns):
             add_cloud(reader, mapper, message, poses, 0)
         yield from mapper.insert_ready()

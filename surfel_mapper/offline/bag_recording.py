@@ -13,23 +13,28 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
-from functools import partial
 import math
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.bags.reader import BagMessage, BagReader
-from surfel_mapper.bags.topics import CLOUD
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.poses import raw_poses
+from surfel_mapper.messages.poses import raw_poses, StampedPose
 from surfel_mapper.offline.pose_choice import (
     choose_for_bag,
     first_scans,
     pose_summary,
     why_not_deskewed,
 )
-from surfel_mapper.offline.pose_sources import pose_topics, PosePath, PoseTopics, static_topics
+from surfel_mapper.offline.pose_sources import (
+    pose_topics,
+    PosePath,
+    PoseTopics,
+    STATIC,
+    static_topics,
+    static_transforms,
+)
 from surfel_mapper.offline.request import part, Request, Span, WHOLE
 
 if TYPE_CHECKING:  # they load the compiler, which `info` does not need
@@ -75,7 +80,9 @@ class BagRecording:
         self.deskew_reason = why_not_deskewed(config, scans)
         if request.mounts:
             config = config.replace({'frames.base_to_sensor': ()})
-        self.poses = self._poses(request, config, path)
+        chosen = '' if choice.topic.endswith(STATIC) else choice.topic
+        self.poses = self._poses(request, config, path, request.pose_topic or chosen or None)
+        static_transforms(reader, self.poses.static)  # refuses topics that disagree
         self.config = config
         self.span = part(
             str(request.path),
@@ -105,18 +112,20 @@ class BagRecording:
         if stop_ns is None and (start_ns is None or every == 1):
             path.check_scan((num_clouds - 1) // every * every)
 
-    def _poses(self, request: Request, config: Config, path: PosePath | None) -> PoseTopics:
+    def _poses(
+        self, request: Request, config: Config, path: PosePath | None, name: str | None
+    ) -> PoseTopics:
         """Return the source of the poses."""
         topics = self.reader.topics
         if path is None:
-            found = pose_topics(topics, config, request.pose_topic)
+            found = pose_topics(topics, config, name, self.topics, request.static_topics)
         elif request.pose_topic is not None:
             raise BagError(f'{request.path}: poses of {request.pose_topic} or of {path.path}?')
         elif not path.has_stamps and len(self.topics) > 1:
             raise BagError(f'{path.path}: poses without times, for several topics of clouds')
         else:
-            static = () if config.frames.base_to_sensor else static_topics(topics)
-            found = PoseTopics({}, static, path)
+            static = static_topics(topics, self.topics, request.static_topics)
+            found = PoseTopics({}, () if config.frames.base_to_sensor else static, path)
         if request.mounts and config.pose.source != 'tf':
             found = replace(found, static=())  # two poses of one sensor might disagree
         return replace(found, mounts=request.mounts)
@@ -163,7 +172,7 @@ def chosen_topics(reader: BagReader, request: Request, config: Config) -> list[s
     configured = [f'/{name.lstrip("/")}' for name in config.input.topics]
     named = [*request.topics] or [*request.mounts] or configured
     names: list[str | None] = [*named] or [None]
-    choose: Callable[[str | None], str] = partial(reader.topics.choose, CLOUD)
+    choose: Callable[[str | None], str] = reader.topics.choose_cloud
     if config.input.kind == 'depth':
         choose = reader.topics.choose_image
     topics = [choose(name) for name in dict.fromkeys(names)]
@@ -226,9 +235,7 @@ def feed(
 
     """
     clouds = {cloud_topics} if isinstance(cloud_topics, str) else set(cloud_topics)
-    for topic, mount in poses.mounts.items():
-        base = mapper.config.frames.base
-        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
+    static = add_static(reader, mapper, poses)
     first = numbers_before(reader, clouds, poses, span)
     seen: Counter[str] = Counter()
 
@@ -251,7 +258,7 @@ def feed(
             add_camera_info(reader, mapper, message, images)
         elif message.topic not in clouds:
             with mapper.counters.timed('poses'):
-                add_poses(reader, mapper, message, poses)
+                add_poses(reader, mapper, message, poses, static)
         elif span.holds(message.record_ns):
             if seen[message.topic] % span.every == 0:
                 number = first[message.topic] + seen[message.topic]
@@ -353,14 +360,44 @@ def add_camera_info(
         mapper.ignore_message('bad_message', f'calibration ignored: {error}')
 
 
-def add_poses(reader: BagReader, mapper: Mapper, message: BagMessage, topics: PoseTopics) -> None:
-    """Enter the poses of a message; one that cannot be read is counted."""
+def add_static(
+    reader: BagReader, mapper: Mapper, poses: PoseTopics
+) -> dict[tuple[str, str], StampedPose]:
+    """Enter mounts and the first static transforms; return the latter for ``add_poses``."""
+    for topic, mount in poses.mounts.items():
+        base = mapper.config.frames.base
+        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
+    static = static_transforms(reader, poses.static)
+    for pose in static.values():
+        add_pose(mapper, pose, poses, is_static=True)
+    return static
+
+
+def add_poses(
+    reader: BagReader,
+    mapper: Mapper,
+    message: BagMessage,
+    topics: PoseTopics,
+    static: dict[tuple[str, str], StampedPose],
+) -> None:
+    """Enter the poses of a message that are not in ``static``; one that is damaged is counted."""
     kind, base = topics.kinds.get(message.topic, 'tf'), mapper.config.frames.base
     try:
         poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
     except PoseError as error:
         mapper.ignore_message('bad_message', f'pose ignored: {error}')
         return
+    is_static = message.topic in topics.static
     for pose in poses:
-        if topics.path is None or pose.child != base:  # the file has the pose of the base
-            mapper.add_pose(*pose, static=message.topic in topics.static)
+        if is_static:
+            key, pose = (message.topic, pose.child), pose._replace(stamp_ns=0)
+            if static.get(key) == pose:
+                continue
+            static[key] = pose
+        add_pose(mapper, pose, topics, is_static=is_static)
+
+
+def add_pose(mapper: Mapper, pose: StampedPose, topics: PoseTopics, *, is_static: bool) -> None:
+    """Enter a pose, unless a file has the poses of its frame."""
+    if topics.path is None or pose.child != mapper.config.frames.base:
+        mapper.add_pose(*pose, static=is_static)

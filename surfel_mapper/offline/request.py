@@ -35,6 +35,8 @@ class Request:
         Topics of clouds; empty: the only one of the bag.
     pose_topic : str, optional
         Topic of poses, if there are several.
+    static_topics : tuple of str
+        Topics of static transforms; empty: those in the namespaces of clouds and poses.
     poses : Path, optional
         A file of poses of frames.base instead.
     poses_format : str, optional
@@ -54,6 +56,7 @@ class Request:
     path: Path
     topics: tuple[str, ...] = ()
     pose_topic: str | None = None
+    static_topics: tuple[str, ...] = ()
     poses: Path | None = None
     poses_format: str | None = None
     poses_from: str | None = None

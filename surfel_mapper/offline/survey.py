@@ -10,23 +10,24 @@ Only the headers of clouds are read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain
 import math
 from typing import Any
 
 from surfel_mapper.bags.reader import BagMessage, BagReader
-from surfel_mapper.bags.topics import CLOUD, Topic
+from surfel_mapper.bags.topics import Topic, Topics
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.messages.cdr import frame_name, stamp_ns
 from surfel_mapper.messages.poses import raw_poses, StampedPose
-from surfel_mapper.offline.pose_sources import static_topics, TYPES
+from surfel_mapper.offline.pose_sources import shares_namespace, static_topics, TYPES
 from surfel_mapper.poses import TransformBuffer
 
-SOURCES = {type_: source for source, type_ in TYPES.items()}
+SOURCES = {type_: source for source, types in TYPES.items() for type_ in types}
 """The pose.source that reads each type."""
 
 ALL_TIME_S = 1e9
@@ -77,22 +78,30 @@ class Survey:
     Attributes
     ----------
     topics : dict of str to TopicSurvey
+    reader_topics : Topics
+        The topics of the bag.
     stamps : dict of (str, str) to list of int
         Stamps of the clouds, ns, by topic and frame.
     poses : dict of str to list of StampedPose
         By topic.
-    static : list of StampedPose
-        Static transforms.
+    static : dict of str to list of StampedPose
+        Static transforms, by topic.
     undecodable : int
         Number of damaged messages of clouds and poses.
 
     """
 
     topics: dict[str, TopicSurvey]
+    reader_topics: Topics
     stamps: dict[tuple[str, str], list[int]] = field(default_factory=dict)
     poses: dict[str, list[StampedPose]] = field(default_factory=dict)
-    static: list[StampedPose] = field(default_factory=list)
+    static: dict[str, list[StampedPose]] = field(default_factory=dict)
     undecodable: int = 0
+
+    def static_for(self, *names: str) -> list[StampedPose]:
+        """Return the static transforms of clouds and poses; see static_topics."""
+        chosen = static_topics(self.reader_topics, names)
+        return [pose for topic in chosen for pose in self.static.get(topic, [])]
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,9 +153,10 @@ def survey(
         If the bag is damaged.
 
     """
-    found = Survey({topic.name: TopicSurvey(topic) for topic in reader.topics})
+    found = Survey({topic.name: TopicSurvey(topic) for topic in reader.topics}, reader.topics)
     static = static_topics(reader.topics)
-    for message in reader.messages(surveyed_topics(reader), None, stop_ns):
+    moving = [name for name in surveyed_topics(reader) if name not in static]
+    for message in chain(reader.all_messages(static), reader.messages(moving, None, stop_ns)):
         try:
             frames = note_message(found, reader, message, static)
         except (BagError, CloudFormatError, PoseError):
@@ -159,14 +169,14 @@ def survey(
 
 def surveyed_topics(reader: BagReader) -> list[str]:
     """Return the topics of clouds and poses."""
-    return [topic.name for topic in reader.topics if topic.type in (CLOUD, *SOURCES)]
+    return reader.topics.of_type(*reader.topics.clouds, *SOURCES)
 
 
 def note_message(
     found: Survey, reader: BagReader, message: BagMessage, static: Collection[str]
 ) -> list[str]:
     """Add a message to a survey and return the frames that it names."""
-    if message.type == CLOUD:
+    if message.type in reader.topics.clouds:
         decoded = reader.decode(message)
         frame = frame_name(decoded.header.frame_id)
         found.stamps.setdefault((message.topic, frame), []).append(stamp_ns(decoded.header))
@@ -174,7 +184,7 @@ def note_message(
     kind, base = SOURCES[message.type], DEFAULTS.frames.base
     poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
     if message.topic in static:
-        found.static += poses
+        found.static.setdefault(message.topic, []).extend(poses)
     else:
         found.poses.setdefault(message.topic, []).extend(poses)
     return [f'{pose.parent} -> {pose.child}' for pose in poses]
@@ -189,14 +199,21 @@ def offers(found: Survey) -> list[Offer]:
     if found.static and 'tf' not in [source.kind for source in sources]:
         sources.append(Source('/tf_static', 'tf', []))  # a sensor at rest
     made = [
-        tried(source, found.static, clouds, frame, stamps)
+        tried(source, found.static_for(clouds, source.topic), clouds, frame, stamps)
         for (clouds, frame), stamps in found.stamps.items()
-        for source in sources
+        for source in of_namespace(sources, clouds)
     ]
     kinds = list(SOURCES.values())
     return sorted(
         made, key=lambda o: (o.clouds, -o.covered, kinds.index(o.settings['pose.source']))
     )
+
+
+def of_namespace(sources: Sequence[Source], clouds: str) -> list[Source]:
+    """Return the sources of each kind in the namespace of clouds; all of a kind if none is."""
+    own = [source for source in sources if shares_namespace(source.topic, clouds)]
+    kinds = {source.kind for source in own}
+    return [source for source in sources if source in own or source.kind not in kinds]
 
 
 @dataclass(frozen=True, slots=True)
