@@ -85,6 +85,8 @@ def run(args: argparse.Namespace) -> int:
 
 def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str, Any]:
     """Return the survey as plain values."""
+    from surfel_mapper.offline.clocks import clock_offsets
+
     return {
         'bag': str(reader.path),
         'format': 'ROS 1' if reader.is_ros1 else 'ROS 2',
@@ -103,6 +105,10 @@ def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str,
         'undecodable': found.undecodable,
         'cut': list(reader.cuts),
         'poses': [dataclasses.asdict(offer) for offer in made],
+        'clock_offsets': [
+            {**dataclasses.asdict(clock), 'text': str(clock)}
+            for clock in clock_offsets(found, reader.topics.of_type(*reader.topics.clouds))
+        ],
     }
 
 
@@ -118,6 +124,7 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
     lines += [f'damaged: {cut}' for cut in content['cut']]
     if content['undecodable']:
         lines.append(f'{content["undecodable"]} messages of clouds or poses are damaged')
+    lines += [f'clocks: {clock["text"]}' for clock in content['clock_offsets']]
     is_choice = len({offer.clouds for offer in made}) > 1
     for clouds in dict.fromkeys(offer.clouds for offer in made):
         with_a_pose = f'clouds of {clouds} with a pose, and the settings for --config:'
@@ -214,7 +221,7 @@ def table(topics: list[dict[str, Any]]) -> list[str]:
 
 
 def offered(offer: Offer, is_choice: bool) -> list[str]:
-    """Return the clouds with a pose from a source, and settings, if a choice options, to use it."""
+    """Return the number of clouds with a pose from a source, and how to use it."""
     import yaml
 
     from surfel_mapper.config import Config

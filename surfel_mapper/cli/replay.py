@@ -57,6 +57,9 @@ SUMMARY = 'Map a bag, or a folder of scans, and write the map, a picture and fig
 
 EXAMPLE = 'surfel-mapper replay street.mcap --config my.yaml --voxel-size 0.2 -o street/ --open'
 
+LARGEST_OFFSET_S = 1e10
+"""Limit of an offset of clocks, s: the bound of input.time_offset_s."""
+
 ONE_PROCESS = ('window', 'align', 'view', 'rrd')
 """Options that ask for all scans in order, in one process."""
 
@@ -129,6 +132,15 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
         choices=('tum', 'kitti', 'csv', 'g2o'),
         help='its format (default: recognised by its first line)',
     )
+    add(
+        '--time-offset',
+        action='append',
+        default=[],
+        type=time_offset,
+        metavar='[TOPIC=]S',
+        help='add S seconds to the stamps of the clouds, of a topic or of all '
+        '(input.time_offset_s), whose clock differs from that of the poses; repeatable',
+    )
     add('--start', type=seconds, default=0.0, metavar='S', help='leave out the first S seconds')
     add('--duration', type=positive_float, default=math.inf, metavar='S', help='map S seconds')
     add('--every', type=positive_int, default=1, metavar='N', help='map one cloud of every N')
@@ -180,6 +192,18 @@ def mount(text: str) -> tuple[str, tuple[float, ...]]:
             f'{text!r}, expected TOPIC=X,Y,Z,QX,QY,QZ,QW with a quaternion of norm 1'
         )
     return topic, numbers
+
+
+def time_offset(text: str) -> tuple[str, float]:
+    """Return topic and seconds of TOPIC=S; an empty topic stands for all."""
+    topic, _, number = text.rpartition('=')
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= LARGEST_OFFSET_S:
+        raise argparse.ArgumentTypeError(f'{text!r}, expected seconds, or TOPIC=SECONDS')
+    return topic, value
 
 
 def run(args: argparse.Namespace) -> int:
@@ -267,6 +291,8 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
 def with_filters(args: argparse.Namespace) -> Config:
     """Return the configuration that the arguments ask for, with its filters."""
     config = configured(args)
+    for topic, value in args.time_offset:
+        config = config if topic else config.replace({'input.time_offset_s': value})
     return config if args.filters is None else config.replace({'filters': args.filters})
 
 
@@ -281,6 +307,7 @@ def request_of(args: argparse.Namespace, bag: Path) -> Request:
         poses_format=args.poses_format,
         poses_from=args.poses_from,
         mounts=dict(args.mount),
+        time_offsets={topic: value for topic, value in args.time_offset if topic},
         start_s=args.start,
         duration_s=args.duration,
         every=args.every,

@@ -286,6 +286,12 @@ class InputConfig(Stage):
         low=0.0,
         high=1e9,
     )
+    time_offset_s: float = setting(
+        0.0,
+        'Added to the stamps of clouds, s: the clock of the poses less that of the sensors.',
+        low=-1e10,
+        high=1e10,
+    )
     max_waiting_clouds: int = setting(
         20,
         'At most this many clouds wait to be mapped; the oldest is dropped.',

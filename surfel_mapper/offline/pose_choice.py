@@ -11,7 +11,7 @@ to map, and deskewed if its points carry times. ``Request.poses_from`` overrides
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 
@@ -62,7 +62,11 @@ class PoseChoice:
 
 
 def choose_for_bag(
-    reader: BagReader, topics: Sequence[str], request: Request, config: Config
+    reader: BagReader,
+    topics: Sequence[str],
+    request: Request,
+    config: Config,
+    sample: Callable[[], Survey],
 ) -> PoseChoice:
     """
     Choose the source of the poses of a bag.
@@ -77,6 +81,8 @@ def choose_for_bag(
         Its ``poses_from`` and ``poses`` come first.
     config : Config
         Its ``pose.source`` counts unless it is auto, and its ``frames``.
+    sample : callable
+        Returns a survey of the first clouds of the bag; see ``sampled``.
 
     Raises
     ------
@@ -94,19 +100,18 @@ def choose_for_bag(
     has_poses = any(reader.topics.of_type(*types) for types in TYPES.values())
     is_framed = config.frames != DEFAULT.frames or request.mounts or request.pose_topic
     if has_poses and not is_depth and not is_framed:
-        return choose_by_sample(reader, topics, wanted, asked)
+        return choose_by_sample(reader, topics, wanted, asked, sample())
     if wanted is not None:
         return PoseChoice(asked)
     if has_poses:
-        return choose_by_frames(reader, topics, request, config)
+        return choose_by_frames(reader, topics, request, config, sample)
     return registered(reader, topics, config, 'the recording has no poses')
 
 
 def choose_by_sample(
-    reader: BagReader, topics: Sequence[str], wanted: str | None, config: Config
+    reader: BagReader, topics: Sequence[str], wanted: str | None, config: Config, sample: Survey
 ) -> PoseChoice:
     """Return the source that gives the clouds of a sample their poses, or registration."""
-    sample = sampled(reader)
     sources = list(TYPES) if wanted is None else [wanted]
     best = {
         source: tried
@@ -160,7 +165,11 @@ def changes(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def choose_by_frames(
-    reader: BagReader, topics: Sequence[str], request: Request, config: Config
+    reader: BagReader,
+    topics: Sequence[str],
+    request: Request,
+    config: Config,
+    sample: Callable[[], Survey],
 ) -> PoseChoice:
     """Return the first source that is there, as the node does, with the frames of the user."""
     candidates = []
@@ -170,7 +179,7 @@ def choose_by_frames(
             names = [name for name in reader.topics.of_type(*types) if name == request.pose_topic]
         missing = '' if names else 'no topic'
         if names and source == 'tf' and config.input.kind == 'cloud':
-            missing = missing_transforms(sampled(reader), topics, request, config)
+            missing = missing_transforms(sample(), topics, request, config)
         topic = DEFAULTS[source] if DEFAULTS[source] in names else (names or [''])[0]
         candidates.append(PoseCandidate(source, topic, missing))
     choice = choose_source(candidates)
@@ -236,11 +245,11 @@ def is_usable(offer: Offer, found: Survey) -> bool:
     return not any(fixed == frame or mounting(static, fixed, frame) for frame in frames)
 
 
-def sampled(reader: BagReader) -> Survey:
-    """Return a survey of the first clouds of a bag."""
+def sampled(reader: BagReader, offsets_ns: Mapping[str, int]) -> Survey:
+    """Return a survey of the first clouds of a bag, with offsets added to their stamps."""
     length_ns = SAMPLE_NS
     while True:
-        found = survey(reader, stop_ns=reader.start_ns + length_ns)
+        found = survey(reader, stop_ns=reader.start_ns + length_ns, offsets_ns=offsets_ns)
         if found.stamps or reader.start_ns + length_ns > reader.end_ns:
             return found
         length_ns *= 4

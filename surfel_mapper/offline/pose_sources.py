@@ -148,6 +148,10 @@ class PoseTopics:
     mounts : mapping of str to 7 floats
         Pose of the sensor of each topic of clouds in frames.base, x y z qx qy qz qw. Clouds of
         these topics get the topic's name as frame; the frame in their header is ignored.
+    offsets_ns : mapping of str to int
+        Added to the stamps of the clouds of a topic.
+    unstamped : frozenset of str
+        Topics whose stamps are not set: their record times are used.
 
     """
 
@@ -155,6 +159,8 @@ class PoseTopics:
     static: tuple[str, ...] = ()
     path: PosePath | None = None
     mounts: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    offsets_ns: Mapping[str, int] = field(default_factory=dict)
+    unstamped: frozenset[str] = frozenset()
 
 
 def pose_topics(

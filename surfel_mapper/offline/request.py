@@ -46,6 +46,8 @@ class Request:
         the configuration decides.
     mounts : mapping of str to 7 floats
         Pose of the sensor of each topic in frames.base, x y z qx qy qz qw.
+    time_offsets : mapping of str to float
+        Seconds added to the stamps of clouds of a topic, beside ``input.time_offset_s``.
     start_s, duration_s, every : float, float, int
         The part to map; see ``part``.
     bin_columns : int, optional
@@ -61,6 +63,7 @@ class Request:
     poses_format: str | None = None
     poses_from: str | None = None
     mounts: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    time_offsets: Mapping[str, float] = field(default_factory=dict)
     start_s: float = 0.0
     duration_s: float = math.inf
     every: int = 1

@@ -89,7 +89,8 @@ def in_order(values: Mapping[str, Any], names: Sequence[str]) -> list[tuple[str,
 def uncertain_text(summary: Mapping[str, Any]) -> str:
     """Return why a map is in doubt, or lacks more scans than usual; empty if neither is so."""
     texts = apart_text(summary), surrounded_text(summary), missing_text(summary)
-    return '\n'.join(filter(None, texts))
+    clocks = [offset['text'] for offset in summary.get('clock_offsets', [])]
+    return '\n'.join(filter(None, [*texts, *clocks]))
 
 
 def missing_text(summary: Mapping[str, Any]) -> str:

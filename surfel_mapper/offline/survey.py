@@ -10,7 +10,7 @@ Only the headers of clouds are read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain
@@ -86,6 +86,8 @@ class Survey:
         By topic.
     static : dict of str to list of StampedPose
         Static transforms, by topic.
+    leads_ns : dict of str to list of int
+        Times by which the stamps of clouds and poses are ahead of their record times, by topic.
     undecodable : int
         Number of damaged messages of clouds and poses.
 
@@ -96,7 +98,19 @@ class Survey:
     stamps: dict[tuple[str, str], list[int]] = field(default_factory=dict)
     poses: dict[str, list[StampedPose]] = field(default_factory=dict)
     static: dict[str, list[StampedPose]] = field(default_factory=dict)
+    leads_ns: dict[str, list[int]] = field(default_factory=dict)
     undecodable: int = 0
+
+    @property
+    def sources(self) -> list[Source]:
+        """The topics of poses; that of static transforms stands for a sensor at rest."""
+        sources = [
+            Source(topic, SOURCES[self.topics[topic].topic.type], poses)
+            for topic, poses in self.poses.items()
+        ]
+        if self.static and 'tf' not in [source.kind for source in sources]:
+            sources.append(Source('/tf_static', 'tf', []))
+        return sources
 
     def static_for(self, *names: str) -> list[StampedPose]:
         """Return the static transforms of clouds and poses; see static_topics."""
@@ -134,6 +148,7 @@ def survey(
     reader: BagReader,
     on_message: Callable[[], object] = lambda: None,
     stop_ns: int | None = None,
+    offsets_ns: Mapping[str, int] | None = None,
 ) -> Survey:
     """
     Read all clouds and poses of a bag.
@@ -146,6 +161,8 @@ def survey(
         Called after every message, for a progress bar.
     stop_ns : int, optional
         Record time at which to stop; without, the whole bag is read.
+    offsets_ns : mapping of str to int, optional
+        Added to the stamps of the clouds of a topic.
 
     Raises
     ------
@@ -158,7 +175,8 @@ def survey(
     moving = [name for name in surveyed_topics(reader) if name not in static]
     for message in chain(reader.all_messages(static), reader.messages(moving, None, stop_ns)):
         try:
-            frames = note_message(found, reader, message, static)
+            offset_ns = (offsets_ns or {}).get(message.topic, 0)
+            frames = note_message(found, reader, message, static, offset_ns)
         except (BagError, CloudFormatError, PoseError):
             found.undecodable += 1
             frames = []
@@ -173,35 +191,38 @@ def surveyed_topics(reader: BagReader) -> list[str]:
 
 
 def note_message(
-    found: Survey, reader: BagReader, message: BagMessage, static: Collection[str]
+    found: Survey,
+    reader: BagReader,
+    message: BagMessage,
+    static: Collection[str],
+    offset_ns: int = 0,
 ) -> list[str]:
     """Add a message to a survey and return the frames that it names."""
     if message.type in reader.topics.clouds:
         decoded = reader.decode(message)
         frame = frame_name(decoded.header.frame_id)
-        found.stamps.setdefault((message.topic, frame), []).append(stamp_ns(decoded.header))
+        stamp = (stamp_ns(decoded.header) or message.record_ns) + offset_ns
+        found.stamps.setdefault((message.topic, frame), []).append(stamp)
+        found.leads_ns.setdefault(message.topic, []).append(stamp - message.record_ns)
         return [frame]
     kind, base = SOURCES[message.type], DEFAULTS.frames.base
     poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
     if message.topic in static:
         found.static.setdefault(message.topic, []).extend(poses)
     else:
+        poses = [p if p.stamp_ns else p._replace(stamp_ns=message.record_ns) for p in poses]
         found.poses.setdefault(message.topic, []).extend(poses)
+        leads = found.leads_ns.setdefault(message.topic, [])
+        leads += [pose.stamp_ns - message.record_ns for pose in poses]
     return [f'{pose.parent} -> {pose.child}' for pose in poses]
 
 
 def offers(found: Survey) -> list[Offer]:
     """Return every source of poses tried on every topic of clouds, the best of each first."""
-    sources = [
-        Source(topic, SOURCES[found.topics[topic].topic.type], poses)
-        for topic, poses in found.poses.items()
-    ]
-    if found.static and 'tf' not in [source.kind for source in sources]:
-        sources.append(Source('/tf_static', 'tf', []))  # a sensor at rest
     made = [
         tried(source, found.static_for(clouds, source.topic), clouds, frame, stamps)
         for (clouds, frame), stamps in found.stamps.items()
-        for source in of_namespace(sources, clouds)
+        for source in of_namespace(found.sources, clouds)
     ]
     kinds = list(SOURCES.values())
     return sorted(
