@@ -190,6 +190,11 @@ class ScanPipeline:
             self._settle(self.guard.judge(pose))
 
     def _checked(self, scan: Scan) -> Scan:
+        """Return a scan that can be mapped, by the clock of the poses, with its times."""
+        offset_ns = round(1e9 * self.config.input.time_offset_s)
+        return self._timed(scan).moved_in_time(offset_ns)
+
+    def _timed(self, scan: Scan) -> Scan:
         """Return a scan that can be mapped, with the times that deskewing needs; else raise."""
         if not scan.frame_id:
             raise ScanRefusedError('empty_frame_id', 'its header has no frame_id')

@@ -257,7 +257,7 @@ def test_warnings_go_to_stderr_only(tmp_path, capsys, caplog):
     entries[4][3].point_step = 15
     bag = write_rosbag2(tmp_path / 'drive', entries)
     with caplog.at_level(logging.WARNING):
-        assert main(['replay', str(bag), '--json', '--output', str(tmp_path / 'out')]) == 0
+        assert main(['replay', str(bag), '--json', '--output', str(tmp_path / 'out')]) == 4
 
     assert '/points: ' in caplog.text
     assert json.loads(capsys.readouterr().out)['scans']['mapped'] == NUM_SCANS - 1
