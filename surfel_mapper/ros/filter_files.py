@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from surfel_mapper.config import Config
+from surfel_mapper.config import Config, read_yaml
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.ros.map_files import is_inside
@@ -70,16 +70,19 @@ class FilterFiles:
 
 def check_chain(path: str) -> None:
     """Raise ConfigError with the kind of fault if a file holds no valid chain."""
+    if fault := fault_of(path):
+        raise ConfigError(f'filters: {path!r:.500}: {fault}')
+
+
+def fault_of(path: str) -> str:
+    """Return the kind of fault of a chain, without text of its file; empty if it is valid."""
     try:
+        read_yaml(path.partition('#')[0], as_text=True)
         Chain.load(path)
-    except ConfigError as error:
-        raise ConfigError(f'filters: {path!r:.500}: {kind_of(error)}') from None
-
-
-def kind_of(error: ConfigError) -> str:
-    """Return the kind of fault of a chain, without text of its file."""
-    if isinstance(error.__cause__, OSError):
-        return f'cannot be read: {error.__cause__.strerror}'
-    if isinstance(error.__cause__, ValueError):
+    except OSError as error:
+        return f'cannot be read: {error.strerror}'
+    except ConfigError:
+        return 'no valid chain of filters; `surfel-mapper filter` with this file states the fault'
+    except ValueError:
         return 'not YAML'
-    return 'no valid chain of filters; `surfel-mapper filter` with this file states the fault'
+    return ''

@@ -21,7 +21,7 @@ from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
 from surfel_mapper.pipeline.warm_up import node_stages
 from surfel_mapper.poses import AUTO, SourceChoice
 from surfel_mapper.ros.base_node import BaseNode
-from surfel_mapper.ros.filter_files import kind_of
+from surfel_mapper.ros.filter_files import fault_of
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.main_thread import TaskQueue
 from surfel_mapper.ros.map_files import directory_of, MapWriter, save_map
@@ -209,9 +209,10 @@ class Session:
         """Pass the newest settings to the mapper; called in the mapping thread."""
         try:
             self.mapper.reconfigure(self.config)
-        except ConfigError as error:  # the filter file has changed since it was checked
-            text = f'filters: {self.config.filters}: {kind_of(error)}'
-            self._node.get_logger().error(f'settings not applied: {text}')
+        except ConfigError:  # the filter file has changed since it was checked
+            fault = fault_of(self.config.filters)
+            text = f'settings not applied: filters: {self.config.filters}: {fault}'
+            self._node.get_logger().error(text)
         self.outputs.expire()
 
 

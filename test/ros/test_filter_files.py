@@ -52,6 +52,7 @@ def test_the_directory_is_by_default_that_of_the_first_parameter_file(tmp_path):
     ('content', 'kind'),
     [
         (SECRET, 'no valid chain'),
+        (f'- {SECRET.partition(":")[2]}', 'no valid chain'),
         (f'- {SECRET}: 1', 'no valid chain'),
         (f'- MaxDistDataPointsFilter: {{maxDist: {SECRET}}}', 'no valid chain'),
         (f'"{SECRET}', 'not YAML'),

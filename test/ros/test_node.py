@@ -103,7 +103,6 @@ def bad_clouds(stamp_ns):
         ('bad_cloud', no_z),
         ('bad_cloud', unknown_type),
         ('bad_cloud', made(point_step=10)),
-        ('bad_cloud', made(row_step=7)),
         ('bad_cloud', made(data=array('B', bytes(100)))),
         ('bad_cloud', made(data=array('B'))),
         ('empty_frame_id', no_frame),
