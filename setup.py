@@ -175,7 +175,7 @@ setup(
     ],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'ros/fastdds_shm.xml', 'viz/page/*']},
+    package_data={NAME: ['py.typed', 'ros/*.xml', 'viz/page/*']},
     install_requires=REQUIRED,
     extras_require={
         'formats': FORMATS,
