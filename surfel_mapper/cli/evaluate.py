@@ -115,9 +115,9 @@ def maps(args: argparse.Namespace) -> dict[str, Any]:
     if is_world(args.truth):
         truth = load_truth(args.truth)
     else:
-        other = load_discs(args.truth, args.min_points)
-        truth = CloudTruth(other)
-        digests = compared_digests(surfels, other)
+        reference = load_discs(args.truth, args.min_points)
+        truth = CloudTruth(reference)
+        digests = compared_digests(surfels, reference)
     size_m = surfels.voxel_size_m or DEFAULT_M
     max_distance_m = args.max_distance or size_m
     motion = None
@@ -133,11 +133,11 @@ def maps(args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def compared_digests(surfels: Discs, other: Discs) -> dict[str, Any]:
+def compared_digests(surfels: Discs, reference: Discs) -> dict[str, Any]:
     """Return whether two maps are equal to the bit, if both are exact."""
-    if surfels.digest is None or other.digest is None:
+    if surfels.digest is None or reference.digest is None:
         return {}
-    return {'equal': surfels.digest == other.digest}
+    return {'equal': surfels.digest == reference.digest}
 
 
 def map_lines(result: dict[str, Any]) -> list[str]:

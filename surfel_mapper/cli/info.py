@@ -38,15 +38,15 @@ CHOICE = ('poses_from', 'poses_reason', 'deskewed', 'deskew_reason')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument(
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument(
         'bag',
         type=Path,
         metavar='BAG',
         nargs='?',
         help='rosbag2 directory, .mcap, .db3, ROS 1 .bag, or directory or file of scans',
     )
-    what.add_argument(
+    source.add_argument(
         '--parameters', action='store_true', help='print all settings of node and replay instead'
     )
     add_bin_columns(parser)
@@ -76,14 +76,14 @@ def run(args: argparse.Namespace) -> int:
         total = reader.topics.num_messages(surveyed_topics(reader))
         read = itertools.count(1)
         with shown_progress(args, 'message') as show:
-            found = survey(reader, lambda: show(next(read), total))
-        made = offers(found)
-        content = {**as_mapping(reader, found, made), 'replay': chosen(args.bag)}
+            surveyed = survey(reader, lambda: show(next(read), total))
+        made = offers(surveyed)
+        content = {**as_mapping(reader, surveyed, made), 'replay': chosen(args.bag)}
     show_lines(json.dumps(content) if args.json else report(printable(content), made))
     return CUT if args.strict and content['cut'] else 0
 
 
-def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str, Any]:
+def as_mapping(reader: BagReader, survey: Survey, made: list[Offer]) -> dict[str, Any]:
     """Return the survey as plain values."""
     from surfel_mapper.offline.clocks import clock_offsets
 
@@ -95,19 +95,19 @@ def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str,
         'topics': [
             {
                 'topic': name,
-                'type': seen.topic.type,
-                'messages': seen.topic.count,
-                'rate_hz': seen.rate_hz,
-                'frames': seen.frames,
+                'type': summary.topic.type,
+                'messages': summary.topic.count,
+                'rate_hz': summary.rate_hz,
+                'frames': summary.frames,
             }
-            for name, seen in found.topics.items()
+            for name, summary in survey.topics.items()
         ],
-        'undecodable': found.undecodable,
+        'undecodable': survey.undecodable,
         'cut': list(reader.cuts),
         'poses': [dataclasses.asdict(offer) for offer in made],
         'clock_offsets': [
             {**dataclasses.asdict(clock), 'text': str(clock)}
-            for clock in clock_offsets(found, reader.topics.of_type(*reader.topics.clouds))
+            for clock in clock_offsets(survey, reader.topics.of_type(*reader.topics.clouds))
         ],
     }
 
@@ -155,10 +155,10 @@ def chosen(path: Path) -> dict[str, Any]:
 
     try:
         with open_recording(Request(path=path), Config()) as recording:
-            found = recording.describe()
+            description = recording.describe()
     except BagError:  # several topics of clouds, or none: a topic has to be named
         return {}
-    return {name: found[name] for name in CHOICE}
+    return {name: description[name] for name in CHOICE}
 
 
 def folder_content(path: Path, bin_columns: int | None) -> dict[str, Any]:
@@ -172,17 +172,17 @@ def folder_content(path: Path, bin_columns: int | None) -> dict[str, Any]:
     first = folder.first_scan()
     if first is None:
         raise FileFormatError(folder.first_error)
-    found = folder.describe()
+    description = folder.describe()
     return {
         'bag': str(path),
         'format': folder.format,
         'scans': len(folder.files),
         'seconds': folder.recorded_s,
-        'times_from': found['times_from'],
+        'times_from': description['times_from'],
         'points': len(first),
         'columns': sorted(first.columns),
         'damaged': [folder.first_error] if folder.first_error else [],
-        'replay': {name: found[name] for name in CHOICE},
+        'replay': {name: description[name] for name in CHOICE},
     }
 
 

@@ -209,9 +209,9 @@ def time_offset(text: str) -> tuple[str, float]:
 def run(args: argparse.Namespace) -> int:
     """Map one recording or many, and report."""
     if (args.poses_from == 'file') != (args.poses is not None) and args.poses_from is not None:
-        found = 'no --poses' if args.poses is None else f'--poses {args.poses}'
+        poses = 'no --poses' if args.poses is None else f'--poses {args.poses}'
         raise UsageError(
-            f'--poses-from {args.poses_from} and {found}: expected both `--poses-from file` and '
+            f'--poses-from {args.poses_from} and {poses}: expected both `--poses-from file` and '
             '`--poses FILE` for a file of poses, else no --poses'
         )
     is_many = len(args.bags) > 1 or args.workers is not None or args.scheduler is not None
@@ -244,8 +244,8 @@ def replay_one(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     chosen = replay_options(args)
     request = request_of(args, args.bags[0])
     config = with_filters(args)
-    others = {'--poses-out': args.poses_out, '--rrd': args.rrd}
-    check_distinct(request.path, args.output, chosen.formats, others)
+    outputs = {'--poses-out': args.poses_out, '--rrd': args.rrd}
+    check_distinct(request.path, args.output, chosen.formats, outputs)
     return replay(request, output=args.output, config=config, options=chosen, **options)
 
 
@@ -267,10 +267,10 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     """Map recordings into one map, with the workers that were asked for."""
     from surfel_mapper.offline.replay import all_scans
 
-    given = [name for name in ONE_PROCESS if getattr(args, name)]
-    if given:
+    refused = [name for name in ONE_PROCESS if getattr(args, name)]
+    if refused:
         raise UsageError(
-            f'--{given[0]}: not with several bags, --workers or --scheduler, where no process '
+            f'--{refused[0]}: not with several bags, --workers or --scheduler, where no process '
             'maps all scans in order'
         )
     config = with_filters(args).replace(all_scans())

@@ -157,7 +157,7 @@ def show_files(args: argparse.Namespace) -> None:
     def read() -> list[Content]:
         names = [path.resolve().name if many and path.is_dir() else '' for path in args.what]
         pairs = zip(args.what, names, strict=True)
-        return [each for path, name in pairs for each in contents(path, name)]
+        return [content for path, name in pairs for content in contents(path, name)]
 
     with ThreadPoolExecutor(1) as reader:  # a large map takes longer to read than rerun to start
         reading = reader.submit(read)
@@ -179,14 +179,14 @@ def show_files(args: argparse.Namespace) -> None:
 
 
 def show_all(
-    scene: Scene | GltfScene, found: Sequence[Content], args: argparse.Namespace
+    scene: Scene | GltfScene, contents: Sequence[Content], args: argparse.Namespace
 ) -> Shown:
     """Show contents as the arguments ask for, and print a sentence about each."""
     from surfel_mapper.viz.show import show_contents
 
     shown = show_contents(
         scene,
-        found,
+        contents,
         colouring=args.color,
         target=args.at,
         most_discs=args.discs,
