@@ -175,7 +175,7 @@ def refusing(name: str | Path, error: Callable[[str], Exception]) -> Iterator[No
         yield
     except SurfelMapperError:
         raise
-    except OSError as found:
-        raise error(f'{name}: cannot be read: {found.strerror or found}') from found
-    except Exception as found:  # MemoryError too
-        raise error(f'{name}: damaged: {type(found).__name__}: {found}') from found
+    except OSError as cause:
+        raise error(f'{name}: cannot be read: {cause.strerror or cause}') from cause
+    except Exception as cause:  # MemoryError too
+        raise error(f'{name}: damaged: {type(cause).__name__}: {cause}') from cause

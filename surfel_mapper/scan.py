@@ -251,9 +251,9 @@ class Scan:
 
 def check_offsets(offsets: object, num_points: int) -> None:
     """Raise ValueError unless the times of points are an array (N,) of int64."""
-    found = offsets if isinstance(offsets, np.ndarray) else np.empty(0, object)
-    if found.shape != (num_points,) or found.dtype != np.int64:
-        kind = f'{found.dtype} {found.shape}' if found is offsets else type(offsets).__name__
+    array = offsets if isinstance(offsets, np.ndarray) else np.empty(0, object)
+    if array.shape != (num_points,) or array.dtype != np.int64:
+        kind = f'{array.dtype} {array.shape}' if array is offsets else type(offsets).__name__
         raise ValueError(f'offsets of times: {kind}, expected int64 ({num_points},)')
 
 
