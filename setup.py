@@ -61,6 +61,7 @@ CLUSTER = [
 
 LAS = [
     'laspy[lazrs]>=2.5',  # scans in LAS and LAZ files; lazrs unpacks LAZ
+    'pyproj>=3.6',  # units of coordinate systems in them; MIT
 ]
 
 OUSTER = [
@@ -174,7 +175,7 @@ setup(
     ],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'ros/fastdds_shm.xml', 'viz/page/*']},
+    package_data={NAME: ['py.typed', 'ros/*.xml', 'viz/page/*']},
     install_requires=REQUIRED,
     extras_require={
         'formats': FORMATS,

@@ -42,18 +42,18 @@ def as_array(name: str, values: npt.ArrayLike) -> npt.NDArray[Any]:
 
 def as_numbers(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return values as float64; raise ValueError, with their name, if they are not numbers."""
-    found = as_array(name, values)
-    if found.dtype == np.float64:
-        return found
+    array = as_array(name, values)
+    if array.dtype == np.float64:
+        return array
     try:
-        if found.dtype.kind in 'cmMSUV':  # dates would become their number of ticks
+        if array.dtype.kind in 'cmMSUV':  # dates would become their number of ticks
             raise TypeError
         with np.errstate(over='ignore'):  # wider floats become infinite
-            return np.asarray(found, np.float64)
+            return np.asarray(array, np.float64)
     except (TypeError, ValueError, OverflowError):
         shown = repr(values) if isinstance(values, str) else f'a {type(values).__name__}'
         if isinstance(values, np.ndarray):
-            shown = f'{found.dtype} {found.shape}'
+            shown = f'{array.dtype} {array.shape}'
         raise ValueError(f'{name}: {shown}, expected numbers') from None
 
 
@@ -80,10 +80,10 @@ def check_rows(name: str, rows: object) -> None:
     """Raise IndexError if rows are neither a slice nor a mask or indices in one dimension."""
     if isinstance(rows, slice):
         return
-    found = as_array(name, rows)  # type: ignore[arg-type]
-    if found.ndim != 1 or (found.size and found.dtype.kind not in 'iub'):
+    array = as_array(name, rows)  # type: ignore[arg-type]
+    if array.ndim != 1 or (array.size and array.dtype.kind not in 'iub'):
         raise IndexError(
-            f'{name}: {found.dtype} {found.shape}, expected a slice, a mask or row indices'
+            f'{name}: {array.dtype} {array.shape}, expected a slice, a mask or row indices'
         )
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+import gc
 import logging
 import threading
 from time import perf_counter
@@ -49,14 +50,22 @@ class Progress:
         self._seconds = 0.0
         self._start = 0.0
         self._depth = 0
+        self._collects_garbage = True
         self._lock = threading.Lock()
 
     def begin(self) -> None:
-        """Note that a kernel, or a function that one calls, begins to compile; announce it."""
+        """
+        Note that a kernel, or a function that one calls, begins to compile; announce it.
+
+        No garbage is collected until it is compiled: that takes an eighth of the time and finds
+        little, because the compiler keeps most of its objects to the end.
+        """
         with self._lock:
             self._depth += 1
             if self._depth > 1:
                 return
+            self._collects_garbage = gc.isenabled()
+            gc.disable()
             self._start = perf_counter()
             self.num_kernels += 1
             is_first, is_new = self._announced is None, self._announced != self.stage
@@ -70,6 +79,8 @@ class Progress:
         with self._lock:
             self._depth -= 1
             if self._depth == 0:
+                if self._collects_garbage:
+                    gc.enable()
                 self._seconds += perf_counter() - self._start
 
     @property

@@ -195,9 +195,9 @@ class Laps:
 
     def end(self, stage: str) -> None:
         """End a stage and start the next."""
-        now = clock()
-        self._stages[stage] = (now - self._lap) * 1e3
-        self._lap = now
+        stop = clock()
+        self._stages[stage] = (stop - self._lap) * 1e3
+        self._lap = stop
 
     @property
     def milliseconds(self) -> dict[str, float]:

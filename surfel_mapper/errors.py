@@ -13,6 +13,7 @@ Exceptions of this package.
         MapLimitError      a voxel index or a count beyond the range of the integers  (ValueError)
         NotInMapError      removing moments that the map does not contain             (ValueError)
       FilterError          a filter cannot work on a scan                             (ValueError)
+      ScanRefusedError     a scan that a stage of the pipeline leaves out, with the cause
       AlignmentError       scans, pairs or poses that do not determine poses          (ValueError)
       ModelError           points to which no models can be fitted                    (ValueError)
       BagError             a bag that cannot be read, or lacks a topic or poses
@@ -107,6 +108,22 @@ class FilterError(SurfelMapperError, ValueError):
     """A filter cannot process a scan: a column is missing, or a value is unusable."""
 
 
+class ScanRefusedError(SurfelMapperError):
+    """
+    A scan that a stage of the pipeline leaves out.
+
+    Attributes
+    ----------
+    cause : str
+        The cause by which the scan is counted.
+
+    """
+
+    def __init__(self, cause: str, reason: str = '') -> None:
+        super().__init__(reason)
+        self.cause = cause
+
+
 class AlignmentError(SurfelMapperError, ValueError):
     """Scans, pairs or poses are not suitable for alignment; nothing is changed."""
 
@@ -158,7 +175,7 @@ def refusing(name: str | Path, error: Callable[[str], Exception]) -> Iterator[No
         yield
     except SurfelMapperError:
         raise
-    except OSError as found:
-        raise error(f'{name}: cannot be read: {found.strerror or found}') from found
-    except Exception as found:  # MemoryError too
-        raise error(f'{name}: damaged: {type(found).__name__}: {found}') from found
+    except OSError as cause:
+        raise error(f'{name}: cannot be read: {cause.strerror or cause}') from cause
+    except Exception as cause:  # MemoryError too
+        raise error(f'{name}: damaged: {type(cause).__name__}: {cause}') from cause

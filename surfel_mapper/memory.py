@@ -73,12 +73,12 @@ collection the garbage of the compiler takes 60 MB."""
 @contextmanager
 def rare_collections() -> Iterator[None]:
     """Collect garbage rarely in a with-block that compiles kernels."""
-    before = gc.get_threshold()
-    gc.set_threshold(RARELY, *before[1:])
+    thresholds = gc.get_threshold()
+    gc.set_threshold(RARELY, *thresholds[1:])
     try:
         yield
     finally:
-        gc.set_threshold(*before)
+        gc.set_threshold(*thresholds)
 
 
 @contextmanager

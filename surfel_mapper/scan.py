@@ -213,11 +213,25 @@ class Scan:
 
     def with_times(self, times: PointTimes) -> Scan:
         """Return the scan with the times of its points, which are not decoded for that."""
+        return self._changed(times=times)
+
+    def moved_in_time(self, offset_ns: int) -> Scan:
+        """Return the scan with an offset added to its stamp and the times of its points."""
+        if not offset_ns:
+            return self
+        times = self.times
+        if times is not None:
+            first_ns, last_ns = times.first_ns + offset_ns, times.last_ns + offset_ns
+            times = replace(times, first_ns=first_ns, last_ns=last_ns)
+        return self._changed(stamp_ns=self.stamp_ns + offset_ns, times=times)
+
+    def _changed(self, **changes: Any) -> Scan:
+        """Return the scan with other values; its points are not decoded for that."""
         if self._lazy is None or self.depth is not None:  # which has these very points
-            return replace(self, times=times)
+            return replace(self, **changes)
         once = partial(getattr, self, 'points')  # decoded once for both
         later = LazyPoints(len(self), once, self._lazy.xyz)
-        return replace(self, points=cast(Any, later), times=times)
+        return replace(self, points=cast(Any, later), **changes)
 
     def select(self, rows: npt.NDArray[Any]) -> Scan:
         """
@@ -237,9 +251,9 @@ class Scan:
 
 def check_offsets(offsets: object, num_points: int) -> None:
     """Raise ValueError unless the times of points are an array (N,) of int64."""
-    found = offsets if isinstance(offsets, np.ndarray) else np.empty(0, object)
-    if found.shape != (num_points,) or found.dtype != np.int64:
-        kind = f'{found.dtype} {found.shape}' if found is offsets else type(offsets).__name__
+    array = offsets if isinstance(offsets, np.ndarray) else np.empty(0, object)
+    if array.shape != (num_points,) or array.dtype != np.int64:
+        kind = f'{array.dtype} {array.shape}' if array is offsets else type(offsets).__name__
         raise ValueError(f'offsets of times: {kind}, expected int64 ({num_points},)')
 
 

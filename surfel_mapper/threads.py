@@ -97,9 +97,9 @@ if hasattr(os, 'register_at_fork'):
     os.register_at_fork(after_in_child=pool.cache_clear)  # threads do not follow into a child
 
 
-def split(num_rows: int, parts: int) -> list[slice]:
+def split(num_rows: int, number: int) -> list[slice]:
     """Return consecutive slices of nearly equal length that cover num_rows rows."""
-    bounds = [num_rows * part // parts for part in range(parts + 1)]
+    bounds = [num_rows * k // number for k in range(number + 1)]
     return [slice(first, last) for first, last in itertools.pairwise(bounds)]
 
 

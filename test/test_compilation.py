@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import subprocess
@@ -49,6 +50,29 @@ def test_the_clock_stands_still_while_a_kernel_compiles(progress):
     assert progress.num_kernels == 1
     assert 0.0 < progress.seconds < passed
     assert passed_clock == pytest.approx(passed - progress.seconds, abs=passed / 10)
+
+
+@needs_compiler
+@pytest.mark.parametrize('collects', [True, False])
+def test_garbage_is_collected_again_after_a_compilation(progress, collects):
+    try:
+        if not collects:
+            gc.disable()
+        compile_another()
+        assert gc.isenabled() == collects
+    finally:
+        gc.enable()
+
+
+@needs_compiler
+def test_no_garbage_is_collected_while_kernels_compile(progress):
+    progress.begin()
+    progress.begin()
+    assert not gc.isenabled()
+    progress.end()
+    assert not gc.isenabled()
+    progress.end()
+    assert gc.isenabled()
 
 
 @needs_compiler

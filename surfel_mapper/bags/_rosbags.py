@@ -148,9 +148,14 @@ def latched_profile() -> Qos:
     )
 
 
-def is_cdr(connection: Connection) -> bool:
-    """Return whether messages are serialised as CDR, or as ROS 1 in a ROS 1 bag."""
-    return getattr(connection.ext, 'serialization_format', 'cdr') == 'cdr'
+def serialization(connection: Connection) -> str:
+    """Return the serialisation of messages: cdr, ros1, or one that is not read, as protobuf."""
+    return str(getattr(connection.ext, 'serialization_format', 'ros1'))
+
+
+def is_readable(connection: Connection) -> bool:
+    """Return whether messages are serialised as CDR or as in ROS 1."""
+    return serialization(connection) in ('cdr', 'ros1')
 
 
 def has_legal_names(connection: Connection) -> bool:
@@ -169,11 +174,9 @@ def is_latched(connection: Connection) -> bool:
 
 
 def type_name(connection: Connection) -> str:
-    """Return the message type of a connection, with the serialisation if that is not CDR."""
+    """Return the message type of a connection, with the serialisation if that is not read."""
     name = SAME_AS.get(connection.msgtype, connection.msgtype)
-    if is_cdr(connection):
-        return name
-    return f'{name} as {connection.ext.serialization_format}'  # type: ignore[union-attr]
+    return name if is_readable(connection) else f'{name} as {serialization(connection)}'
 
 
 @cache
@@ -206,6 +209,14 @@ def ros2_hash(connection: Connection) -> str:
     store = get_typestore(Stores.EMPTY)
     store.fielddefs = {**jazzy_types().fielddefs, **_parsed(connection)}
     return store.hash_rihs01(connection.msgtype)
+
+
+def member_names(connection: Connection, type_: str) -> list[str]:
+    """Return the names of the members of a type by the definition of a connection; none if bad."""
+    try:
+        return [name for name, _ in _parsed(connection)[type_][1]]
+    except Exception:  # of a text from the bag, of many types
+        return []
 
 
 def _parsed(connection: Connection) -> Any:

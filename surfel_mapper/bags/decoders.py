@@ -12,7 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
-from surfel_mapper.bags._rosbags import is_cdr, jazzy_types, ros1_types, ros2_hash, type_name
+from surfel_mapper.bags._rosbags import (
+    is_readable,
+    jazzy_types,
+    ros1_types,
+    ros2_hash,
+    type_name,
+)
 
 if TYPE_CHECKING:
     from surfel_mapper.bags._rosbags import Connection, Typestore
@@ -56,7 +62,7 @@ class Decoders:
         if type_ in jazzy_types().fielddefs:
             return None
         connection = self._connection(type_)
-        if not is_cdr(connection):
+        if not is_readable(connection):
             raise ValueError('its messages are not CDR')
         if not connection.msgdef.data:
             raise ValueError('the bag has no definition of it')

@@ -4,25 +4,40 @@
 The files that make up a bag, and its metadata.yaml.
 
 A rosbag2 recording is a directory of one or more files and a metadata.yaml, which is written last
-and so is missing if the recorder was killed. Files compressed as a whole end in .zstd.
+and so is missing if the recorder was killed. Files compressed as a whole end in .zstd. Users
+unpack and rename files, so the content of a file counts before its name.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from functools import lru_cache
+import logging
 import os
 from pathlib import Path
 from typing import Any
 
+from surfel_mapper.bags.compression import ZSTD_MAGIC
 from surfel_mapper.config import read_yaml
 from surfel_mapper.errors import BagError
 from surfel_mapper.files.atomic import by_number
+from surfel_mapper.files.scan_files import SUFFIXES
 
 STORAGE_SUFFIXES = ('.mcap', '.db3')
-PACKED_SUFFIX = '.zstd'
+PACKED_SUFFIXES = ('.zstd', '.zst')
+STORAGE_MAGICS = (b'SQLite format 3', b'\x89MCAP')
 ROS1_SUFFIXES = ('.bag', '.bag.active')
 METADATA = 'metadata.yaml'
+
+_log = logging.getLogger(__name__)
+
+READ = (
+    f'a bag: a directory with {METADATA} or files ending in .mcap or .db3 (perhaps .zstd), or a '
+    f'.bag of ROS 1; or scans: files ending in {", ".join(SUFFIXES)}, a folder of them, or an '
+    'Ouster .pcap'
+)
+"""Formats of recordings, for errors."""
 
 
 def files_of(path: Path) -> list[Path]:
@@ -43,10 +58,7 @@ def files_of(path: Path) -> list[Path]:
     if not path.is_file():
         raise BagError(f'{path}: no such file or directory; expected a bag or scans')
     if not is_storage(path) and not is_ros1(path):
-        raise BagError(
-            f'{path}: not a bag; expected a rosbag2 directory, or a file ending in .mcap, .db3 '
-            '(perhaps .zstd) or .bag'
-        )
+        raise BagError(f'{path}: {path.suffix or "no ending"} is not read; expected {READ}')
     return [path]
 
 
@@ -61,13 +73,16 @@ def is_storage(path: Path) -> bool:
 
 
 def is_packed(path: Path) -> bool:
-    """Return whether a file is compressed as a whole."""
-    return path.suffix == PACKED_SUFFIX
+    """Return whether a file is compressed as a whole: by its first bytes, then by its name."""
+    with open(path, 'rb') as file:
+        head = file.read(16)
+    is_named = path.suffix in PACKED_SUFFIXES and not head.startswith(STORAGE_MAGICS)
+    return is_named or head.startswith(ZSTD_MAGIC)
 
 
 def unpacked_name(path: Path) -> str:
     """Return the name of a file without the suffix of packed files."""
-    return path.name.removesuffix(PACKED_SUFFIX)
+    return path.stem if path.suffix in PACKED_SUFFIXES else path.name
 
 
 def stated_counts(path: Path) -> dict[str, int]:
@@ -124,10 +139,35 @@ def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
         raise BagError(
             f'{directory / METADATA}: lists {", ".join(foreign)}, expected .mcap or .db3 files'
         )
-    missing = [file.name for file in files if not os.path.isfile(file)]
-    if missing:
-        raise BagError(f'{directory}: {", ".join(missing)} of its {METADATA} is missing')
-    return files
+    return files if all(map(os.path.isfile, files)) else replaced_files(directory, files)
+
+
+def replaced_files(directory: Path, files: list[Path]) -> list[Path]:
+    """
+    Return the files of a directory in place of listed ones that were unpacked, packed or renamed.
+
+    Raises
+    ------
+    BagError
+        If there are fewer or more of them.
+
+    """
+    present = [file for file in directory.iterdir() if is_storage(file)]
+    present = loose_files(directory) if present else present
+    by_name = {unpacked_name(file): file for file in present}
+    replaced = [by_name.get(unpacked_name(file)) for file in files]
+    if len(present) == len(files) and None in replaced:
+        replaced = [*present]
+    missing = ', '.join(file.name for file in files if not os.path.isfile(file))
+    if None in replaced:
+        rest = f'; without {METADATA} the rest is read: {", ".join(sorted(by_name))}'
+        raise BagError(
+            f'{directory}: {missing} of its {METADATA} is missing{rest if present else ""}'
+        )
+    chosen = [file for file in replaced if file is not None]
+    names = ', '.join(file.name for file in chosen)
+    _log.warning('%s: %s of its %s is missing; %s is read', directory, missing, METADATA, names)
+    return chosen
 
 
 def loose_files(directory: Path) -> list[Path]:
@@ -139,11 +179,11 @@ def loose_files(directory: Path) -> list[Path]:
     """
     files = [file for file in directory.iterdir() if is_storage(file) and file.is_file()]
     names = {file.name for file in files}
-    files = [file for file in files if not is_packed(file) or unpacked_name(file) not in names]
+    files = [f for f in files if f.name == unpacked_name(f) or unpacked_name(f) not in names]
     if not files:
-        raise BagError(
-            f'{directory}: not a bag: neither {METADATA} nor an .mcap or .db3 file in it'
-        )
+        endings = Counter(file.suffix for file in directory.iterdir() if file.is_file())
+        found = ', '.join(f'{n} {ending or "without ending"}' for ending, n in endings.items())
+        raise BagError(f'{directory}: files in it: {found or "none"}; expected {READ}')
     return sorted(files, key=by_number)
 
 

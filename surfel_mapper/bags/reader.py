@@ -25,21 +25,29 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 from surfel_mapper.bags._rosbags import (
     has_legal_names,
-    is_cdr,
     is_latched,
+    is_readable,
+    member_names,
+    serialization,
     type_name,
 )
 from surfel_mapper.bags.compression import import_zstd, unpack_file, ZSTD_MAGIC
 from surfel_mapper.bags.decoders import Decoders
-from surfel_mapper.bags.paths import files_of, is_packed, is_ros1, stated_counts, unpacked_name
+from surfel_mapper.bags.paths import files_of, is_packed, stated_counts, unpacked_name
 from surfel_mapper.bags.storage import damaged, described, open_storage, Storage, suffix
 from surfel_mapper.bags.streamed_mcap import StreamedMcap
 from surfel_mapper.bags.topics import CLOUD, SAME_AS, Topic, Topics
 from surfel_mapper.errors import BagError, SurfelMapperError
+from surfel_mapper.messages.livox import MEMBERS, parse_livox
 from surfel_mapper.messages.pointcloud2 import parse_cloud
 
 if TYPE_CHECKING:
     from surfel_mapper.bags._rosbags import Connection
+
+LIVOX_PARSERS = dict.fromkeys(
+    ('livox_ros_driver/msg/CustomMsg', 'livox_ros_driver2/msg/CustomMsg'), parse_livox
+)
+"""Decoder of the types of Livox's drivers."""
 
 MAX_NAMES = 12
 """Number of topics named in a message."""
@@ -83,13 +91,15 @@ class BagReader:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.is_ros1 = is_ros1(self.path) and not self.path.is_dir()
         self.cuts: list[str] = []
         self._latched: set[str] | None = None
+        self._whole: dict[frozenset[str], list[BagMessage]] = {}
         self._storages: list[tuple[Path, Storage]] = []
         with ExitStack() as files:
             self._open(files_of(self.path), files)
-            self.topics = Topics(self.path, self._indexed_topics())
+            readable = [c for c in self._connections() if is_readable(c)]
+            self.is_ros1 = {*map(serialization, readable)} == {'ros1'}
+            self.topics = Topics(self.path, self._indexed_topics(), self._cloud_types())
             if not any(topic.count for topic in self.topics):
                 raise BagError(f'{self.path}: a bag without messages')
             self._decoders = Decoders(self._connections, is_ros1=self.is_ros1)
@@ -153,6 +163,13 @@ class BagReader:
         if start_ns is None and stop_ns is None and not self.cuts:
             self._check_complete(read, names)
 
+    def all_messages(self, names: Collection[str]) -> list[BagMessage]:
+        """Return all messages of topics that have few, such as static transforms; read once."""
+        key = frozenset(names)
+        if key and key not in self._whole:
+            self._whole[key] = [*self.messages(names)]
+        return self._whole.get(key, [])
+
     def decode(self, message: BagMessage) -> Any:
         """
         Return a message as an object with the attributes of its ROS type.
@@ -165,8 +182,9 @@ class BagReader:
             If a message of another type cannot be read.
 
         """
-        if message.type == CLOUD:
-            return parse_cloud(message.raw, ros1=self.is_ros1, topic=message.topic)
+        parse = {CLOUD: parse_cloud, **LIVOX_PARSERS}.get(message.type)
+        if parse is not None:
+            return parse(message.raw, ros1=self.is_ros1, topic=message.topic)
         try:
             store, type_ = self._decoders.find(message.type)
             if self.is_ros1:
@@ -200,7 +218,8 @@ class BagReader:
         """Open the files of the bag; the last of several may be unreadable, as after a crash."""
         for number, path in enumerate(paths, 1):
             try:
-                file = self._unpacked(path, files) if is_packed(path) else path
+                is_plain = path.name == unpacked_name(path) and not is_packed(path)
+                file = path if is_plain else self._unpacked(path, files)
                 storage = open_storage(file, path)
             except BagError as error:
                 if number == 1 or number < len(paths):
@@ -220,10 +239,12 @@ class BagReader:
                 )
 
     def _unpacked(self, path: Path, files: ExitStack) -> Path:
-        """Return a packed file unpacked into a temporary directory."""
+        """Return a file unpacked into a temporary directory, or linked if it only has the name."""
         directory = files.enter_context(tempfile.TemporaryDirectory(prefix='surfel_mapper-'))
         target = Path(directory, unpacked_name(path))
-        if not unpack_file(path, target):
+        if not is_packed(path):
+            target.symlink_to(path.resolve())
+        elif not unpack_file(path, target):
             size = path.stat().st_size
             self.cuts.append(f'{path}: the compressed file is cut off at byte {size}')
         return target
@@ -253,6 +274,16 @@ class BagReader:
             for name, names in sorted(types.items())
         ]
 
+    def _cloud_types(self) -> tuple[str, ...]:
+        """Return the types that can be read as clouds: Livox's only if defined as it is read."""
+        livox = {
+            type_
+            for connection in self._connections()
+            if (type_ := type_name(connection)) in LIVOX_PARSERS
+            and member_names(connection, type_) == [*MEMBERS]
+        }
+        return (CLOUD, *sorted(livox))
+
     def _stream(
         self,
         path: Path,
@@ -262,7 +293,7 @@ class BagReader:
         stop_ns: int | None,
     ) -> Iterator[BagMessage]:
         """Yield the messages of one file; packed ones unpacked."""
-        wanted = [c for c in storage.connections if is_cdr(c) and has_legal_names(c)]
+        wanted = [c for c in storage.connections if is_readable(c) and has_legal_names(c)]
         if names is not None:
             wanted = [c for c in wanted if c.topic in names]
         if not wanted:
@@ -324,8 +355,8 @@ class BagReader:
             )
 
     def _check_complete(self, read: Counter[str], names: Collection[str] | None) -> None:
-        """Compare the number of messages read of each topic, if all are CDR, with the index."""
-        unread = {c.topic for c in self._connections() if not is_cdr(c)}
+        """Compare the number of messages read of each readable topic with the index."""
+        unread = {c.topic for c in self._connections() if not is_readable(c)}
         asked = [
             topic
             for topic in self.topics

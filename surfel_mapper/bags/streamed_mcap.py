@@ -169,14 +169,19 @@ class StreamedMcap:
         """Return rosbags' description of a channel."""
         channel = self._channels[key]
         schema = self._schemas.get(channel.schema_id)
+        name, definition = '', ('', '')
+        if schema is not None:
+            name, definition = schema.name, (schema.encoding, schema.data.decode(errors='replace'))
+        if channel.message_encoding == 'ros1' and '/msg/' not in name:
+            name = name.replace('/', '/msg/')
         return ros2_connection(
             key,
             channel.topic,
-            schema.name if schema else '',
+            name,
             self,
             encoding=channel.message_encoding,
             qos=channel.metadata.get('offered_qos_profiles', ''),
-            definition=(schema.encoding, schema.data.decode()) if schema else ('', ''),
+            definition=definition,
         )._replace(msgcount=self._counts[key])
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+import re
 
 from surfel_mapper.errors import BagError
 
@@ -20,10 +21,25 @@ IMAGE = 'sensor_msgs/msg/Image'
 PACKED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 POSE = 'geometry_msgs/msg/PoseStamped'
+POSE_WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 TF = 'tf2_msgs/msg/TFMessage'
 
 SAME_AS = {'tf/msg/tfMessage': TF}
 """Names of types in early ROS 1, and the type with the same content."""
+
+CONVERTERS = {
+    r'livox\w*/msg/CustomMsg$': 'livox_ros_driver2 publishes PointCloud2 with xfer_format 0',
+    r'velodyne_msgs/msg/VelodyneScan$': 'velodyne_transform_node of velodyne_pointcloud',
+    r'ouster\w*/msg/PacketMsg$': '`ros2 launch ouster_ros replay.launch.xml`',
+    r'(hesai|pandar)\w*/msg/': 'hesai_ros_driver, with packets of ROS as its source',
+    r'nebula_msgs/msg/': 'nebula_ros with launch_hw false',
+    r'rslidar\w*/msg/': 'rslidar_sdk with msg_source 2',
+    r'CompressedPointCloud2$': '`ros2 run point_cloud_transport republish`',
+    r'LaserScan$': 'laserscan_to_pointcloud_node of pointcloud_to_laserscan',
+    r'sensor_msgs/msg/PointCloud$': 'point_cloud_converter of pcl_ros',
+    r' as \w+$': 'the packages mcap-protobuf-support and mcap-ros2-support of Python',
+}
+"""Programs that make PointCloud2 of messages, by a regular expression of the type."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +52,21 @@ class Topic:
 
 
 class Topics(list[Topic]):
-    """The topics of the bag at a path, which errors name."""
+    """
+    The topics of the bag at a path, which errors name.
 
-    def __init__(self, path: Path, topics: Collection[Topic]) -> None:
+    Attributes
+    ----------
+    clouds : tuple of str
+        The types that can be read as clouds, PointCloud2 first.
+
+    """
+
+    def __init__(
+        self, path: Path, topics: Collection[Topic], clouds: tuple[str, ...] = (CLOUD,)
+    ) -> None:
         super().__init__(topics)
-        self.path = path
+        self.path, self.clouds = path, clouds
 
     def num_messages(self, names: Collection[str]) -> int:
         """Return the number of messages of the named topics by the index."""
@@ -49,6 +75,11 @@ class Topics(list[Topic]):
     def of_type(self, *types: str) -> list[str]:
         """Return the names of the topics of any of the types."""
         return [topic.name for topic in self if topic.type in types]
+
+    def choose_cloud(self, name: str | None = None) -> str:
+        """Return the topic of clouds to read; other types if named, or without PointCloud2."""
+        is_usual = name is None and self.of_type(CLOUD)
+        return self.choose(CLOUD, name, or_else=() if is_usual else self.clouds[1:])
 
     def choose_image(self, name: str | None = None) -> str:
         """
@@ -102,5 +133,20 @@ class Topics(list[Topic]):
             return found[0]
         if found:
             raise BagError(f'{self.path}: several topics to choose from, name one; {offers}')
-        every = ', '.join(topic.name for topic in self)
-        raise BagError(f'{self.path}: no topic of type {type_}; its topics: {every}')
+        every = ', '.join(f'{topic.name} ({topic.type})' for topic in self)
+        advice = '; '.join(converters(self)) if type_ == CLOUD else ''
+        raise BagError(
+            f'{self.path}: no topic of type {type_}; its topics: {every}'
+            f'{f"; to convert: {advice}" if advice else ""}'
+        )
+
+
+def converters(topics: Collection[Topic]) -> list[str]:
+    """Return the program that makes PointCloud2 of each type for which there is one."""
+    types = dict.fromkeys(topic.type for topic in topics)
+    return [
+        f'{type_}: {program}'
+        for type_ in types
+        for pattern, program in CONVERTERS.items()
+        if re.search(pattern, type_)
+    ]

@@ -18,6 +18,9 @@ map; Ctrl-C or SIGTERM ended the work.
 """
 
 
+MAX_COLUMNS = 64
+"""Limit of --bin-columns; points of data sets have up to ten numbers."""
+
 DIGITS = re.compile('[0-9]{1,18}')
 
 
@@ -77,6 +80,23 @@ def seconds(text: str) -> float:
     if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f'{text!r}, expected seconds, zero or more')
     return value
+
+
+def add_bin_columns(parser: argparse._ActionsContainer) -> None:
+    """Declare --bin-columns."""
+    parser.add_argument(
+        '--bin-columns',
+        type=bin_columns,
+        metavar='N',
+        help='numbers a point of .bin files, x y z and further ones (default: by their values)',
+    )
+
+
+def bin_columns(text: str) -> int:
+    """Return a number of columns, x y z at least."""
+    if not DIGITS.fullmatch(text) or not 3 <= int(text) <= MAX_COLUMNS:
+        raise argparse.ArgumentTypeError(f'{text!r}, expected 3 to {MAX_COLUMNS}')
+    return int(text)
 
 
 def add_overwrite(parser: argparse._ActionsContainer) -> None:

@@ -61,14 +61,14 @@ class Lines:
 
     def show(self, done: int, total: int) -> None:
         """Print the progress, if the last line is old enough."""
-        now = time.monotonic()
+        clock_s = time.monotonic()
         if self._start is None:
-            self._start, self._last = (now, done), now
-        start, before = self._start
-        if now - self._last < EVERY_S or done == before:
+            self._start, self._last = (clock_s, done), clock_s
+        start, first_done = self._start
+        if clock_s - self._last < EVERY_S or done == first_done:
             return
-        self._last = now
-        rate = (done - before) / (now - start)
+        self._last = clock_s
+        rate = (done - first_done) / (clock_s - start)
         left_s = max(total - done, 0) / rate
         print(
             f'surfel-mapper {self._verb}: {done} of {max(total, done)} {self._unit}s, '
@@ -97,11 +97,11 @@ def stopped_by_interrupt() -> Iterator[Callable[[], bool]]:
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(noted)
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
 
 
@@ -114,25 +114,25 @@ def interrupted_by_sigterm(*, ends_process: bool = False) -> Iterator[None]:
     not interrupt the removal. If the first ends the process, later ones are ignored after the
     block too: they would replace the exit code. Outside of the main thread nothing changes.
     """
-    before: dict[int, Any] = {}
+    handlers: dict[int, Any] = {}
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if not swallows(frame):
             raise KeyboardInterrupt
-        before.setdefault(signal.SIGALRM, signal.signal(signal.SIGALRM, interrupt))
+        handlers.setdefault(signal.SIGALRM, signal.signal(signal.SIGALRM, interrupt))
         signal.setitimer(signal.ITIMER_REAL, RETRY_S)
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before[signal.SIGTERM] = signal.signal(signal.SIGTERM, interrupt)
+    handlers[signal.SIGTERM] = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
     finally:
         if ends_process and signal.getsignal(signal.SIGTERM) is signal.SIG_IGN:
-            del before[signal.SIGTERM]
-        if signal.SIGALRM in before:
+            del handlers[signal.SIGTERM]
+        if signal.SIGALRM in handlers:
             signal.setitimer(signal.ITIMER_REAL, 0)
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)

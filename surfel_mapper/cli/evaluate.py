@@ -27,9 +27,6 @@ SUMMARY = 'Compare a map with the truth or another map, or a trajectory with ano
 
 EXAMPLE = 'surfel-mapper evaluate street_surfels --truth street'
 
-TRAJECTORIES = ('.tum', '.txt', '.csv', '.kitti')
-"""Endings of trajectories."""
-
 DEFAULT_M = 0.5
 """Default of --max-distance and --radius for maps without a voxel size, m."""
 
@@ -90,7 +87,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare and report."""
-    is_trajectory = args.map.suffix in TRAJECTORIES
+    from surfel_mapper.files.trajectory import SUFFIXES
+
+    is_trajectory = args.map.suffix.lower() in SUFFIXES
     result = finite_or_none(trajectories(args) if is_trajectory else maps(args))
     content = {'map': str(args.map), 'truth': str(args.truth), **result}
     lines = trajectory_lines(result) if is_trajectory else map_lines(result)
@@ -116,9 +115,9 @@ def maps(args: argparse.Namespace) -> dict[str, Any]:
     if is_world(args.truth):
         truth = load_truth(args.truth)
     else:
-        other = load_discs(args.truth, args.min_points)
-        truth = CloudTruth(other)
-        digests = compared_digests(surfels, other)
+        reference = load_discs(args.truth, args.min_points)
+        truth = CloudTruth(reference)
+        digests = compared_digests(surfels, reference)
     size_m = surfels.voxel_size_m or DEFAULT_M
     max_distance_m = args.max_distance or size_m
     motion = None
@@ -134,11 +133,11 @@ def maps(args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def compared_digests(surfels: Discs, other: Discs) -> dict[str, Any]:
+def compared_digests(surfels: Discs, reference: Discs) -> dict[str, Any]:
     """Return whether two maps are equal to the bit, if both are exact."""
-    if surfels.digest is None or other.digest is None:
+    if surfels.digest is None or reference.digest is None:
         return {}
-    return {'equal': surfels.digest == other.digest}
+    return {'equal': surfels.digest == reference.digest}
 
 
 def map_lines(result: dict[str, Any]) -> list[str]:

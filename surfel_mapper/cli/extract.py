@@ -165,27 +165,27 @@ def exact_map(path: Path) -> Path:
     from surfel_mapper.errors import FileFormatError
     from surfel_mapper.files.latest_map import EXACT, map_in
 
-    found = map_in(path, EXACT) if path.is_dir() else path
-    if found is None:
+    map_path = map_in(path, EXACT) if path.is_dir() else path
+    if map_path is None:
         raise FileFormatError(
             f'{path}: no map.npz, map.parquet or map/tile_i=*/tile_j=*/ in this directory'
         )
-    return found
+    return map_path
 
 
-def figures(model: MultiModel, found: Any, num_points: int) -> dict[str, Any]:
+def figures(model: MultiModel, evaluation: Any, num_points: int) -> dict[str, Any]:
     """Return the figures of the report; None for undefined ones."""
     values = {
         'points': num_points,
         'thinned': model.num_thinned,
-        'planes': found.num_planes,
-        'surfaces': found.num_surfaces,
-        'gaussians': found.num_gaussians,
-        'bytes': found.size_bytes,
-        'compression': found.compression,
-        'precision_rms_m': found.precision_rms_m,
-        'completeness_rms_m': found.completeness_rms_m,
-        'coverage': found.coverage,
+        'planes': evaluation.num_planes,
+        'surfaces': evaluation.num_surfaces,
+        'gaussians': evaluation.num_gaussians,
+        'bytes': evaluation.size_bytes,
+        'compression': evaluation.compression,
+        'precision_rms_m': evaluation.precision_rms_m,
+        'completeness_rms_m': evaluation.completeness_rms_m,
+        'coverage': evaluation.coverage,
     }
     return {name: None if value != value else value for name, value in values.items()}
 

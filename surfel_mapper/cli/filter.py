@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import add_overwrite
+from surfel_mapper.cli._arguments import add_bin_columns, add_overwrite
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._settings import add_settings, configured
 from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
@@ -50,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest='topics',
         help='of a bag: filter the clouds of this topic only; may be repeated',
     )
+    add_bin_columns(parser)
     add_settings(
         parser,
         'configuration whose frames.base_to_sensor is the pose of the sensor on the robot',
@@ -75,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
             args.output,
             topics=args.topics,
             T_base_sensor=pose_matrix(mount[:3], mount[3:]) if mount else None,
+            bin_columns=args.bin_columns,
             overwrite=args.overwrite,
             show=show,
         )

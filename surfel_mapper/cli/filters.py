@@ -32,8 +32,8 @@ def run(args: argparse.Namespace) -> int:
     """List the filters."""
     from surfel_mapper.filters.registry import all_filters, find
 
-    found = [find(name) for name in args.names] or all_filters()
-    listed = [as_mapping(cls) for cls in found]
+    classes = [find(name) for name in args.names] or all_filters()
+    listed = [as_mapping(cls) for cls in classes]
     print(json.dumps(listed) if args.json else '\n\n'.join(map(described, listed)))
     return 0
 
@@ -48,15 +48,15 @@ def as_mapping(cls: type[Filter]) -> dict[str, Any]:
         'meaning': (inspect.getdoc(cls) or '').partition('\n')[0],
         'parameters': [
             {
-                'name': each.name,
-                'libpointmatcher': each.libpointmatcher,
-                'type': each.kind,
-                'default': plain(each.default),
-                'libpointmatcher_default': plain(each.libpointmatcher_default),
-                'allowed': each.allowed,
-                'meaning': each.meaning,
+                'name': setting.name,
+                'libpointmatcher': setting.libpointmatcher,
+                'type': setting.kind,
+                'default': plain(setting.default),
+                'libpointmatcher_default': plain(setting.libpointmatcher_default),
+                'allowed': setting.allowed,
+                'meaning': setting.meaning,
             }
-            for each in settings_of(cls)
+            for setting in settings_of(cls)
         ],
     }
 
@@ -65,14 +65,14 @@ def described(content: dict[str, Any]) -> str:
     """Return a filter for people: a line about it, and below one for each parameter."""
     libpointmatcher = f' ({content["libpointmatcher"]})' if content['libpointmatcher'] else ''
     lines = [f'{content["name"]}{libpointmatcher}', *textwrap.wrap(content['meaning'], WIDTH - 2)]
-    for each in content['parameters']:
-        name = f'{each["name"]} ({each["libpointmatcher"]})' if libpointmatcher else each['name']
+    for item in content['parameters']:
+        name = f'{item["name"]} ({item["libpointmatcher"]})' if libpointmatcher else item['name']
         name = name.removesuffix(' ()')
-        default = each['default'] or "''"
-        if libpointmatcher and each['libpointmatcher_default'] != each['default']:
-            default += f' ({each["libpointmatcher_default"]} under the other name)'
-        allowed = f' in {each["allowed"]}' if each['allowed'].startswith('[') else ''
-        choices = f' of {each["allowed"]}' if each['allowed'] and not allowed else ''
-        line = f'{name}: {default}, {each["type"]}{allowed}{choices}. {each["meaning"]}'
+        default = item['default'] or "''"
+        if libpointmatcher and item['libpointmatcher_default'] != item['default']:
+            default += f' ({item["libpointmatcher_default"]} under the other name)'
+        allowed = f' in {item["allowed"]}' if item['allowed'].startswith('[') else ''
+        choices = f' of {item["allowed"]}' if item['allowed'] and not allowed else ''
+        line = f'{name}: {default}, {item["type"]}{allowed}{choices}. {item["meaning"]}'
         lines += textwrap.wrap(line, WIDTH - 4, initial_indent='  ', subsequent_indent='      ')
     return '\n  '.join(lines)

@@ -17,7 +17,7 @@ import json
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import CUT
+from surfel_mapper.cli._arguments import add_bin_columns, CUT
 from surfel_mapper.cli._output import printable, show_lines
 from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
 from surfel_mapper.errors import escaped
@@ -38,17 +38,18 @@ CHOICE = ('poses_from', 'poses_reason', 'deskewed', 'deskew_reason')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument(
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument(
         'bag',
         type=Path,
         metavar='BAG',
         nargs='?',
         help='rosbag2 directory, .mcap, .db3, ROS 1 .bag, or directory or file of scans',
     )
-    what.add_argument(
+    source.add_argument(
         '--parameters', action='store_true', help='print all settings of node and replay instead'
     )
+    add_bin_columns(parser)
     parser.add_argument('--json', action='store_true', help='print as JSON')
     parser.add_argument(
         '--strict', action='store_true', help='exit with 3 if the bag is cut off or damaged'
@@ -68,22 +69,24 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.offline.survey import offers, survey, surveyed_topics
 
     if is_scans(args.bag):
-        content = folder_content(args.bag)
+        content = folder_content(args.bag, args.bin_columns)
         show_lines(json.dumps(content) if args.json else folder_report(printable(content)))
         return 0
     with BagReader(args.bag) as reader:
         total = reader.topics.num_messages(surveyed_topics(reader))
         read = itertools.count(1)
         with shown_progress(args, 'message') as show:
-            found = survey(reader, lambda: show(next(read), total))
-        made = offers(found)
-        content = {**as_mapping(reader, found, made), 'replay': chosen(args.bag)}
+            surveyed = survey(reader, lambda: show(next(read), total))
+        made = offers(surveyed)
+        content = {**as_mapping(reader, surveyed, made), 'replay': chosen(args.bag)}
     show_lines(json.dumps(content) if args.json else report(printable(content), made))
     return CUT if args.strict and content['cut'] else 0
 
 
-def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str, Any]:
+def as_mapping(reader: BagReader, survey: Survey, made: list[Offer]) -> dict[str, Any]:
     """Return the survey as plain values."""
+    from surfel_mapper.offline.clocks import clock_offsets
+
     return {
         'bag': str(reader.path),
         'format': 'ROS 1' if reader.is_ros1 else 'ROS 2',
@@ -92,16 +95,20 @@ def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str,
         'topics': [
             {
                 'topic': name,
-                'type': seen.topic.type,
-                'messages': seen.topic.count,
-                'rate_hz': seen.rate_hz,
-                'frames': seen.frames,
+                'type': summary.topic.type,
+                'messages': summary.topic.count,
+                'rate_hz': summary.rate_hz,
+                'frames': summary.frames,
             }
-            for name, seen in found.topics.items()
+            for name, summary in survey.topics.items()
         ],
-        'undecodable': found.undecodable,
+        'undecodable': survey.undecodable,
         'cut': list(reader.cuts),
         'poses': [dataclasses.asdict(offer) for offer in made],
+        'clock_offsets': [
+            {**dataclasses.asdict(clock), 'text': str(clock)}
+            for clock in clock_offsets(survey, reader.topics.of_type(*reader.topics.clouds))
+        ],
     }
 
 
@@ -117,11 +124,13 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
     lines += [f'damaged: {cut}' for cut in content['cut']]
     if content['undecodable']:
         lines.append(f'{content["undecodable"]} messages of clouds or poses are damaged')
+    lines += [f'clocks: {clock["text"]}' for clock in content['clock_offsets']]
+    is_choice = len({offer.clouds for offer in made}) > 1
     for clouds in dict.fromkeys(offer.clouds for offer in made):
         with_a_pose = f'clouds of {clouds} with a pose, and the settings for --config:'
         lines += ['', escaped(with_a_pose)]
         for offer in made:
-            lines += offered(offer) if offer.clouds == clouds else []
+            lines += offered(offer, is_choice) if offer.clouds == clouds else []
     if not made:
         lines += ['', 'no poses; if the clouds are in a fixed frame, use --poses-from identity']
     lines += ['', replay_line(content['replay'])] if content['replay'] else []
@@ -146,34 +155,34 @@ def chosen(path: Path) -> dict[str, Any]:
 
     try:
         with open_recording(Request(path=path), Config()) as recording:
-            found = recording.describe()
+            description = recording.describe()
     except BagError:  # several topics of clouds, or none: a topic has to be named
         return {}
-    return {name: found[name] for name in CHOICE}
+    return {name: description[name] for name in CHOICE}
 
 
-def folder_content(path: Path) -> dict[str, Any]:
+def folder_content(path: Path, bin_columns: int | None) -> dict[str, Any]:
     """Return the number, times and columns of scans in files as plain values."""
     from surfel_mapper.config import Config
     from surfel_mapper.errors import FileFormatError
     from surfel_mapper.offline.request import Request
     from surfel_mapper.offline.scan_folder import ScanFolder
 
-    folder = ScanFolder(Request(path=path), Config(), None)
+    folder = ScanFolder(Request(path=path, bin_columns=bin_columns), Config(), None)
     first = folder.first_scan()
     if first is None:
         raise FileFormatError(folder.first_error)
-    found = folder.describe()
+    description = folder.describe()
     return {
         'bag': str(path),
         'format': folder.format,
         'scans': len(folder.files),
         'seconds': folder.recorded_s,
-        'times_from': found['times_from'],
+        'times_from': description['times_from'],
         'points': len(first),
         'columns': sorted(first.columns),
         'damaged': [folder.first_error] if folder.first_error else [],
-        'replay': {name: found[name] for name in CHOICE},
+        'replay': {name: description[name] for name in CHOICE},
     }
 
 
@@ -211,8 +220,8 @@ def table(topics: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-def offered(offer: Offer) -> list[str]:
-    """Return the number of clouds with a pose from a source, and the settings to use it."""
+def offered(offer: Offer, is_choice: bool) -> list[str]:
+    """Return the number of clouds with a pose from a source, and how to use it."""
     import yaml
 
     from surfel_mapper.config import Config
@@ -225,7 +234,8 @@ def offered(offer: Offer) -> list[str]:
             stages.setdefault(stage, {})[key] = value
     text = yaml.safe_dump(stages, default_flow_style=None, sort_keys=False, width=1000)
     fixed = offer.settings['frames.fixed']
-    lines = [f'  {offer.poses}: {offer.covered} of {offer.total}, in the frame {fixed}']
+    options = f' (--topic {offer.clouds} --pose-topic {offer.poses})' if is_choice else ''
+    lines = [f'  {offer.poses}: {offer.covered} of {offer.total}, in the frame {fixed}{options}']
     if offer.missing:
         lines.append(f'    {offer.missing}')
     return [*map(escaped, lines), *(f'      {line}' for line in text.splitlines())]

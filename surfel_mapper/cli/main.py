@@ -9,9 +9,9 @@ loads no ROS. A verb prints its result on stdout and everything else on stderr. 
 --ros-args are ``args.ros_args``. Modules with a leading underscore are shared by verbs.
 
 Exit code 0: done; 1: refused, with a message; 2: usage, also of no verb at all; 3: done, but the
-bag is cut off, with --strict; 4: done, but some scans have no certain place on the map, or their
-surroundings seem to move along; 130: interrupted, by Ctrl-C or SIGTERM alike, as a replay writes
-its map after both. A page of ``view`` and the node end with 0 then.
+bag is cut off, with --strict; 4: done, but the map is in doubt or lacks over 5 % of the scans;
+130: interrupted, by Ctrl-C or SIGTERM alike, as a replay writes its map after both. A page of
+``view`` and the node end with 0 then.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@
 Ctrl-C or SIGTERM ends the recording early, and the scans mapped until then are written; Ctrl-C
 pressed again ends at once. Several bags, --workers and --scheduler map parts that are added up.
 
-Exit code 3: done, but the recording is cut off and --strict was given. 4: done, but registration
-could not place some scans on the map, which became maps of their own, or the surroundings seem to
-move along.
+Exit code 3: done, but the recording is cut off and --strict was given. 4: done, but the map is in
+doubt: less than 95 % of the scans are in it, registration could not place some scans, or their
+surroundings seem to move along. The last lines say which, with counts by cause.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.arguments import is_unit
 from surfel_mapper.cli._arguments import (
+    add_bin_columns,
     add_formats,
     add_overwrite,
     add_workers,
@@ -56,6 +57,9 @@ SUMMARY = 'Map a bag, or a folder of scans, and write the map, a picture and fig
 
 EXAMPLE = 'surfel-mapper replay street.mcap --config my.yaml --voxel-size 0.2 -o street/ --open'
 
+LARGEST_OFFSET_S = 1e10
+"""Limit of an offset of clocks, s: the bound of input.time_offset_s."""
+
 ONE_PROCESS = ('window', 'align', 'view', 'rrd')
 """Options that ask for all scans in order, in one process."""
 
@@ -86,7 +90,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_input_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options for input."""
-    add = parser.add_argument_group('input').add_argument
+    group = parser.add_argument_group('input')
+    add = group.add_argument
     add(
         '--topic',
         action='append',
@@ -103,6 +108,14 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add('--pose-topic', metavar='TOPIC', help='topic of the poses (/tf, /odom or /pose)')
     add(
+        '--static-topic',
+        action='append',
+        default=[],
+        metavar='TOPIC',
+        help='topic of static transforms (default: every tf_static in the namespaces of the '
+        'clouds and poses); repeatable',
+    )
+    add(
         '--poses-from',
         choices=('auto', 'tf', 'odometry', 'pose', 'file', 'registration', 'identity'),
         help='source of the poses (default: pose.source of the configuration); auto is the first '
@@ -116,12 +129,22 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         '--poses-format',
-        choices=('tum', 'kitti', 'csv'),
+        choices=('tum', 'kitti', 'csv', 'g2o'),
         help='its format (default: recognised by its first line)',
+    )
+    add(
+        '--time-offset',
+        action='append',
+        default=[],
+        type=time_offset,
+        metavar='[TOPIC=]S',
+        help='add S seconds to the stamps of the clouds, of a topic or of all '
+        '(input.time_offset_s), whose clock differs from that of the poses; repeatable',
     )
     add('--start', type=seconds, default=0.0, metavar='S', help='leave out the first S seconds')
     add('--duration', type=positive_float, default=math.inf, metavar='S', help='map S seconds')
     add('--every', type=positive_int, default=1, metavar='N', help='map one cloud of every N')
+    add_bin_columns(group)
     add(
         '--window',
         action='store_true',
@@ -171,12 +194,24 @@ def mount(text: str) -> tuple[str, tuple[float, ...]]:
     return topic, numbers
 
 
+def time_offset(text: str) -> tuple[str, float]:
+    """Return topic and seconds of TOPIC=S; an empty topic stands for all."""
+    topic, _, number = text.rpartition('=')
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= LARGEST_OFFSET_S:
+        raise argparse.ArgumentTypeError(f'{text!r}, expected seconds, or TOPIC=SECONDS')
+    return topic, value
+
+
 def run(args: argparse.Namespace) -> int:
     """Map one recording or many, and report."""
     if (args.poses_from == 'file') != (args.poses is not None) and args.poses_from is not None:
-        found = 'no --poses' if args.poses is None else f'--poses {args.poses}'
+        poses = 'no --poses' if args.poses is None else f'--poses {args.poses}'
         raise UsageError(
-            f'--poses-from {args.poses_from} and {found}: expected both `--poses-from file` and '
+            f'--poses-from {args.poses_from} and {poses}: expected both `--poses-from file` and '
             '`--poses FILE` for a file of poses, else no --poses'
         )
     is_many = len(args.bags) > 1 or args.workers is not None or args.scheduler is not None
@@ -209,8 +244,8 @@ def replay_one(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     chosen = replay_options(args)
     request = request_of(args, args.bags[0])
     config = with_filters(args)
-    others = {'--poses-out': args.poses_out, '--rrd': args.rrd}
-    check_distinct(request.path, args.output, chosen.formats, others)
+    outputs = {'--poses-out': args.poses_out, '--rrd': args.rrd}
+    check_distinct(request.path, args.output, chosen.formats, outputs)
     return replay(request, output=args.output, config=config, options=chosen, **options)
 
 
@@ -232,10 +267,10 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     """Map recordings into one map, with the workers that were asked for."""
     from surfel_mapper.offline.replay import all_scans
 
-    given = [name for name in ONE_PROCESS if getattr(args, name)]
-    if given:
+    refused = [name for name in ONE_PROCESS if getattr(args, name)]
+    if refused:
         raise UsageError(
-            f'--{given[0]}: not with several bags, --workers or --scheduler, where no process '
+            f'--{refused[0]}: not with several bags, --workers or --scheduler, where no process '
             'maps all scans in order'
         )
     config = with_filters(args).replace(all_scans())
@@ -256,6 +291,8 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
 def with_filters(args: argparse.Namespace) -> Config:
     """Return the configuration that the arguments ask for, with its filters."""
     config = configured(args)
+    for topic, value in args.time_offset:
+        config = config if topic else config.replace({'input.time_offset_s': value})
     return config if args.filters is None else config.replace({'filters': args.filters})
 
 
@@ -265,11 +302,14 @@ def request_of(args: argparse.Namespace, bag: Path) -> Request:
         path=bag,
         topics=tuple(args.topic),
         pose_topic=args.pose_topic,
+        static_topics=tuple(args.static_topic),
         poses=args.poses,
         poses_format=args.poses_format,
         poses_from=args.poses_from,
         mounts=dict(args.mount),
+        time_offsets={topic: value for topic, value in args.time_offset if topic},
         start_s=args.start,
         duration_s=args.duration,
         every=args.every,
+        bin_columns=args.bin_columns,
     )

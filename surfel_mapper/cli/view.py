@@ -26,6 +26,7 @@ from surfel_mapper.errors import escaped
 
 if TYPE_CHECKING:
     from surfel_mapper.viz.contents import Content
+    from surfel_mapper.viz.gltf import GltfScene
     from surfel_mapper.viz.scene import Scene
 
 SUMMARY = 'Show maps, clouds, meshes, models, trajectories, bags or a running node.'
@@ -77,6 +78,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument('--browser', action='store_true', help='serve a page until Ctrl-C')
     where.add_argument('--rrd', type=Path, metavar='FILE', help='write a file for rerun instead')
+    where.add_argument(
+        '--glb', type=Path, metavar='FILE', help='write glTF instead, for Blender and web pages'
+    )
     add(
         '--port',
         type=page_port,
@@ -111,15 +115,19 @@ def shown(args: argparse.Namespace) -> int:
 
     if bool(args.what) == (args.live is not None):
         raise UsageError('expected WHAT to show, or --live')
-    if args.rrd is not None:
-        check_free(args.rrd, args.overwrite)
+    for path in filter(None, (args.rrd, args.glb)):
+        check_free(path, args.overwrite)
     if args.live is not None:
+        if args.glb is not None:
+            raise UsageError('--glb writes what files hold, not a live node')
         refuse_settings(args)
         show_live(args)
         return 0
+    many = len(args.what) > 1
     recordings = [path for path in args.what if path.exists() and not is_shown(path)]
-    if recordings and len(args.what) > 1:
-        raise UsageError(f'{recordings[0]}: a recording is shown alone')
+    if recordings and (many or args.glb is not None):
+        reason = 'a recording is shown alone' if many else 'for --glb map it with replay first'
+        raise UsageError(f'{recordings[0]}: {reason}')
     if recordings:
         with opened(args) as scene:
             announce(scene)
@@ -139,7 +147,7 @@ def refuse_settings(args: argparse.Namespace) -> None:
 
 
 def show_files(args: argparse.Namespace) -> None:
-    """Read files, show them, and wait if there is a page to serve."""
+    """Read files, show them or write them as glTF, and wait if there is a page to serve."""
     from surfel_mapper.viz.contents import contents
     from surfel_mapper.viz.server import import_rerun
 
@@ -148,10 +156,15 @@ def show_files(args: argparse.Namespace) -> None:
     def read() -> list[Content]:
         names = [path.resolve().name if many and path.is_dir() else '' for path in args.what]
         pairs = zip(args.what, names, strict=True)
-        return [each for path, name in pairs for each in contents(path, name)]
+        return [content for path, name in pairs for content in contents(path, name)]
 
     with ThreadPoolExecutor(1) as reader:  # a large map takes longer to read than rerun to start
         reading = reader.submit(read)
+        if args.glb is not None:
+            from surfel_mapper.viz.gltf import GltfScene
+
+            show_all(GltfScene(args.glb), reading.result(), args)
+            return
         import_rerun()
         if args.rrd is not None or reading.done():
             reading.result()  # if it is refused, nothing is opened and no file overwritten
@@ -162,13 +175,15 @@ def show_files(args: argparse.Namespace) -> None:
                 scene.wait()
 
 
-def show_all(scene: Scene, found: Sequence[Content], args: argparse.Namespace) -> None:
+def show_all(
+    scene: Scene | GltfScene, contents: Sequence[Content], args: argparse.Namespace
+) -> None:
     """Show contents as the arguments ask for, and print a sentence about each."""
     from surfel_mapper.viz.show import show_contents
 
     about = show_contents(
         scene,
-        found,
+        contents,
         colouring=args.color,
         target=args.at,
         most_discs=args.discs,

@@ -102,43 +102,43 @@ class CommonFrame:
             The counts of the scans that were mapped in the common frame.
 
         """
-        parts = [
-            {**part, 'map': f'{each.directory.name}/apart_{number}'}
-            for each in self.placed
-            for number, part in enumerate(each.registration['apart'], start=1)
+        apart = [
+            {**entry, 'map': f'{recording.directory.name}/apart_{number}'}
+            for recording in self.placed
+            for number, entry in enumerate(recording.registration['apart'], start=1)
         ]
         dropped, received = Counter(scans['dropped']), scans['received']
-        for each, reason in self.apart:
-            parts.append(
+        for recording, reason in self.apart:
+            apart.append(
                 {
-                    'scans': each.scans['mapped'],
-                    'first_s': each.first_s,
-                    'last_s': each.last_s,
-                    'reason': f'{each.request.path.name}: {reason}',
-                    'map': each.directory.name,
+                    'scans': recording.scans['mapped'],
+                    'first_s': recording.first_s,
+                    'last_s': recording.last_s,
+                    'reason': f'{recording.request.path.name}: {reason}',
+                    'map': recording.directory.name,
                 }
             )
-            dropped.update(each.scans['dropped'])
-            dropped['apart'] += each.scans['mapped']
-            received += each.scans['received']
-        everyone = [*self.placed, *(each for each, _ in self.apart)]
+            dropped.update(recording.scans['dropped'])
+            dropped['apart'] += recording.scans['mapped']
+            received += recording.scans['received']
+        everyone = [*self.placed, *(recording for recording, _ in self.apart)]
         return {
             'poses_from': 'registration',
             'poses_reason': f'{len(everyone)} recordings without poses, each registered alone and '
             'placed on the others',
             'scans': {**scans, 'received': received, 'dropped': dict(dropped)},
             'registration': {
-                'recordings': [self._description(each) for each in everyone],
-                'apart': parts,
-                'parts_apart': len(parts),
+                'recordings': [self._description(recording) for recording in everyone],
+                'apart': apart,
+                'parts_apart': len(apart),
             },
         }
 
-    def _description(self, each: Registered) -> dict[str, Any]:
+    def _description(self, recording: Registered) -> dict[str, Any]:
         """Return path, map and motion of a recording."""
-        found = {'path': str(each.request.path), 'map': each.directory.name}
-        motion = next((motion for one, motion in self.motions if one is each), None)
-        return found if motion is None else {**found, 'motion': motion.summary()}
+        description = {'path': str(recording.request.path), 'map': recording.directory.name}
+        motion = next((motion for owner, motion in self.motions if owner is recording), None)
+        return description if motion is None else {**description, 'motion': motion.summary()}
 
 
 def register(task: tuple[Request, Config, Path, bool | None]) -> Registered:
@@ -156,27 +156,27 @@ def register(task: tuple[Request, Config, Path, bool | None]) -> Registered:
 
     """
     request, config, directory, align = task
-    found = replay(
+    result = replay(
         replace(request, poses_from='registration'),
         output=directory,
         config=config,
         options=ReplayOptions(formats=('npz',), align=align, overwrite=True),
     )
-    stamps_ns, poses = beyond_the_end(found.trajectory.stamps_ns, found.trajectory.of_body)
+    stamps_ns, poses = beyond_the_end(result.trajectory.stamps_ns, result.trajectory.of_body)
     write_tum(directory / POSES, stamps_ns, poses)
     settings = {
         'pose.source': 'pose',
-        'frames.base': found.summary['registration']['body'],
-        'deskew.enabled': found.mapper.config.deskew.enabled,
+        'frames.base': result.summary['registration']['body'],
+        'deskew.enabled': result.mapper.config.deskew.enabled,
     }
     return Registered(
         request=replace(request, poses=directory / POSES, poses_format='tum', poses_from='file'),
         config=config.replace(settings),
         directory=directory,
-        first_s=found.trajectory.stamps_ns[0] / 1e9,
-        last_s=found.trajectory.stamps_ns[-1] / 1e9,
-        scans=found.summary['scans'],
-        registration=found.summary['registration'],
+        first_s=result.trajectory.stamps_ns[0] / 1e9,
+        last_s=result.trajectory.stamps_ns[-1] / 1e9,
+        scans=result.summary['scans'],
+        registration=result.summary['registration'],
     )
 
 
@@ -191,13 +191,13 @@ def beyond_the_end(
     return [*stamps_ns, next_ns], np.concatenate([poses, last[None]])
 
 
-def in_one_frame(found: Sequence[Registered]) -> CommonFrame:
+def in_one_frame(recordings: Sequence[Registered]) -> CommonFrame:
     """
-    Place recordings on each other, and write their poses anew in the frame of the first.
+    Place recordings on each other, and rewrite their poses in the frame of the first.
 
     Parameters
     ----------
-    found : sequence of Registered
+    recordings : sequence of Registered
         Each in a frame of its own.
 
     Raises
@@ -206,47 +206,47 @@ def in_one_frame(found: Sequence[Registered]) -> CommonFrame:
         If a map or its poses cannot be read or written.
 
     """
-    first, *others = found
+    first, *later = recordings
     whole = discs_of(first)
     placed, motions = [first], []
-    waiting = [(each, '') for each in others]
+    waiting = [(recording, '') for recording in later]
     num_placed = 0
     while waiting and num_placed < len(placed):  # a map just placed may reach the others
         num_placed, tried, waiting = len(placed), waiting, []
-        for each, _ in tried:
-            discs = discs_of(each)
-            width_m = each.config.map.voxel_size_m
+        for recording, _ in tried:
+            discs = discs_of(recording)
+            width_m = recording.config.map.voxel_size_m
             try:
                 motion = find_motion(discs, CloudTruth(whole), {}, width_m)
             except AlignmentError as error:
-                waiting.append((each, str(error)))
+                waiting.append((recording, str(error)))
                 continue
-            move_poses(each.directory / POSES, motion)
+            move_poses(recording.directory / POSES, motion)
             whole = joined(whole, moved_discs(discs, motion.T_truth_map))
-            placed.append(each)
-            motions.append((each, motion))
-    for each, reason in waiting:
+            placed.append(recording)
+            motions.append((recording, motion))
+    for recording, reason in waiting:
         log.warning(
-            '%s could not be placed on the other recordings: %s', each.request.path, reason
+            '%s could not be placed on the other recordings: %s', recording.request.path, reason
         )
     return CommonFrame(placed=placed, apart=waiting, motions=motions)
 
 
-def discs_of(each: Registered) -> Discs:
+def discs_of(recording: Registered) -> Discs:
     """Return the map of a recording."""
-    return load_discs(each.directory / 'map.npz', each.config.map.min_points)
+    return load_discs(recording.directory / 'map.npz', recording.config.map.min_points)
 
 
 def move_poses(path: Path, motion: FrameMotion) -> None:
     """Move the poses in a file."""
-    found = Trajectory.load(path)
-    if found.stamp_ns is not None:  # TUM has stamps
-        write_tum(path, found.stamp_ns, motion.T_truth_map @ found.matrices)
+    trajectory = Trajectory.load(path)
+    if trajectory.stamp_ns is not None:  # TUM has stamps
+        write_tum(path, trajectory.stamp_ns, motion.T_truth_map @ trajectory.matrices)
 
 
 def joined(first: Discs, second: Discs) -> Discs:
     """Return the discs of two maps in one frame."""
-    normals = [each.normal for each in (first, second) if each.normal is not None]
+    normals = [discs.normal for discs in (first, second) if discs.normal is not None]
     return replace(
         first,
         position=np.concatenate([first.position, second.position]),

@@ -107,12 +107,12 @@ def map_bags(
     """
     total = MappedBags(Mapper(bags[0][0].config.replace({'pose.source': 'identity'})))
     unfinished: dict[int, dict[int, ShardResult]] = {bag: {} for bag in range(len(bags))}
-    places = [(bag, place) for bag, shards in enumerate(bags) for place in range(len(shards))]
+    indices = [(bag, index) for bag, shards in enumerate(bags) for index in range(len(shards))]
     tasks = [shard for shards in bags for shard in shards]
     for number, result in workers.run(map_shard, tasks, stopped):
         on_done(result.recorded_s)
-        bag, place = places[number]
-        unfinished[bag][place] = result
+        bag, index = indices[number]
+        unfinished[bag][index] = result
         results = leading(unfinished[bag])
         if len(results) == len(bags[bag]):
             total.add(results)
@@ -138,12 +138,12 @@ def leading(results: Mapping[int, ShardResult]) -> list[ShardResult]:
     """Return the shards from the start of a bag that continue each other, by their numbers."""
     if len(results) > 1 and any(result.resets for result in results.values()):
         return []  # time was set back, which clears the map of all shards before
-    found: list[ShardResult] = []
-    while (result := results.get(len(found))) is not None:
-        if found and found[-1].after != result.before:
+    run: list[ShardResult] = []
+    while (result := results.get(len(run))) is not None:
+        if run and run[-1].end_outlook != result.start_outlook:
             break
-        found.append(result)
-    return found
+        run.append(result)
+    return run
 
 
 def added(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:

@@ -86,10 +86,10 @@ def replay_bags(
     began = clock()
     options = ReplayOptions() if options is None else options
     check(config, options, output)
-    found = surveyed(requests, config)
-    is_registered = check_one_kind(found)
+    surveys = surveyed(requests, config)
+    is_registered = check_one_kind(surveys)
     # a recording that is registered is read twice
-    recorded_s, done_s = sum(each.recorded_s for each in found), 0.0
+    recorded_s, done_s = sum(survey.recorded_s for survey in surveys), 0.0
     total_s = (1 + is_registered) * recorded_s
 
     def on_done(seconds: float) -> None:
@@ -100,10 +100,10 @@ def replay_bags(
     times = {'survey': clock()}
     with open_workers(workers, scheduler) as pool:
         times['start'] = clock()
-        jobs, frame = [(each.request, config) for each in found], None
+        jobs, frame = [(survey.request, config) for survey in surveys], None
         if is_registered:
-            frame = registered(found, config, output, options.align, pool, on_done, stopped)
-            jobs = [(each.request, each.config) for each in frame.placed]
+            frame = registered(surveys, config, output, options.align, pool, on_done, stopped)
+            jobs = [(recording.request, recording.config) for recording in frame.placed]
             times['register'] = clock()
         mapped = mapped_together(jobs, recorded_s, pool, on_done, stopped)
         times['map'] = clock()
@@ -117,7 +117,7 @@ def replay_bags(
         'wall_s': durations(began, times),
         'window': False,
         'interrupted': mapped.interrupted,
-        'cut': [cut for each in found for cut in each.cuts],
+        'cut': [cut for survey in surveys for cut in survey.cuts],
         **mapped.mapper.summary(),
         **mapped.counts,
         **({} if frame is None else frame.summary(mapped.counts['scans'])),
@@ -149,7 +149,7 @@ def check(config: Config, options: ReplayOptions, output: Path) -> None:
         if name not in MAP_FORMATS or name == BAG:
             raise ConfigError(
                 f'formats: {name!r} needs one recording and a single process, expected some of '
-                f'{", ".join(known for known in MAP_FORMATS if known != BAG)}'
+                f'{", ".join(form for form in MAP_FORMATS if form != BAG)}'
             )
     check_free(output, options.overwrite)
     check_formats(options.formats, output)
@@ -203,10 +203,10 @@ def surveyed(requests: Sequence[Request], config: Config) -> list[Surveyed]:
     """Return duration, s, source of poses, and files that end too early, of each recording."""
     from surfel_mapper.offline.recording import open_recording
 
-    found = []
+    surveys = []
     for request in requests:
         with open_recording(request, config) as recording:
-            found.append(
+            surveys.append(
                 Surveyed(
                     request=request,
                     recorded_s=recording.recorded_s,
@@ -214,23 +214,23 @@ def surveyed(requests: Sequence[Request], config: Config) -> list[Surveyed]:
                     poses_from=str(recording.describe()['poses_from']),
                 )
             )
-    return found
+    return surveys
 
 
-def check_one_kind(found: Sequence[Surveyed]) -> bool:
+def check_one_kind(surveys: Sequence[Surveyed]) -> bool:
     """Return whether the recordings have to be registered; raise BagError if only some have."""
-    without = [each for each in found if each.poses_from == 'registration']
-    others = [each for each in found if each.poses_from != 'registration']
-    if without and others:
+    without = [survey for survey in surveys if survey.poses_from == 'registration']
+    posed = [survey for survey in surveys if survey.poses_from != 'registration']
+    if without and posed:
         raise BagError(
-            f'{without[0].request.path} has no poses, but {others[0].request.path} has, from '
-            f'{others[0].poses_from}; expected all or none, or --poses-from registration for all'
+            f'{without[0].request.path} has no poses, but {posed[0].request.path} has, from '
+            f'{posed[0].poses_from}; expected all or none, or --poses-from registration for all'
         )
     return bool(without)
 
 
 def registered(
-    found: Sequence[Surveyed],
+    surveys: Sequence[Surveyed],
     config: Config,
     output: Path,
     align: bool | None,
@@ -243,13 +243,13 @@ def registered(
     from surfel_mapper.cluster.shards import absolute
 
     tasks = [
-        (absolute(each.request), config, output.absolute() / f'registered_{number}', align)
-        for number, each in enumerate(found, start=1)
+        (absolute(survey.request), config, output.absolute() / f'registered_{number}', align)
+        for number, survey in enumerate(surveys, start=1)
     ]
     done = {}
     for number, result in pool.run(register, tasks, stopped):
         done[number] = result
-        on_done(found[number].recorded_s)
+        on_done(surveys[number].recorded_s)
     if len(done) < len(tasks):
         raise MapError('stopped before all recordings were registered')
     return in_one_frame([done[number] for number in range(len(tasks))])

@@ -25,7 +25,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.memory import keep_freed_memory
-from surfel_mapper.offline.bag_recording import add_cloud, add_poses, BagRecording
+from surfel_mapper.offline.bag_recording import add_cloud, add_poses, add_static, BagRecording
 from surfel_mapper.offline.outputs import ScanTrajectory
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import all_scans
@@ -92,7 +92,7 @@ class ShardResult:
         Its part of the map.
     config : Config
         The settings, with the source of the poses.
-    before, after : str, optional
+    start_outlook, end_outlook : str, optional
         Outlook at its start and at its stop; None at the ends of the bag.
     counts : dict
         ``Counters.summary`` of this part alone.
@@ -109,8 +109,8 @@ class ShardResult:
 
     map: SurfelMap
     config: Config
-    before: str | None
-    after: str | None
+    start_outlook: str | None
+    end_outlook: str | None
     counts: dict[str, Any]
     resets: int
     recorded_s: float
@@ -162,7 +162,7 @@ def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
             return [whole]
         start_ns, stop_ns = recording.bounds_ns
     number = max(math.ceil((stop_ns - start_ns) / 1e9 / shard_s - SLACK), 1)
-    bounds = [start_ns + (stop_ns - start_ns) * part // number for part in range(1, number)]
+    bounds = [start_ns + (stop_ns - start_ns) * k // number for k in range(1, number)]
     lead_s = LEAD_S + config.input.reset_after_s + sweep_s(config)
     return [
         replace(whole, start_ns=first, stop_ns=last, lead_s=lead_s)
@@ -217,8 +217,8 @@ def map_shard(shard: Shard) -> ShardResult:
     return ShardResult(
         map=mapper.map,
         config=mapper.config,
-        before=start.outlook,
-        after=None if shard.stop_ns is None else mapper.outlook(),
+        start_outlook=start.outlook,
+        end_outlook=None if shard.stop_ns is None else mapper.outlook(),
         counts=difference(mapper.counters.summary(), start.counts),
         resets=mapper.counters.resets,
         recorded_s=recorded_s,
@@ -249,14 +249,12 @@ def replay_middle(
         raise BagError(f'{recording.reader.path}: depth images are mapped by one process alone')
     reader, poses, clouds = recording.reader, recording.poses, set(recording.topics)
     mapper.passes_over = shard.start_ns is not None
-    for topic, mount in poses.mounts.items():
-        base = mapper.config.frames.base
-        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
+    static = add_static(reader, mapper, poses)
     for message in messages_of(recording, shard):
         if mapper.passes_over and message.record_ns >= (shard.start_ns or 0):
             start.record(mapper)
         if message.topic not in clouds:
-            add_poses(reader, mapper, message, poses)
+            add_poses(reader, mapper, message, poses, static)
         elif recording.span.holds(message.record_ns):
             add_cloud(reader, mapper, message, poses, 0)
         yield from mapper.insert_ready()
@@ -283,14 +281,14 @@ def messages_of(recording: BagRecording, shard: Shard) -> Iterator[BagMessage]:
     yield from reader.messages(names, first_ns, last_ns)
 
 
-def difference(now: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
-    """Return counts less those before; times of stages stay as they are."""
-    left: dict[str, Any] = {}
-    for name, value in now.items():
+def difference(counts: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
+    """Return counts less earlier ones; times of stages stay as they are."""
+    change: dict[str, Any] = {}
+    for name, value in counts.items():
         if name == 'milliseconds':
-            left[name] = value
+            change[name] = value
         elif isinstance(value, dict):
-            left[name] = difference(value, before.get(name, {}))
+            change[name] = difference(value, earlier.get(name, {}))
         else:
-            left[name] = value - before.get(name, 0)
-    return left
+            change[name] = value - earlier.get(name, 0)
+    return change

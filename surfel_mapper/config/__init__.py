@@ -31,6 +31,7 @@ from surfel_mapper.config.layers import (
 )
 from surfel_mapper.config.registration import AlignConfig, LoopsConfig, RegistrationConfig
 from surfel_mapper.config.settings import (
+    checked,
     Declaration,
     flatten,
     near,
@@ -86,6 +87,7 @@ __all__ = [
     'WEIGHT_MODES',
     'WindowConfig',
     'allowed',
+    'checked',
     'FIRST',
     'declarations',
     'first_ones',

@@ -257,12 +257,12 @@ def load_layer_packages() -> None:
 
 def declarations() -> list[Declaration]:
     """Return the declaration of every setting, in order."""
-    rows = []
+    rows: list[Declaration] = []
     for stage, holder in stage_fields().items():
-        rows += settings_of(holder.default_factory, stage)  # type: ignore[arg-type]
+        rows += settings_of(holder.default_factory, stage)
     for stage, cls in layer_stages().items():
         rows += settings_of(cls, stage)
-    return rows + settings_of(Config)
+    return [*rows, *settings_of(Config)]
 
 
 def load_config(path: str | Path | None = None) -> Config:

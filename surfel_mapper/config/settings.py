@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 import dataclasses
 from dataclasses import dataclass, field
 import difflib
+from functools import cache
 import math
 from typing import Any, ClassVar
 
@@ -108,6 +109,11 @@ class Declaration:
         return type(self.default).__name__
 
     @property
+    def is_list(self) -> bool:
+        """Whether the value is a tuple."""
+        return isinstance(self.default, tuple)
+
+    @property
     def is_number(self) -> bool:
         """Whether the value is one number."""
         return type(self.default) in (int, float)
@@ -170,13 +176,18 @@ def stage_name(cls: type[Stage]) -> str:
     return cls.STAGE or cls.__name__.removesuffix('Config').lower()
 
 
-def settings_of(cls: type, stage: str = '') -> list[Declaration]:
+def settings_of(cls: Any, stage: str = '') -> tuple[Declaration, ...]:
     """Return the settings of a dataclass, in order; fields not made by ``setting`` are skipped."""
-    return [
+    return _settings_of(cls, stage)
+
+
+@cache
+def _settings_of(cls: Any, stage: str) -> tuple[Declaration, ...]:
+    return tuple(
         Declaration(stage, field.name, field.default, **field.metadata)
         for field in dataclasses.fields(cls)
         if 'meaning' in field.metadata
-    ]
+    )
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:

@@ -268,6 +268,11 @@ class InputConfig(Stage):
         'Topics of the clouds or images, one a sensor; empty: points, or depth/image.',
         items=str,
     )
+    filters_directory: str = setting(
+        '',
+        'Directory of the files that filters may name while the node runs; empty: that of the '
+        'parameter file.',
+    )
     min_range_m: float = setting(
         0.1, 'Points nearer to the origin of their frame are ignored, m.', low=0.0, high=1e6
     )
@@ -280,6 +285,12 @@ class InputConfig(Stage):
         'by less, the scan is dropped.',
         low=0.0,
         high=1e9,
+    )
+    time_offset_s: float = setting(
+        0.0,
+        'Added to the stamps of clouds, s: the clock of the poses less that of the sensors.',
+        low=-1e10,
+        high=1e10,
     )
     max_waiting_clouds: int = setting(
         20,

@@ -143,7 +143,7 @@ def true_poses(
     if not (path / SIMULATION_FILE).exists():
         raise FileFormatError(
             f'{path}: not a simulated bag, which has a {SIMULATION_FILE}; '
-            'expected one, or a trajectory (TUM, KITTI or CSV)'
+            'expected one, or a trajectory (TUM, KITTI, CSV, g2o)'
         )
     drive = load_simulation(path).drive
     poses = [drive.T_odom_sensor(int(stamp_ns)) for stamp_ns in stamps_ns]

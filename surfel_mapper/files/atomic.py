@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+import fcntl
 import json
 import math
 import os
@@ -21,6 +22,9 @@ import secrets
 from typing import Any, BinaryIO
 
 from surfel_mapper.errors import FileFormatError
+
+PART = '.surfel_mapper-'
+"""Start of the names of temporary files, which end with ``.part``."""
 
 
 @contextmanager
@@ -46,7 +50,7 @@ def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO
     target = Path(os.path.realpath(path))
     if os.path.exists(target) and not os.path.isfile(target):
         raise FileFormatError(f'{path}: not a regular file, expected one, or a new name')
-    temporary = target.with_name(f'.surfel_mapper-{secrets.token_hex(8)}.part')
+    temporary = target.with_name(f'{PART}{secrets.token_hex(8)}.part')
     try:
         file = open(temporary, 'x+b')  # noqa: SIM115 - closed before it is renamed
     except OSError as error:
@@ -57,11 +61,13 @@ def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO
         raise
     try:
         with file:
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             yield file
             file.flush()
             if lasting:
                 os.fsync(file.fileno())
-        os.replace(temporary, target)
+            os.replace(temporary, target)
         if lasting:
             sync_directory(target.parent)
     except BaseException as error:
@@ -69,6 +75,21 @@ def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
             raise cannot_write(path, error) from error
         raise
+
+
+def remove_abandoned(directory: Path) -> list[Path]:
+    """Remove the temporary files of processes that have died, which hold no lock; return them."""
+    removed = []
+    for path in directory.glob(f'{PART}*.part'):
+        with suppress(OSError):  # locked, gone, or a link
+            file = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink()
+                removed.append(path)
+            finally:
+                os.close(file)
+    return removed
 
 
 def check_free(path: Path, overwrite: bool) -> None:

@@ -12,6 +12,7 @@ map projection, so they are returned as float64.
 from __future__ import annotations
 
 import io
+import logging
 import math
 import os
 from pathlib import Path
@@ -24,13 +25,26 @@ import numpy.typing as npt
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import ConfigError, DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.files.point_columns import Columns, RGB
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
 
 SUFFIXES = ('.las', '.laz')
 
-RGB = ('red', 'green', 'blue')
+ATTRIBUTES = ('classification', 'return_number', 'number_of_returns')
+"""Fields of every point, which become columns of their names."""
+
+MODEL_KEY, GEOGRAPHIC = 1024, 2
+"""GeoTIFF's key of the kind of coordinates, and its value for degrees."""
+
+UNIT_KEYS = (3076, 4099)
+"""GeoTIFF's keys of the units of x and y, and of z."""
+
+LINEAR_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200.0 / 3937.0}
+"""EPSG codes of metre, foot and US survey foot; others are found by pyproj."""
+
+logger = logging.getLogger(__name__)
 
 RESOLUTION_M = 1e-4
 """Unit of the coordinates that are written, m."""
@@ -54,20 +68,21 @@ LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 """Layers of the items of a point by their type; type 14, further bytes, has one for each byte."""
 
 
-def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
+def read_points(path: str | Path) -> Columns:
     """
     Return the columns of a LAS or LAZ file.
 
     Returns
     -------
     dict of str to (N,) array
-        x, y, z float64, m; intensity float32; timestamp float64 if the file has GPS times, s;
-        red, green, blue uint8 if it has colours.
+        x, y, z float64, m; intensity float32; classification, return_number, number_of_returns;
+        timestamp float64 if the file has GPS times, s; red, green, blue uint8 if it has colours;
+        extra columns by their names. Points that are marked as withheld are left out.
 
     Raises
     ------
     FileFormatError
-        If it cannot be read.
+        If it cannot be read, or its coordinates are degrees.
     DependencyError
         If laspy is not installed.
 
@@ -82,18 +97,74 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
     except BaseException as error:  # of decoders; a panic of Rust is no Exception
         raise FileFormatError(f'{path}: no LAS or LAZ file: {error}') from error
+    is_kept = np.asarray(las.withheld) == 0
+    if not is_kept.all():
+        logger.info('%s: %d points are withheld and left out', path, len(las) - is_kept.sum())
+    return {name: np.array(values)[is_kept] for name, values in las_columns(path, las).items()}
+
+
+def las_columns(path: str | Path, las: Any) -> Columns:
+    """Return the columns of all points of a file."""
     names = set(las.point_format.dimension_names)
-    columns: dict[str, npt.NDArray[Any]] = {
-        name: np.ascontiguousarray(getattr(las, name), np.float64) for name in 'xyz'
+    factors = metres_of(path, las.header)
+    columns: Columns = {
+        name: np.ascontiguousarray(getattr(las, name), np.float64) * factor
+        for name, factor in zip('xyz', factors, strict=True)
     }
     columns['intensity'] = np.asarray(las.intensity, np.float32)
+    columns |= {name: np.asarray(las[name]) for name in ATTRIBUTES}
     if 'gps_time' in names:
         columns['timestamp'] = np.asarray(las.gps_time, np.float64)
     if set(RGB) <= names:
         values = [np.asarray(las[name]) for name in RGB]
         shift = 8 if max((int(v.max()) for v in values if v.size), default=0) > 255 else 0
         columns |= {n: (v >> shift).astype(np.uint8) for n, v in zip(RGB, values, strict=True)}
+    for name in las.point_format.extra_dimension_names:
+        columns.setdefault(name, np.asarray(las[name]))
     return columns
+
+
+def metres_of(path: str | Path, header: Any) -> tuple[float, float, float]:
+    """
+    Return the metres in a unit of x, y and z, by the coordinate system; 1 if there is none.
+
+    Heights without a unit of their own have that of x and y.
+
+    Raises
+    ------
+    FileFormatError
+        If coordinates are degrees.
+
+    """
+    directories = header.vlrs.get('GeoKeyDirectoryVlr')
+    keys = {key.id: key.value_offset for vlr in directories for key in vlr.geo_keys}
+    factor, height = (LINEAR_UNITS.get(keys.get(key, 0)) for key in UNIT_KEYS)
+    is_geographic = keys.get(MODEL_KEY) == GEOGRAPHIC
+    if factor is None and not is_geographic:
+        try:
+            crs = header.parse_crs()
+        except Exception as error:  # of pyproj, or pyproj is missing
+            logger.warning('%s: unit of its coordinates: %s; metres are assumed', path, error)
+            crs = None
+        if crs is not None:
+            is_geographic = crs.is_geographic
+            factors = [axis.unit_conversion_factor for axis in crs.axis_info]
+            factor, height = factors[0], height or factors[-1]
+    if is_geographic:
+        raise FileFormatError(
+            f'{path}: longitudes and latitudes in degrees, expected coordinates of a map '
+            'projection; convert it, as with `pdal translate --filter reprojection`'
+        )
+    elif factor is None and any(keys.get(key) for key in UNIT_KEYS):
+        logger.warning('%s: units %s of EPSG are not known; metres are assumed', path, keys)
+    factor = factor or 1.0
+    height = height or factor
+    if (factor, height) != (1.0, 1.0):
+        logger.warning(
+            '%s: coordinates in units of %.7g m, heights of %.7g m, are converted to metres',
+            *(path, factor, height),
+        )
+    return factor, factor, height
 
 
 def write_surfels(
@@ -147,7 +218,7 @@ def write_surfels(
     for name in RGB if has_colour else ():
         las[name] = np.rint(257.0 * surfels.channels[name]).astype(np.uint16)  # 255 is 65535
     content = io.BytesIO()
-    las.write(content, do_compress=Path(path).suffix == '.laz')
+    las.write(content, do_compress=Path(path).suffix.lower() == '.laz')
     with replace_file(path) as file:
         file.write(content.getvalue())
 

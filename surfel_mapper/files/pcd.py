@@ -5,9 +5,9 @@ Surfels and points as PCD, for PCL and tools built on it.
 
 Files are written binary with the columns of ~/normals, including normal_x normal_y normal_z
 curvature, the names of PCL's PointNormal. All are float32, as in PCL's point types: PCL silently
-drops a field x of doubles. That rounds by 0.5 mm at 10 km from the origin; PLY and Parquet keep
-doubles. All encodings are read: ascii, binary, and binary_compressed, whose columns are packed
-with LZF, which the extra ``formats`` installs.
+drops a field x of doubles. VIEWPOINT, the pose of the sensor, is read and written. All encodings
+are read: ascii, binary, and binary_compressed, whose columns are packed with LZF, which the extra
+``formats`` installs.
 
 The format is a text header and a table, so numpy alone reads and writes it: a library (pypcd4,
 Open3D) would be one more dependency for 200 lines, and neither refuses truncated files. The tests
@@ -16,7 +16,7 @@ compare with pypcd4.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 import os
@@ -27,11 +27,13 @@ from typing import Any, BinaryIO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import MAX_SQUARE_ERROR
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import check_names, replace_file
+from surfel_mapper.files.point_columns import Columns, RGB
 from surfel_mapper.files.text_table import read_table
-from surfel_mapper.mapping.surfel_columns import surfel_columns
+from surfel_mapper.mapping.surfel_columns import file_positions, packed_rgb, surfel_columns
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
@@ -52,16 +54,18 @@ MAX_POINT_BYTES = 65536
 PADDING = 4096
 """Most zero bytes that may follow the points; the Point Cloud Library adds up to a page."""
 
-Columns = dict[str, npt.NDArray[Any]]
+ORIGIN = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+"""Viewpoint of points in the frame of the sensor."""
 
 
 @dataclass(frozen=True, slots=True)
 class PcdHeader:
-    """Layout, number and encoding of the points, by the text header of a file."""
+    """Layout, number and encoding of the points and viewpoint, by the text header of a file."""
 
     layout: np.dtype[Any]
     num_points: int
     encoding: str
+    viewpoint: tuple[float, ...]
 
 
 def write_surfels(
@@ -77,8 +81,7 @@ def write_surfels(
     surfels : Surfels
         In the frame of the map.
     origin_m : (3,) float, m
-        Added to the positions; if it is not 0, x y z are doubles, since float32 rounds by 0.25 m
-        at the northings of UTM.
+        Added to the positions; see file_positions.
 
     Raises
     ------
@@ -86,16 +89,18 @@ def write_surfels(
         If the file cannot be written.
 
     """
-    columns = surfel_columns(surfels)
-    if np.any(origin_m):
-        places = surfels.position + np.asarray(origin_m)
-        columns = {**columns, **dict(zip('xyz', places.T, strict=True))}
-    write_points(path, columns)
+    write_points(path, {**surfel_columns(surfels), **file_positions(path, surfels, origin_m)})
 
 
-def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> None:
+def write_points(
+    path: str | Path,
+    columns: Mapping[str, npt.NDArray[Any]],
+    viewpoint: Sequence[float] = ORIGIN,
+) -> None:
     """
     Write columns of equal length K as a binary PCD, atomically.
+
+    The bytes red, green and blue become ``rgb``, which PCL and CloudCompare draw.
 
     Parameters
     ----------
@@ -103,6 +108,8 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
         The file; see replace_file.
     columns : mapping of str to (K,) array
         At least one column of integers, float32 or float64.
+    viewpoint : 7 floats
+        Pose of the sensor, x y z qw qx qy qz.
 
     Raises
     ------
@@ -111,6 +118,9 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
 
     """
     check_names(path, columns)
+    if columns.keys() >= {*RGB} and all(columns[name].dtype == np.uint8 for name in RGB):
+        rgb = packed_rgb(*(columns[name] for name in RGB))
+        columns = {**{k: v for k, v in columns.items() if k not in RGB}, 'rgb': rgb}
     layout = np.dtype([(name, v.dtype.newbyteorder('<')) for name, v in columns.items()])
     table = np.empty(len(next(iter(columns.values()))), layout)
     for name, values in columns.items():
@@ -122,7 +132,7 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
         f'SIZE {" ".join(str(type_.itemsize) for type_ in types)}\n'
         f'TYPE {" ".join(KINDS[type_.kind] for type_ in types)}\n'
         f'COUNT {" ".join("1" for _ in types)}\n'
-        f'WIDTH {len(table)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n'
+        f'WIDTH {len(table)}\nHEIGHT 1\nVIEWPOINT {" ".join(f"{v:.16g}" for v in viewpoint)}\n'
         f'POINTS {len(table)}\nDATA binary\n'
     )
     with replace_file(path) as file:
@@ -159,6 +169,23 @@ def read_points(path: str | Path) -> Columns:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
 
 
+def read_viewpoint(path: str | Path) -> tuple[float, ...]:
+    """
+    Return the pose of the sensor that a PCD file states, x y z qw qx qy qz; ORIGIN without one.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read or is not a PCD.
+
+    """
+    try:
+        with open_regular(path) as file:
+            return read_header(path, file).viewpoint
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+
+
 def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
     """Return the parsed header; the file is then at the first point."""
     words: dict[str, list[str]] = {}
@@ -177,6 +204,10 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
         if len(stated) == 2 and stated[0] * stated[1] not in (0, num_points):
             raise ValueError(f'WIDTH {stated[0]}, HEIGHT {stated[1]}, POINTS {num_points}')
         (encoding,) = words['DATA']
+        viewpoint = tuple(map(float, words.get('VIEWPOINT') or ORIGIN))
+        is_pose = len(viewpoint) == 7 and all(map(math.isfinite, viewpoint))
+        if not is_pose or abs(math.hypot(*viewpoint[3:]) ** 2 - 1.0) > MAX_SQUARE_ERROR:
+            viewpoint = ORIGIN  # some programs write zeros
         fields = [
             field_of(*stated, place)
             for place, stated in enumerate(zip(names, kinds, sizes, counts, strict=True))
@@ -191,7 +222,7 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
             f'{path}: {num_points} points, DATA {encoding}, expected ascii, binary or '
             'binary_compressed'
         )
-    return PcdHeader(layout, num_points, encoding)
+    return PcdHeader(layout, num_points, encoding, viewpoint)
 
 
 def field_of(name: str, kind: str, size: int, count: int, place: int) -> tuple[Any, ...]:

@@ -4,10 +4,9 @@
 Surfels and points as PLY, for CloudCompare and MeshLab.
 
 Files are binary and little endian, one vertex per surfel: x y z nx ny nz planarity curvature
-num_points. Positions are doubles: float32 rounds by 0.5 mm at 10 km from the origin and by 0.25 m
-at the northings of UTM, where the map still resolves 8 micrometres; programs that draw in float32
-shift such coordinates on import. The other properties are float32, exact to 1e-5 deg for normals,
-and uint32 for counts.
+num_points. Numbers are float32, exact to 1e-5 deg for normals, and uint32 for counts. Beyond 8 km
+from the origin positions are doubles: float32 rounds by 0.25 m at the northings of UTM, where the
+map still resolves 8 micrometres; programs that draw in float32 shift such coordinates on import.
 
 The format is a text header and a table, so numpy alone reads and writes it. It is our own code
 because plyfile, the usual library, is under the GPL, which this package is not; the tests compare
@@ -16,9 +15,12 @@ with it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 import os
 from pathlib import Path
+import struct
 from typing import Any, BinaryIO, TYPE_CHECKING
 
 import numpy as np
@@ -27,7 +29,9 @@ import numpy.typing as npt
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import check_names, replace_file
+from surfel_mapper.files.point_columns import Columns, RGB
 from surfel_mapper.files.text_table import read_table
+from surfel_mapper.mapping.surfel_columns import file_positions
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
@@ -59,7 +63,8 @@ ORDERS = {'binary_little_endian': '<', 'binary_big_endian': '>', 'ascii': '<'}
 
 MAX_HEADER_BYTES = 65536
 
-RGB = ('red', 'green', 'blue')
+MAX_LIST = 65536
+"""Limit of the number of values in a list of a row."""
 
 
 def write_surfels(
@@ -75,7 +80,7 @@ def write_surfels(
     surfels : Surfels
         In the frame of the map.
     origin_m : (3,) float, m
-        Added to the positions, in float64; see SurfelMap.
+        Added to the positions, in float64; see SurfelMap and file_positions.
 
     Raises
     ------
@@ -84,7 +89,7 @@ def write_surfels(
 
     """
     values = {
-        **dict(zip('xyz', (surfels.position + np.asarray(origin_m)).T, strict=True)),
+        **file_positions(path, surfels, origin_m),
         **dict(zip(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32).T, strict=True)),
         'planarity': surfels.planarity.astype(np.float32),
         'curvature': surfels.curvature.astype(np.float32),
@@ -146,158 +151,280 @@ def as_table(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[str, npt.NDArray[
     return properties, table
 
 
-def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
+@dataclass(frozen=True, slots=True)
+class Element:
+    """
+    An element of a PLY file.
+
+    Attributes
+    ----------
+    name, count : str, int
+        Name, and number of rows.
+    properties : list of (str, dtype, dtype or None)
+        Name and type of each property; of a list also the type of its length.
+
+    """
+
+    name: str
+    count: int
+    properties: list[tuple[str, np.dtype[Any], np.dtype[Any] | None]]
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether rows may differ in size."""
+        return any(length is not None for _, _, length in self.properties)
+
+    @property
+    def layout(self) -> np.dtype[Any]:
+        """The smallest row: single values, and the lengths of lists."""
+        return np.dtype([(name, length or type_) for name, type_, length in self.properties])
+
+
+def read_points(path: str | Path) -> Columns:
     """
     Return the properties of the vertices of a PLY file, each an array of length K.
 
     Parameters
     ----------
     path : str or Path
-        A PLY file, binary or ascii. Its first element must be the vertices, with scalar
-        properties; later elements (faces) are not read.
+        A PLY file, binary or ascii. Lists among the properties are left out, and all elements but
+        the vertices: faces, cameras.
 
     Raises
     ------
     FileFormatError
-        If the file cannot be read, is not a PLY, has another structure or is truncated.
+        If the file cannot be read, is not a PLY, has no vertices or is truncated.
 
     """
-    try:
-        with open_regular(path) as file:
-            file_size = os.fstat(file.fileno()).st_size
-            count, layout, is_text, is_last = read_header(path, file)
-            if is_text:
-                table = read_table(path, file, layout, count, is_last=is_last)
-            else:
-                left = file_size - file.tell()
-                check_size(path, count, layout, left, is_last=is_last)
-                table = np.frombuffer(file.read(count * layout.itemsize), layout)
-            return {
-                name: np.ascontiguousarray(table[name], layout[name].newbyteorder('='))
-                for name in layout.names or ()
-            }
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    columns, _ = read_elements(path, ('vertex',))
+    return {name: values for name, values in columns['vertex'].items() if is_single(values)}
 
 
 def read_mesh(path: str | Path) -> Mesh | None:
     """
-    Return the mesh in a binary PLY file, or None if the file has no faces.
+    Return the mesh in a PLY file, binary or ascii, or None if the file has no faces.
 
-    Parameters
-    ----------
-    path : str or Path
-        A PLY file whose first element is the vertices and whose second one is the faces, triangles
-        with the property vertex_indices (or vertex_index) only.
+    A face of more than three corners becomes a fan of triangles.
 
     Raises
     ------
     FileFormatError
-        If the file cannot be read, is damaged, a text file with faces, or has other faces.
+        If the file cannot be read, is damaged, or its faces are no lists of vertices.
 
     """
     from surfel_mapper.tsdf.mesh import Mesh
 
-    try:
-        with open_regular(path) as file:
-            layout, count = read_faces_header(path, file)
-            if layout is None or not count:
-                return None
-            number, vertex, is_text, _ = read_header(path, file)
-            if is_text:
-                raise FileFormatError(f'{path}: faces as text, expected a binary PLY')
-            file_size = os.fstat(file.fileno()).st_size
-            needed = number * vertex.itemsize + count * layout.itemsize
-            if needed > file_size - file.tell():
-                raise FileFormatError(
-                    f'{path}: {file_size - file.tell()} bytes after the header, expected {needed} '
-                    f'for {number} vertices and {count} triangles'
-                )
-            columns = np.frombuffer(file.read(number * vertex.itemsize), vertex)
-            faces = np.frombuffer(file.read(count * layout.itemsize), layout)
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    corners = faces['corners'].astype(np.int32)
-    if (faces['count'] != 3).any() or (corners < 0).any() or (corners >= number).any():
-        raise FileFormatError(f'{path}: faces with other than 3 of the {number} vertices')
-    names = vertex.names or ()
-    if not {'x', 'y', 'z'} <= set(names):
-        raise FileFormatError(f'{path}: vertices without x, y, z')
-    colours = [columns[name] for name in RGB if name in names]
-    is_coloured = len(colours) == 3 and all(each.dtype == np.uint8 for each in colours)
+    elements, has_all = read_elements(path, ('vertex', 'face'))
+    columns = elements['vertex']
+    corners = [v for v in elements.get('face', {}).values() if not is_single(v)]
+    number = len(next(iter(columns.values())))
+    if not has_all or not any(map(len, elements['face'].values())):
+        return None
+    if not corners or not {'x', 'y', 'z'} <= columns.keys():
+        raise FileFormatError(f'{path}: faces without a list of vertices, or no x, y, z')
+    triangles = fans(corners[0])
+    if not ((triangles >= 0) & (triangles < number)).all():
+        raise FileFormatError(f'{path}: faces with other than the {number} vertices')
+    colours = [columns[name] for name in RGB if name in columns]
+    is_coloured = len(colours) == 3 and all(channel.dtype == np.uint8 for channel in colours)
     return Mesh(
         vertices=np.stack([columns[name].astype(np.float64) for name in 'xyz'], axis=1),
-        triangles=corners,
+        triangles=triangles.astype(np.int32),
         colors=np.stack(colours, axis=1) if is_coloured else np.empty((0, 3), np.uint8),
-        labels=columns['label'].astype(np.int32) if 'label' in names else np.empty(0, np.int32),
+        labels=columns['label'].astype(np.int32) if 'label' in columns else np.empty(0, np.int32),
     )
 
 
-def read_faces_header(path: str | Path, file: BinaryIO) -> tuple[np.dtype[Any] | None, int]:
-    """Return layout and number of the faces, None if there are none; the file is at its begin."""
-    header, found, _ = file.read(MAX_HEADER_BYTES).partition(b'end_header')
-    file.seek(0)
-    lines = [line.split() for line in header.decode('ascii', 'replace').splitlines()]
-    at = next((i for i, line in enumerate(lines) if line[:2] == ['element', 'face']), None)
-    if not found or at is None:
-        return None, 0
+def is_single(values: npt.NDArray[Any]) -> bool:
+    """Return whether a property has one value a row; lists have several, or are objects."""
+    return values.ndim == 1 and values.dtype != object
+
+
+def fans(corners: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Return the triangles (T, 3) of faces with corners (F, C), or (F,) objects of any number."""
+    if corners.dtype == object:
+        rows = [(face[0], *pair) for face in corners for pair in pairwise(face[1:])]
+        return np.array(rows, np.int64).reshape(-1, 3)
+    columns = [[0, k, k + 1] for k in range(1, corners.shape[1] - 1)]
+    return corners[:, columns].reshape(-1, 3).astype(np.int64)
+
+
+def read_elements(path: str | Path, wanted: Sequence[str]) -> tuple[dict[str, Columns], bool]:
+    """Return elements up to the last wanted one, and whether all of these are in the file."""
+    tables: dict[str, Columns] = {}
     try:
-        order = next(ORDERS[line[1]] for line in lines if line[:1] == ['format'])
-        (_, _, count), (_, kind, of_count, of_corner, name), *others = lines[at:]
-        layout = np.dtype(
-            [('count', order + TYPES[of_count]), ('corners', order + TYPES[of_corner], (3,))]
-        )
-        number = int(count)
-    except (ValueError, KeyError, StopIteration) as error:
-        raise FileFormatError(f'{path}: faces that are no list of vertices') from error
-    if kind != 'list' or 'property' in [line[0] for line in others if line] or number < 0:
-        raise FileFormatError(f'{path}: faces with properties beside {name}, expected that only')
-    return layout, number
+        with open_regular(path) as file:
+            elements, is_text = read_header(path, file)
+            size = os.fstat(file.fileno()).st_size
+            for element in elements:
+                is_last = element is elements[-1]
+                check_size(path, element, size - file.tell(), is_text=is_text, is_last=is_last)
+                if element.has_lists:
+                    tables[element.name] = list_columns(path, file, element, is_text=is_text)
+                    continue
+                if is_text:
+                    layout, count = element.layout, element.count
+                    table = read_table(path, file, layout, count, is_last=is_last)
+                else:
+                    content = file.read(element.count * element.layout.itemsize)
+                    table = np.frombuffer(content, element.layout)
+                tables[element.name] = native(table)
+                if {*wanted} <= tables.keys():
+                    break
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    return tables, {*wanted} <= tables.keys()
+
+
+def native(table: npt.NDArray[Any]) -> Columns:
+    """Return the columns of a structured array, in the byte order of the machine."""
+    return {
+        name: np.ascontiguousarray(table[name], table.dtype[name].base.newbyteorder('='))
+        for name in table.dtype.names or ()
+    }
+
+
+def list_columns(path: str | Path, file: BinaryIO, element: Element, *, is_text: bool) -> Columns:
+    """Return the properties of an element with lists: (K, C) for lists of C values, or objects."""
+    start = file.tell()
+    if not is_text and (table := equal_rows(file, element)) is not None:
+        lengths = {f'{name} length' for name, _, _ in element.properties}
+        return {name: v for name, v in native(table).items() if name not in lengths}
+    file.seek(start)
+    read_row = text_row if is_text else binary_row
+    try:
+        rows = [read_row(file, element) for _ in range(element.count)]
+    except (ValueError, IndexError, struct.error) as error:
+        raise FileFormatError(
+            f'{path}: {element.count} x {element.name}: other numbers than stated; truncated?'
+        ) from error
+    columns: Columns = {}
+    for at, (name, type_, length) in enumerate(element.properties):
+        values = [row[at] for row in rows]
+        is_equal = length is None or len({len(row) for row in values}) == 1
+        if is_equal:
+            columns[name] = np.array(values).astype(type_.newbyteorder('='))
+        else:
+            columns[name] = np.empty(len(rows), object)
+            columns[name][:] = values
+    return columns
+
+
+def equal_rows(file: BinaryIO, element: Element) -> npt.NDArray[Any] | None:
+    """Return the rows of a binary element as a table; None if their lists differ in length."""
+    start = file.tell()
+    try:
+        row = binary_row(file, element) if element.count else []
+    except (ValueError, struct.error):
+        return None
+    fields: list[Any] = []
+    for (name, type_, length), value in zip(element.properties, row, strict=False):
+        if length is not None:
+            fields.append((f'{name} length', length))
+        fields.append((name, type_) if length is None else (name, type_, (len(value),)))
+    layout = np.dtype(fields)
+    file.seek(start)
+    content = file.read(element.count * layout.itemsize)
+    if not fields or len(content) < element.count * layout.itemsize:
+        return None
+    table = np.frombuffer(content, layout)
+    lengths = [table[name] for name in layout.names or () if name.endswith(' length')]
+    return table if all((values == values[0]).all() for values in lengths) else None
+
+
+def binary_row(file: BinaryIO, element: Element) -> list[Any]:
+    """Return the values of the next row, a tuple for a list."""
+    row: list[Any] = []
+    for _, type_, length in element.properties:
+        number = 1 if length is None else unpack(file, length, 1)[0]
+        values = unpack(file, type_, number)
+        row.append(values[0] if length is None else values)
+    return row
+
+
+def unpack(file: BinaryIO, type_: np.dtype[Any], number: int) -> tuple[Any, ...]:
+    """Return a number of values of a type; raise ValueError if there cannot be as many."""
+    if not 0 <= number <= MAX_LIST:
+        raise ValueError(f'a list of {number}')
+    order = '>' if type_.str[0] == '>' else '<'
+    return struct.unpack(f'{order}{number}{type_.char}', file.read(number * type_.itemsize))
+
+
+def text_row(file: BinaryIO, element: Element) -> list[Any]:
+    """Return the values of the next line, a list for a list."""
+    words, row, at = list(map(float, file.readline().split())), list[Any](), 0
+    for _, _, length in element.properties:
+        if length is None:
+            row.append(words[at])
+            at += 1
+            continue
+        number = int(words[at])
+        row.append(words[at + 1 : at + 1 + number])
+        at += 1 + number
+    if len(words) != at:
+        raise ValueError(f'{len(words)} numbers, expected {at}')
+    return row
 
 
 def check_size(
-    path: str | Path, count: int, layout: np.dtype[Any], left: int, *, is_last: bool
+    path: str | Path, element: Element, left: int, *, is_text: bool, is_last: bool
 ) -> None:
-    """Raise FileFormatError if the vertices of a binary file do not fill the bytes left."""
-    size = count * layout.itemsize
-    if size > left:
-        raise FileFormatError(
-            f'{path}: {left} bytes after the header, expected {size} for {count} vertices; '
-            'truncated?'
-        )
-    if is_last and left - size >= layout.itemsize:
-        raise FileFormatError(
-            f'{path}: {left} bytes after the header, expected {size} for {count} vertices; is its '
-            'header damaged?'
-        )
+    """Raise FileFormatError if an element cannot have its rows in the bytes left."""
+    row_bytes = 2 * len(element.properties) - 1 if is_text else element.layout.itemsize
+    size = element.count * row_bytes
+    kind = 'vertices' if element.name == 'vertex' else f'x {element.name}'
+    expected = f'{left} bytes after the header, expected {size} for {element.count} {kind}'
+    if size > left and not (is_text and not element.has_lists):  # read_table counts the rows
+        raise FileFormatError(f'{path}: {expected}; truncated?')
+    if is_last and not is_text and not element.has_lists and left - size >= row_bytes:
+        raise FileFormatError(f'{path}: {expected}; is its header damaged?')
 
 
-def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], bool, bool]:
+def read_header(path: str | Path, file: BinaryIO) -> tuple[list[Element], bool]:
     """
-    Return number and layout of the vertices, and whether they are text and the last element.
+    Return the elements of a file, the vertices among them, and whether they are text.
 
-    The file is then at the first vertex.
+    The file is then at the first row.
     """
-    header, found, _ = file.read(MAX_HEADER_BYTES).partition(b'end_header')
+    header, end, _ = file.read(MAX_HEADER_BYTES).partition(b'end_header')
     lines = [line.split() for line in header.decode('ascii', 'replace').splitlines()]
-    if not found or not lines or lines[0] != ['ply']:
+    if not end or not lines or lines[0] != ['ply']:
         raise FileFormatError(f'{path}: not a PLY file, its header is missing')
     file.seek(len(header))
     file.readline()
     lines = [line for line in lines[1:] if line and line[0] not in ('comment', 'obj_info')]
+    elements: list[Element] = []
     try:
-        (_, encoding, version), (_, element, count), *others = lines
-        after = [i for i, line in enumerate(others) if line[0] == 'element']
-        properties = others[: after[0]] if after else others
-        layout = np.dtype([(name, ORDERS[encoding] + TYPES[kind]) for _, kind, name in properties])
-        number = int(count)
-    except (ValueError, KeyError) as error:
+        (_, encoding, version), *declarations = lines
+        order = ORDERS[encoding]
+        for keyword, *words in declarations:
+            if keyword == 'element':
+                name, count = words
+                elements.append(Element(name, int(count), []))
+                continue
+            *kinds, name = words
+            types = [np.dtype(order + TYPES[kind]) for kind in kinds if kind != 'list']
+            if keyword != 'property' or len(types) != 1 + (kinds[0] == 'list'):
+                raise ValueError(f'{keyword} {" ".join(words)}')
+            elements[-1].properties.append(
+                (name, types[-1], None if len(types) == 1 else types[0])
+            )
+        for element in elements:
+            _ = element.layout  # a name of two properties is refused
+    except (ValueError, LookupError) as error:
         raise FileFormatError(
-            f'{path}: not a PLY whose first element has scalar properties only'
+            f'{path}: not a PLY whose elements have properties: {error}'
         ) from error
-    if version != '1.0' or element != 'vertex' or number < 0 or not properties:
+    stated = ', '.join(f'{e.count} x {e.name} of {len(e.properties)} properties' for e in elements)
+    vertices = [element for element in elements if element.name == 'vertex']
+    if (
+        version != '1.0'
+        or len({element.name for element in elements}) < len(elements)
+        or any(element.count < 0 or not element.properties for element in elements)
+        or not any(length is None for e in vertices for _, _, length in e.properties)
+    ):
         raise FileFormatError(
-            f'{path}: version {version}, first element {count} x {element} of {len(properties)} '
-            'properties, expected 1.0 and vertices of at least one'
+            f'{path}: version {version}, {stated or "no elements"}, expected 1.0 and vertices of '
+            'at least one number each'
         )
-    return number, layout, encoding == 'ascii', not after
+    return elements, encoding == 'ascii'

@@ -49,6 +49,12 @@ def nanoseconds(text: str, where: str, unit: str = '') -> int:
     return stamp_ns
 
 
+def unit_by_digits(text: str) -> str:
+    """Return the unit of a time by the digits before its point: ns, us or ms since 1970, or s."""
+    digits = len(text.strip().partition('.')[0])
+    return 's' if digits < 12 else 'ms' if digits < 14 else 'us' if digits < 17 else 'ns'
+
+
 def read_times(path: str | Path) -> npt.NDArray[np.int64]:
     """Return the times in a file of one number of seconds a line, (T,) int64 ns, in its order."""
     return column_ns(table_rows(read_lines(path), 1, meaning=': a time'), 0)

@@ -95,9 +95,10 @@ class TextLines:
         """Return file:line."""
         return f'{self.path}:{self.numbers[row]}'
 
-    def without_first(self) -> TextLines:
-        """Return the lines after the first one."""
-        return TextLines(self.path, self.numbers[1:], self.texts[1:])
+    def at(self, rows: Sequence[int]) -> TextLines:
+        """Return some lines."""
+        numbers = [self.numbers[row] for row in rows]
+        return TextLines(self.path, numbers, [self.texts[row] for row in rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

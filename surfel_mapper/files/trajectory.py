@@ -1,7 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Trajectories as text: reading TUM, KITTI and CSV, writing TUM.
+Trajectories as text: reading those of most programs, writing TUM.
+
+A line is a pose: a stamp or nothing, x y z and a quaternion, or a matrix; the first line decides.
+Read are TUM (with an id behind it: RTAB-Map; in nanoseconds: ORB-SLAM3), KITTI, matrices of four
+rows (Replica) in a line or in four (Redwood, 7-Scenes), KITTI-360 with the number of the scan
+before them, g2o's VERTEX_SE3, and CSV with names of its columns (EuRoC, Newer College).
 
 Coordinates are written with the digits that restore the same float64, stamps with all nanoseconds
 (stamps.py). Poses are neither sorted nor interpolated here: a pose of the wrong time maps a scan
@@ -24,12 +29,15 @@ from surfel_mapper.arguments import as_array, as_numbers, as_path, as_whole, mad
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.pose_rows import matrix_rows, quaternion_rows, warn_of_skew
-from surfel_mapper.files.stamps import column_ns, read_times, UNITS_NS
-from surfel_mapper.files.text_table import read_lines, table_rows, TextLines
+from surfel_mapper.files.stamps import column_ns, read_times, unit_by_digits, UNITS_NS
+from surfel_mapper.files.text_table import read_lines, Rows, table_rows, TextLines
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw, quaternions
 from surfel_mapper.poses.pose_track import seconds
 
-FORMATS = ('tum', 'kitti', 'csv')
+SUFFIXES = ('.tum', '.txt', '.csv', '.kitti', '.g2o', '.log')
+"""Endings of trajectories."""
+
+FORMATS = ('tum', 'kitti', 'csv', 'g2o')
 
 TRAJECTORY = 'trajectory.tum'
 """File of a replay with the poses of its scans, beside the map and in its frame."""
@@ -52,11 +60,17 @@ POSE_COLUMNS = (
 
 STAMP_COLUMNS = ('stamp', 'timestamp', 'time', 't')
 
-COLUMNS = {
-    'tum': (8, ': stamp x y z q'),
-    'kitti': (12, ': 3 rows of 4'),
-}
-"""Number of columns of the formats without a header, and their meaning."""
+PARTS = (('sec', 'secs'), ('nsec', 'nsecs', 'nanosec'))
+"""Names of the columns of a stamp in two numbers."""
+
+TUM, RTABMAP = 8, 9
+"""Numbers of columns: stamp x y z qx qy qz qw, and an id."""
+
+MATRICES = (12, 13, 16, 17)
+"""Numbers of columns of three or four rows of a matrix, and of the number of the scan first."""
+
+VERTEX = 'VERTEX_SE3:QUAT'
+"""First word of a pose in g2o: its number, x y z qx qy qz qw."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -68,6 +82,8 @@ class Trajectory:
     ----------
     stamp_ns : (S,) int64, or None
         None for KITTI poses without a times.txt: pose i is that of scan i.
+    number : (S,) int64, or None
+        Of poses without stamps of some scans: the numbers of these, ascending.
     xyz : (S, 3) float64, m
     q_xyzw : (S, 4) float64
         Of squared norm 1 within 1e-2.
@@ -77,6 +93,7 @@ class Trajectory:
     stamp_ns: npt.NDArray[np.int64] | None
     xyz: npt.NDArray[np.float64]
     q_xyzw: npt.NDArray[np.float64]
+    number: npt.NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         """Turn lists into arrays; raise ValueError if shapes or types are not as above."""
@@ -117,7 +134,8 @@ class Trajectory:
             stamps = None if self.stamp_ns is None else self.stamp_ns[row]
             if stamps is not None and (np.diff(stamps) < 0).any():
                 raise IndexError(f'{row}: stamps would descend, expected a positive step')
-            return Trajectory(stamps, self.xyz[row], self.q_xyzw[row])
+            number = None if self.number is None else self.number[row]
+            return Trajectory(stamps, self.xyz[row], self.q_xyzw[row], number)
         row = as_whole('pose', row)
         if not -len(self) <= row < len(self):
             raise IndexError(
@@ -185,7 +203,7 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> Trajectory:
-        """Return the poses in a file, TUM, KITTI or CSV; raises FileFormatError."""
+        """Return the poses in a file; see read_trajectory."""
         return read_trajectory(as_path(path))
 
     def save(self, path: str | Path) -> None:
@@ -236,7 +254,7 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
     path : str or Path
         The file. KITTI poses take their stamps from a times.txt beside it, if there is one.
     format_ : str, optional
-        tum, kitti or csv; by default that of the first line: 8 numbers, 12 numbers, or commas.
+        tum, kitti (matrices) or csv; by default that of the first line.
 
     Raises
     ------
@@ -248,11 +266,11 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
     lines = read_lines(path)
     if not lines.texts:
         raise FileFormatError(f'{path}: no poses in it, expected a line for each')
-    format_ = format_ or guessed(path, lines.texts[0])
+    format_ = format_ or guessed(path, lines.texts)
     if format_ not in FORMATS:
         expected = ', '.join(FORMATS)
         raise FileFormatError(f'{path}: format {format_!r}, expected one of {expected}')
-    readers = {'csv': csv_poses, 'kitti': kitti_poses, 'tum': tum_poses}
+    readers = {'csv': csv_poses, 'kitti': matrix_poses, 'tum': tum_poses, 'g2o': g2o_poses}
     return readers[format_](lines)
 
 
@@ -262,25 +280,57 @@ def trajectory_beside(path: Path) -> Path | None:
     return found if found.is_file() else None
 
 
-def guessed(path: str | Path, line: str) -> str:
-    """Return the format that a first line looks like."""
+def guessed(path: str | Path, texts: Sequence[str]) -> str:
+    """Return the format that the first line looks like; before a matrix it may have 3 numbers."""
+    is_headed = len(texts[0].split()) == 3 and len(texts) > 4
+    line = texts[1 if is_headed else 0]
+    words = line.split()
+    if words[0].startswith(('VERTEX', 'EDGE', 'FIX', 'PARAMS')):
+        return 'g2o'
     if ',' in line:
         return 'csv'
-    formats = {8: 'tum', 12: 'kitti'}
-    count = len(line.split())
-    if count not in formats:
+    if len(words) in (TUM, RTABMAP):
+        return 'tum'
+    if len(words) not in (4, *MATRICES):
         raise FileFormatError(
-            f'{path}: {count} columns in the first line, expected 8 (TUM), 12 (KITTI) or commas '
-            '(CSV)'
+            f'{path}: {len(words)} columns in the first line, expected 8 (TUM; 9 with an id), 12 '
+            '(KITTI) or 16 (4 x 4) of a matrix, 13 or 17 with the number of the scan before it '
+            f'(KITTI-360), four lines of 4, commas (CSV), or {VERTEX} (g2o)'
         )
-    return formats[count]
+    return 'kitti'
 
 
 def tum_poses(lines: TextLines) -> Trajectory:
-    """Return the poses of a TUM file."""
-    columns, meaning = COLUMNS['tum']
-    rows = table_rows(lines, columns, meaning=meaning)
-    return stamped_poses(lines, column_ns(rows, 0), quaternion_rows(rows, slice(1, None)))
+    """Return the poses of a TUM file, in seconds or with a unit by the digits of the stamps."""
+    width = len(lines.texts[0].split())
+    rows = table_rows(lines, width if width == RTABMAP else TUM, meaning=': stamp x y z q')
+    stamp_ns = column_ns(rows, 0, unit_of_column(rows, 0))
+    return stamped_poses(lines, stamp_ns, quaternion_rows(rows, slice(1, TUM)))
+
+
+def unit_of_column(rows: Rows, column: int) -> str:
+    """Return the unit of the stamps of a column by their digits; empty for seconds."""
+    unit = unit_by_digits(rows.words[-1][column]) if len(rows) else 's'
+    return '' if unit == 's' else unit
+
+
+def g2o_poses(lines: TextLines) -> Trajectory:
+    """Return the vertices of a g2o file by their numbers; edges and landmarks are left out."""
+    at = [row for row, text in enumerate(lines.texts) if text.split()[0] == VERTEX]
+    if not at:
+        raise FileFormatError(f'{lines.path}: no line {VERTEX}, expected one for each pose')
+    rows = table_rows(lines.at(at), 9, meaning=': number x y z q')
+    poses = quaternion_rows(rows, slice(2, None))
+    number, order = np.unique(rows.numbers([1])[:, 0].astype(np.int64), return_index=True)
+    if len(number) < len(rows):
+        raise FileFormatError(f'{lines.path}: vertices of equal numbers, expected one for each')
+    return numbered_poses(poses[order], number)
+
+
+def numbered_poses(poses: npt.NDArray[np.float64], number: npt.NDArray[np.int64]) -> Trajectory:
+    """Return poses (R, 7) of the scans of some numbers; those of all scans need no numbers."""
+    is_all = np.array_equal(number, np.arange(len(number)))
+    return Trajectory(None, poses[:, :3], poses[:, 3:], None if is_all else number)
 
 
 def csv_poses(lines: TextLines) -> Trajectory:
@@ -288,14 +338,19 @@ def csv_poses(lines: TextLines) -> Trajectory:
     header = [column_name(column) for column in lines.texts[0].lstrip('# ').split(',')]
     names = [name for name, _ in header]
     stamps = [column for column, name in enumerate(names) if name in STAMP_COLUMNS]
+    parts = [[names.index(alias) for alias in aliases if alias in names] for aliases in PARTS]
     aliased = [[names.index(a) for a in aliases if a in names] for aliases in POSE_COLUMNS]
-    if not stamps or not all(aliased):
+    if not (stamps or all(parts)) or not all(aliased):
         raise FileFormatError(
             f'{lines.where(0)}: columns {", ".join(names)}; expected a header with stamp_s or '
-            'stamp_ns, x, y, z, qx, qy, qz, qw'
+            'stamp_ns (or sec, nsec), x, y, z, qx, qy, qz, qw'
         )
-    rows = table_rows(lines.without_first(), len(names), separator=',')
-    stamp_ns = column_ns(rows, stamps[0], header[stamps[0]][1])
+    rows = table_rows(lines.at(range(1, len(lines.texts))), len(names), separator=',')
+    if stamps:
+        unit = header[stamps[0]][1] or unit_of_column(rows, stamps[0])
+        stamp_ns = column_ns(rows, stamps[0], unit)
+    else:
+        stamp_ns = column_ns(rows, parts[0][0], 's') + column_ns(rows, parts[1][0], 'ns')
     poses = quaternion_rows(rows, [columns[0] for columns in aliased])
     return stamped_poses(rows.lines, stamp_ns, poses)
 
@@ -316,21 +371,41 @@ def stamped_poses(
 
 def column_name(text: str) -> tuple[str, str]:
     """Return name and unit of a CSV column: ``stamp_ns``, or ``timestamp [ns]`` as EuRoC has."""
-    name, _, bracket = text.strip().strip('"').lower().partition('[')
-    name, unit = name.strip(), bracket.partition(']')[0].strip()
+    name, _, bracket = text.strip().strip('"').lower().replace('(', '[').partition('[')
+    name, unit = name.strip(), bracket.rstrip(')] ').strip()
     for suffix in UNITS_NS:
         if name.removesuffix(f'_{suffix}') in STAMP_COLUMNS:
             return name.removesuffix(f'_{suffix}'), unit or name.rpartition('_')[2] * ('_' in name)
     return name, unit
 
 
-def kitti_poses(lines: TextLines) -> Trajectory:
-    """Return the poses of a KITTI file, each the upper three rows of a matrix."""
-    columns, meaning = COLUMNS['kitti']
-    poses, skew = matrix_rows(table_rows(lines, columns, meaning=meaning), slice(None))
+def matrix_poses(lines: TextLines) -> Trajectory:
+    """Return the poses of a file of matrices, in a line each, perhaps numbered, or in four."""
+    if len(lines.texts[0].split()) in (3, 4):
+        lines = joined_by_four(lines)
+    width = len(lines.texts[0].split())
+    rows = table_rows(lines, width if width in MATRICES else 12, meaning=': 3 or 4 rows of 4')
+    first = width % 4
+    poses, skew = matrix_rows(rows, slice(first, first + 12))
+    if width >= 16 and not np.allclose(rows.numbers(slice(first + 12, None)), [0, 0, 0, 1]):
+        raise FileFormatError(f'{lines.path}: last rows of matrices, expected 0 0 0 1')
     warn_of_skew(lines.path, skew)
+    table = np.hstack([poses[:, :3, 3], quaternions(poses)])
+    if first:
+        return numbered_poses(table, rows.numbers([0])[:, 0].astype(np.int64))
     stamps = kitti_stamps(Path(lines.path).with_name(KITTI_TIMES), len(poses))
-    return Trajectory(stamps, poses[:, :3, 3].copy(), quaternions(poses))
+    return Trajectory(stamps, table[:, :3], table[:, 3:])
+
+
+def joined_by_four(lines: TextLines) -> TextLines:
+    """Return matrices of four lines as a line each, without the three numbers that Redwood has."""
+    at = [row for row, text in enumerate(lines.texts) if len(text.split()) != 3]
+    if len(at) % 4 or not at:
+        raise FileFormatError(
+            f'{lines.path}: {len(at)} lines of a matrix, expected four for each pose'
+        )
+    texts = [' '.join(lines.texts[row] for row in at[k : k + 4]) for k in range(0, len(at), 4)]
+    return TextLines(lines.path, [lines.numbers[row] for row in at[::4]], texts)
 
 
 def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:

@@ -64,13 +64,16 @@ def save_tsdf(path: str | Path, blocks: BlockMap, *, compress: bool = False) -> 
         If the file cannot be written.
 
     """
+    save_state(path, *tsdf_content(blocks), compress=compress)
+
+
+def tsdf_content(blocks: BlockMap) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """Return copies of the arrays of a TSDF, and its attributes, for save_state."""
     rows = blocks.rows()
     rows = rows[np.argsort(block_keys(blocks.index(rows)))]
     content = blocks.copied(rows)
     arrays = {name: getattr(content, name) for name in ARRAYS}
-    arrays['stamps'] = NO_STAMPS
-    attributes = attributes_of(blocks.config)
-    save_state(path, arrays, attributes, compress=compress)
+    return {**arrays, 'stamps': NO_STAMPS}, attributes_of(blocks.config)
 
 
 def attributes_of(config: TsdfConfig) -> dict[str, Any]:

@@ -45,6 +45,7 @@ KINDS = {
     MATCHED_IDS: Kind.FIRST,
     **dict.fromkeys(('rgb', 'rgba'), Kind.COLOUR),
     **dict.fromkeys(('label', 'labels', 'class', 'instance', 'object', 'id', 'tag'), Kind.FIRST),
+    **dict.fromkeys(('classification', 'return_number', 'number_of_returns'), Kind.FIRST),  # LAS
     **dict.fromkeys(('ring', 'line', 'channel', 'laser_id', 'return_type'), Kind.FIRST),
 }
 """Kind of columns by name; that of all others follows from their type."""

@@ -300,11 +300,13 @@ class Layer:
         """
         return []
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path) -> Callable[[], object] | None:
         """
         Write the state of the layer to a file, whole or not at all.
 
-        Called only if a layer overrides it; such a layer overrides ``load`` too.
+        Or copy the state and return the function that writes the copy, for another thread: no
+        scan is mapped before ``save`` returns. Called only if a layer overrides it; such a layer
+        overrides ``load`` too.
 
         Raises
         ------

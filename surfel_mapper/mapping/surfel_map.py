@@ -338,6 +338,12 @@ class SurfelMap(MomentMap):
         shifted.merge(self)
         return shifted
 
+    def emptied(self) -> SurfelMap:
+        """Return an empty map of the same voxels, columns and origin."""
+        return SurfelMap(
+            self.voxel_size_m, columns=self.columns, level=self.level, origin_m=self.origin_m
+        )
+
     def copy(self) -> SurfelMap:
         """Return an independent copy."""
         settings = {'columns': self.columns, 'level': self.level}

@@ -86,6 +86,11 @@ class MessageReader:
             self._order = '<' if kind[1] else '>'
 
     @property
+    def is_bigendian(self) -> bool:
+        """Whether numbers have their most significant byte first."""
+        return self._order == '>'
+
+    @property
     def remaining(self) -> int:
         """Number of bytes left."""
         return len(self._raw) - self._at
@@ -108,7 +113,10 @@ class MessageReader:
 
     def sequence(self) -> memoryview:
         """Return the next sequence of bytes, as a view."""
-        size = self.number('I')
+        return self.view(self.number('I'))
+
+    def view(self, size: int) -> memoryview:
+        """Return the next ``size`` bytes, as a view."""
         if size > self.remaining:
             raise ValueError(f'{size} bytes announced, {self.remaining} left')
         view = memoryview(self._raw)[self._at : self._at + size]
@@ -117,11 +125,7 @@ class MessageReader:
 
     def string(self) -> str:
         """Return the next string."""
-        size = self.number('I')
-        if size > self.remaining:
-            raise ValueError(f'{size} bytes announced, {self.remaining} left')
-        text = bytes(self._raw[self._at : self._at + size])
-        self._at += size
+        text = bytes(self.sequence())
         return (text if self.is_ros1 else text.removesuffix(b'\x00')).decode()
 
 

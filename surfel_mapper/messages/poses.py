@@ -12,6 +12,8 @@ covariances, at 100 Hz more than mapping takes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from functools import lru_cache
+import logging
 import struct
 from typing import Any, NamedTuple
 
@@ -19,6 +21,11 @@ from surfel_mapper.errors import PoseError
 from surfel_mapper.messages.cdr import frame_name, MessageReader, read_header, stamp_ns
 
 ODOMETRY, POSE, TF = 'odometry', 'pose', 'tf'
+
+MAX_WARNED = 64
+"""Number of topics kept to give a warning once for each."""
+
+_log = logging.getLogger(__name__)
 
 
 class StampedPose(NamedTuple):
@@ -38,11 +45,12 @@ def poses_in(kind: str, msg: Any, base: str) -> Iterator[StampedPose]:
     Parameters
     ----------
     kind : str
-        odometry (nav_msgs/Odometry), pose (geometry_msgs/PoseStamped) or tf (tf2_msgs/TFMessage).
+        odometry (nav_msgs/Odometry), pose (geometry_msgs/PoseStamped, with covariance or not) or
+        tf (tf2_msgs/TFMessage).
     msg : message
         From rclpy or rosbags.
     base : str
-        Child frame of a stamped pose; the other messages state theirs.
+        Child frame of a stamped pose, and of odometry that states none.
 
     """
     if kind == TF:
@@ -52,9 +60,16 @@ def poses_in(kind: str, msg: Any, base: str) -> Iterator[StampedPose]:
             yield stamped_pose(stamped.header, child, transform.translation, transform.rotation)
     elif kind == ODOMETRY:
         pose = msg.pose.pose
-        yield stamped_pose(msg.header, msg.child_frame_id, pose.position, pose.orientation)
+        child = msg.child_frame_id or base
+        yield stamped_pose(msg.header, child, pose.position, pose.orientation)
     else:
         yield stamped_pose(msg.header, base, msg.pose.position, msg.pose.orientation)
+
+
+@lru_cache(maxsize=MAX_WARNED)
+def warn_of_child(topic: str, base: str) -> None:
+    """Warn once of odometry that does not state the frame of its pose."""
+    _log.warning('%s: child_frame_id is empty, its poses are taken for those of %s', topic, base)
 
 
 def stamped_pose(header: Any, child: str, position: Any, orientation: Any) -> StampedPose:
@@ -103,6 +118,9 @@ def raw_poses(
         for _ in range(number):
             header = read_header(reader)
             child = frame_name(reader.string() if kind in (TF, ODOMETRY) else base)
+            if not child and kind == ODOMETRY:
+                warn_of_child(topic, base)
+                child = base
             parent, at_ns = frame_name(header.frame_id), stamp_ns(header)
             values = reader.floats(7)
             poses.append(StampedPose(parent, child, at_ns, values[:3], values[3:]))

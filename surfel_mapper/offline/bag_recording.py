@@ -12,29 +12,42 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import replace
-from functools import partial
+from dataclasses import asdict, replace
+from functools import cache, partial
+from itertools import islice
+import logging
 import math
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.bags.reader import BagMessage, BagReader
-from surfel_mapper.bags.topics import CLOUD
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
+from surfel_mapper.messages.cdr import stamp_ns
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.poses import raw_poses
+from surfel_mapper.messages.poses import raw_poses, StampedPose
+from surfel_mapper.offline.clocks import clock_offsets, ClockOffset
 from surfel_mapper.offline.pose_choice import (
     choose_for_bag,
     first_scans,
     pose_summary,
+    sampled,
     why_not_deskewed,
 )
-from surfel_mapper.offline.pose_sources import pose_topics, PosePath, PoseTopics, static_topics
+from surfel_mapper.offline.pose_sources import (
+    pose_topics,
+    PosePath,
+    PoseTopics,
+    STATIC,
+    static_topics,
+    static_transforms,
+)
 from surfel_mapper.offline.request import part, Request, Span, WHOLE
 
 if TYPE_CHECKING:  # they load the compiler, which `info` does not need
     from surfel_mapper.offline.image_feeds import Decode, DepthFeed, SceneFeed
     from surfel_mapper.pipeline import Mapper, Update
+
+_log = logging.getLogger(__name__)
 
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 """Type of the calibrations that the feeds of images read."""
@@ -69,13 +82,23 @@ class BagRecording:
         self.cuts = reader.cuts
         self.topics = chosen_topics(reader, request, config)
         check_mounts(request, self.topics, config)
-        choice = choose_for_bag(reader, self.topics, request, config)
+        offsets_ns = {
+            topic: round(1e9 * (config.input.time_offset_s + request.time_offsets.get(topic, 0.0)))
+            for topic in self.topics
+        }
+        sample = cache(partial(sampled, reader, offsets_ns))
+        choice = choose_for_bag(reader, self.topics, request, config, sample)
         self.pose_reason, config = choice.reason, choice.config
         scans = first_scans(reader, self.topics) if config.input.kind == 'cloud' else []
         self.deskew_reason = why_not_deskewed(config, scans)
         if request.mounts:
             config = config.replace({'frames.base_to_sensor': ()})
-        self.poses = self._poses(request, config, path)
+        chosen = '' if choice.topic.endswith(STATIC) else choice.topic
+        self.poses = self._poses(request, config, path, request.pose_topic or chosen or None)
+        static_transforms(reader, self.poses.static)  # refuses topics that disagree
+        self.clocks: list[ClockOffset] = []
+        if self.poses.kinds or (config.pose.source == 'registration' and path is None):
+            self.clocks = clock_offsets(sample(), self.topics, self.poses.kinds or None)
         self.config = config
         self.span = part(
             str(request.path),
@@ -105,21 +128,27 @@ class BagRecording:
         if stop_ns is None and (start_ns is None or every == 1):
             path.check_scan((num_clouds - 1) // every * every)
 
-    def _poses(self, request: Request, config: Config, path: PosePath | None) -> PoseTopics:
+    def _poses(
+        self, request: Request, config: Config, path: PosePath | None, name: str | None
+    ) -> PoseTopics:
         """Return the source of the poses."""
         topics = self.reader.topics
         if path is None:
-            found = pose_topics(topics, config, request.pose_topic)
+            found = pose_topics(topics, config, name, self.topics, request.static_topics)
         elif request.pose_topic is not None:
             raise BagError(f'{request.path}: poses of {request.pose_topic} or of {path.path}?')
         elif not path.has_stamps and len(self.topics) > 1:
             raise BagError(f'{path.path}: poses without times, for several topics of clouds')
         else:
-            static = () if config.frames.base_to_sensor else static_topics(topics)
-            found = PoseTopics({}, static, path)
+            static = static_topics(topics, self.topics, request.static_topics)
+            found = PoseTopics({}, () if config.frames.base_to_sensor else static, path)
         if request.mounts and config.pose.source != 'tf':
             found = replace(found, static=())  # two poses of one sensor might disagree
-        return replace(found, mounts=request.mounts)
+        unstamped = frozenset(
+            name for name in (*self.topics, *found.kinds) if is_unstamped(self.reader, name)
+        )
+        own_ns = {topic: round(1e9 * seconds) for topic, seconds in request.time_offsets.items()}
+        return replace(found, mounts=request.mounts, offsets_ns=own_ns, unstamped=unstamped)
 
     @property
     def num_scans(self) -> int:
@@ -149,12 +178,17 @@ class BagRecording:
             'pose_topics': [*self.poses.kinds, *self.poses.static],
             'poses': None if path is None else str(path.path),
             **pose_summary(self.config, path, self.pose_reason, self.deskew_reason),
+            'clock_offsets': [{**asdict(clock), 'text': str(clock)} for clock in self.clocks],
         }
 
     def replay(
         self, mapper: Mapper, stopped: Callable[[], bool] = lambda: False
     ) -> Iterator[Update]:
         """Feed the clouds to a mapper; yield the update of each."""
+        for clock in self.clocks:
+            _log.warning('%s', clock)
+        for topic in sorted(self.poses.unstamped):
+            _log.warning('%s: header.stamp is 0, not set: the record times are used', topic)
         return feed(self.reader, mapper, self.topics, self.poses, span=self.span, stopped=stopped)
 
 
@@ -163,13 +197,27 @@ def chosen_topics(reader: BagReader, request: Request, config: Config) -> list[s
     configured = [f'/{name.lstrip("/")}' for name in config.input.topics]
     named = [*request.topics] or [*request.mounts] or configured
     names: list[str | None] = [*named] or [None]
-    choose: Callable[[str | None], str] = partial(reader.topics.choose, CLOUD)
+    choose: Callable[[str | None], str] = reader.topics.choose_cloud
     if config.input.kind == 'depth':
         choose = reader.topics.choose_image
     topics = [choose(name) for name in dict.fromkeys(names)]
     for name in config.image_topics.values():
         reader.topics.choose_image(f'/{name.lstrip("/")}')
     return topics
+
+
+def is_unstamped(reader: BagReader, topic: str) -> bool:
+    """Return whether the stamps of a topic are not set, by its first two messages."""
+    try:
+        first = [reader.decode(message) for message in islice(reader.messages([topic]), 2)]
+    except (BagError, CloudFormatError):
+        return False
+    headers = [
+        stamped.header
+        for message in first
+        for stamped in getattr(message, 'transforms', [message])
+    ]
+    return bool(headers) and not any(map(stamp_ns, headers))
 
 
 def check_mounts(request: Request, topics: list[str], config: Config) -> None:
@@ -226,9 +274,7 @@ def feed(
 
     """
     clouds = {cloud_topics} if isinstance(cloud_topics, str) else set(cloud_topics)
-    for topic, mount in poses.mounts.items():
-        base = mapper.config.frames.base
-        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
+    static = add_static(reader, mapper, poses)
     first = numbers_before(reader, clouds, poses, span)
     seen: Counter[str] = Counter()
 
@@ -251,7 +297,7 @@ def feed(
             add_camera_info(reader, mapper, message, images)
         elif message.topic not in clouds:
             with mapper.counters.timed('poses'):
-                add_poses(reader, mapper, message, poses)
+                add_poses(reader, mapper, message, poses, static)
         elif span.holds(message.record_ns):
             if seen[message.topic] % span.every == 0:
                 number = first[message.topic] + seen[message.topic]
@@ -338,9 +384,13 @@ def add_cloud(
         return
     if is_mounted:
         scan = replace(scan, frame_id=message.topic)
+    if message.topic in poses.unstamped:
+        scan = scan.moved_in_time(message.record_ns - scan.stamp_ns)
+    scan = scan.moved_in_time(poses.offsets_ns.get(message.topic, 0))
     if poses.path is not None:
-        poses.path.add_for(mapper, scan.stamp_ns, number)
-    mapper.add_scan(scan)
+        offset_ns = round(1e9 * mapper.config.input.time_offset_s)
+        poses.path.add_for(mapper, scan.stamp_ns + offset_ns, number)
+    mapper.add_scan(scan, message.topic)
 
 
 def add_camera_info(
@@ -353,14 +403,46 @@ def add_camera_info(
         mapper.ignore_message('bad_message', f'calibration ignored: {error}')
 
 
-def add_poses(reader: BagReader, mapper: Mapper, message: BagMessage, topics: PoseTopics) -> None:
-    """Enter the poses of a message; one that cannot be read is counted."""
+def add_static(
+    reader: BagReader, mapper: Mapper, poses: PoseTopics
+) -> dict[tuple[str, str], StampedPose]:
+    """Enter mounts and the first static transforms; return the latter for ``add_poses``."""
+    for topic, mount in poses.mounts.items():
+        base = mapper.config.frames.base
+        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
+    static = static_transforms(reader, poses.static)
+    for pose in static.values():
+        add_pose(mapper, pose, poses, is_static=True)
+    return static
+
+
+def add_poses(
+    reader: BagReader,
+    mapper: Mapper,
+    message: BagMessage,
+    topics: PoseTopics,
+    static: dict[tuple[str, str], StampedPose],
+) -> None:
+    """Enter the poses of a message that are not in ``static``; one that is damaged is counted."""
     kind, base = topics.kinds.get(message.topic, 'tf'), mapper.config.frames.base
     try:
         poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
     except PoseError as error:
         mapper.ignore_message('bad_message', f'pose ignored: {error}')
         return
+    is_static = message.topic in topics.static
     for pose in poses:
-        if topics.path is None or pose.child != base:  # the file has the pose of the base
-            mapper.add_pose(*pose, static=message.topic in topics.static)
+        if message.topic in topics.unstamped:
+            pose = pose._replace(stamp_ns=message.record_ns)
+        if is_static:
+            key, pose = (message.topic, pose.child), pose._replace(stamp_ns=0)
+            if static.get(key) == pose:
+                continue
+            static[key] = pose
+        add_pose(mapper, pose, topics, is_static=is_static)
+
+
+def add_pose(mapper: Mapper, pose: StampedPose, topics: PoseTopics, *, is_static: bool) -> None:
+    """Enter a pose, unless a file has the poses of its frame."""
+    if topics.path is None or pose.child != mapper.config.frames.base:
+        mapper.add_pose(*pose, static=is_static)

@@ -34,6 +34,7 @@ from surfel_mapper.files.pose_rows import (
     rigid_poses,
     warn_of_skew,
 )
+from surfel_mapper.files.raw import FLOATS
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.stamps import column_ns, read_dates, read_times
 from surfel_mapper.files.text_table import finite, read_lines, table_rows
@@ -70,6 +71,11 @@ MAX_CALIBRATION_BYTES = 1 << 16
 """Size limit of a calibration; those of KITTI have 2 kB."""
 
 
+def read_kitti(path: Path) -> tuple[npt.NDArray[Any], Columns]:
+    """Return the points of a scan, in a .bin four float32 each, as most data sets have them."""
+    return read_scan(path, FLOATS)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Dataset:
     """
@@ -99,7 +105,7 @@ class Dataset:
     stamps_ns: list[int]
     trajectory: Trajectory | None = None
     poses_path: Path | None = None
-    read: Read = read_scan
+    read: Read = read_kitti
     missing: str = ''
 
     @property
@@ -185,20 +191,21 @@ def kitti_raw(path: Path) -> Dataset | None:
 
 def nuscenes(path: Path) -> Dataset | None:
     """Recognise samples/LIDAR_TOP and sweeps/LIDAR_TOP, with the tables of v1.0-*/."""
-    found = [
+    scans = [
         file
         for name in ('samples', 'sweeps')
         for file in scans_in(path / name / 'LIDAR_TOP', '.pcd.bin')
     ]
-    if not found:
+    if not scans:
         return None
-    by_time = sorted((stamp_in_name(file, 1000), file) for file in found)
+    by_time = sorted((stamp_in_name(file, 1000), file) for file in scans)
     stamps_ns, files = [stamp for stamp, _ in by_time], [file for _, file in by_time]
     tables = next(iter(sorted(path.glob('v1.0-*/sample_data.json'))), None)
     if tables is None:
-        return Dataset('nuScenes', files, stamps_ns)
+        return Dataset('nuScenes', files, stamps_ns, read=read_scan)
     poses = np.array(nuscenes_poses(tables, files))
-    return Dataset('nuScenes', files, stamps_ns, trajectory(tables, stamps_ns, poses), tables)
+    found = trajectory(tables, stamps_ns, poses)
+    return Dataset('nuScenes', files, stamps_ns, found, tables, read_scan)
 
 
 def nuscenes_poses(tables: Path, files: Sequence[Path]) -> list[Floats]:
@@ -301,7 +308,8 @@ def scans_in(folder: Path, suffix: str) -> list[Path]:
     """Return the files of a directory with an ending, 2 before 10; empty without the directory."""
     if not folder.is_dir():
         return []
-    return sorted((f for f in folder.iterdir() if f.name.endswith(suffix)), key=by_number)
+    files = (f for f in folder.iterdir() if f.name.lower().endswith(suffix) and f.name[0] != '.')
+    return sorted(files, key=by_number)
 
 
 def structured(dtype: np.dtype[Any]) -> Read:

@@ -25,7 +25,7 @@ from surfel_mapper.counters import Counters
 from surfel_mapper.errors import BagError, CloudFormatError, FileFormatError, FilterError
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.atomic import check_free, make_directory
-from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
+from surfel_mapper.files.scan_files import Points, read_scan, scan_files, scan_reader, SUFFIXES
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.columns import as_fields
 from surfel_mapper.geometry import Transform
@@ -74,6 +74,7 @@ def filter_clouds(
     *,
     topics: Sequence[str] = (),
     T_base_sensor: Transform | None = None,
+    bin_columns: int | None = None,
     overwrite: bool = False,
     show: Show = lambda done, expected: None,
 ) -> FilteredClouds:
@@ -93,6 +94,8 @@ def filter_clouds(
         Topics of a bag whose clouds are filtered; empty: all clouds.
     T_base_sensor : (4, 4) float64, optional
         Pose of the sensor on the robot, for filters that need it.
+    bin_columns : int, optional
+        Number of columns of .bin files; without, that which fits their values.
     overwrite : bool
         Whether outputs may be replaced; without it, a directory must be new or empty.
     show : callable
@@ -117,6 +120,7 @@ def filter_clouds(
             )
         sources[target] = source
     check_free(Path(output), overwrite)
+    work.read = scan_reader([source for source, _ in pairs if not is_bag(source)], bin_columns)
     chain.warm_up()
     for source, target in pairs:
         log.info('%s is filtered into %s', source, target)
@@ -143,7 +147,7 @@ def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
         yield inputs[0], output
         return
     if len(inputs) == 1 and inputs[0].is_file():
-        if output.suffix not in WRITTEN:
+        if output.suffix.lower() not in WRITTEN:
             raise FileFormatError(f'{output}: expected a file ending in {" or ".join(WRITTEN)}')
         yield inputs[0], output
         return
@@ -157,7 +161,7 @@ def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
                 f'{each}: no bag, no scans in it; expected files ending in {", ".join(SUFFIXES)}'
             )
         for file in files:
-            suffix = file.suffix if file.suffix in WRITTEN else '.ply'
+            suffix = file.suffix if file.suffix.lower() in WRITTEN else '.ply'
             yield file, output / f'{file.stem}{suffix}'
 
 
@@ -190,20 +194,25 @@ class _Work:
         self.topics = tuple(topics)
         self.pose = pose
         self.show = show
+        self.read: Callable[[Path], Points] = read_scan
         self.counters = Counters()
         self.done = FilteredClouds()
 
     def filter_file(self, source: Path, target: Path, expected: int) -> None:
         """Filter the cloud of a file; its number is its stamp, which random filters use."""
-        points, columns = read_scan(source)
+        points, columns = self.read(source)
         number = self.done.scans
         scan = Scan(points=points, stamp_ns=number, frame_id='sensor', columns=columns)
         try:
             scan = self._filtered(scan)
         except FilterError as error:
             raise FilterError(f'{source}: {error}') from error
-        write = pcd.write_points if target.suffix == '.pcd' else ply.write_points
-        write(target, as_fields(scan, is_flat=True, has_int64=target.suffix == '.pcd'))
+        fields = as_fields(scan, is_flat=True, has_int64=target.suffix.lower() == '.pcd')
+        if target.suffix.lower() == '.ply':
+            ply.write_points(target, fields)
+        else:
+            is_pcd = source.suffix.lower() == '.pcd'
+            pcd.write_points(target, fields, pcd.read_viewpoint(source) if is_pcd else pcd.ORIGIN)
         self.show(self.done.scans, expected)
 
     def filter_bag(self, source: Path, target: Path, overwrite: bool) -> None:

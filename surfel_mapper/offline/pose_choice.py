@@ -11,14 +11,14 @@ to map, and deskewed if its points carry times. ``Request.poses_from`` overrides
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.offline.pose_sources import DEFAULTS, TYPES
+from surfel_mapper.offline.pose_sources import DEFAULTS, source_topics, TYPES
 from surfel_mapper.offline.survey import mounting, Offer, offers, Survey, survey
 from surfel_mapper.poses import AUTO, choose_source, has_chain, PoseCandidate, without_chain
 from surfel_mapper.sensors.time_fields import time_fields
@@ -32,6 +32,9 @@ SAMPLE_NS = 3_000_000_000
 """Length of the sample of a bag, quadrupled until it contains a cloud."""
 
 DEFAULT = Config()
+
+USUAL = [types[0] for types in TYPES.values()]
+"""Types of poses that a choice need not name."""
 
 SETTING = {'file': 'pose'}
 """The pose.source of a choice that has another name."""
@@ -59,7 +62,11 @@ class PoseChoice:
 
 
 def choose_for_bag(
-    reader: BagReader, topics: Sequence[str], request: Request, config: Config
+    reader: BagReader,
+    topics: Sequence[str],
+    request: Request,
+    config: Config,
+    sample: Callable[[], Survey],
 ) -> PoseChoice:
     """
     Choose the source of the poses of a bag.
@@ -74,6 +81,8 @@ def choose_for_bag(
         Its ``poses_from`` and ``poses`` come first.
     config : Config
         Its ``pose.source`` counts unless it is auto, and its ``frames``.
+    sample : callable
+        Returns a survey of the first clouds of the bag; see ``sampled``.
 
     Raises
     ------
@@ -88,22 +97,21 @@ def choose_for_bag(
     if wanted in ('file', 'identity', 'registration'):
         return PoseChoice(config.replace({'pose.source': SETTING.get(wanted, wanted)}))
     asked = config.replace({'pose.source': wanted or AUTO})
-    has_poses = any(reader.topics.of_type(type_) for type_ in TYPES.values())
+    has_poses = any(reader.topics.of_type(*types) for types in TYPES.values())
     is_framed = config.frames != DEFAULT.frames or request.mounts or request.pose_topic
     if has_poses and not is_depth and not is_framed:
-        return choose_by_sample(reader, topics, wanted, asked)
+        return choose_by_sample(reader, topics, wanted, asked, sample())
     if wanted is not None:
         return PoseChoice(asked)
     if has_poses:
-        return choose_by_frames(reader, topics, request, config)
+        return choose_by_frames(reader, topics, request, config, sample)
     return registered(reader, topics, config, 'the recording has no poses')
 
 
 def choose_by_sample(
-    reader: BagReader, topics: Sequence[str], wanted: str | None, config: Config
+    reader: BagReader, topics: Sequence[str], wanted: str | None, config: Config, sample: Survey
 ) -> PoseChoice:
     """Return the source that gives the clouds of a sample their poses, or registration."""
-    sample = sampled(reader)
     sources = list(TYPES) if wanted is None else [wanted]
     best = {
         source: tried
@@ -139,8 +147,11 @@ def candidate(source: str, offer: Offer | None, sample: Survey, needs_half: bool
         missing = f'{offer.poses}: {offer.missing or "none of them moves"}'
     elif needs_half and 2 * offer.covered < offer.total:
         missing = f'{offer.poses} covers {offer.covered} of {offer.total} clouds'
-    text = ', '.join(f'{name}: {value}' for name, value in changes(offer.settings).items())
-    return PoseCandidate(source, offer.poses, missing, text)
+    texts = [f'{name}: {value}' for name, value in changes(offer.settings).items()]
+    surveyed = sample.topics.get(offer.poses)
+    if surveyed and surveyed.topic.type not in USUAL:
+        texts.insert(0, f'a {surveyed.topic.type.rpartition("/")[2]}')
+    return PoseCandidate(source, offer.poses, missing, ', '.join(texts))
 
 
 def changes(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -154,17 +165,21 @@ def changes(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def choose_by_frames(
-    reader: BagReader, topics: Sequence[str], request: Request, config: Config
+    reader: BagReader,
+    topics: Sequence[str],
+    request: Request,
+    config: Config,
+    sample: Callable[[], Survey],
 ) -> PoseChoice:
     """Return the first source that is there, as the node does, with the frames of the user."""
     candidates = []
-    for source, type_ in TYPES.items():
-        names = [
-            topic for topic in reader.topics.of_type(type_) if request.pose_topic in (None, topic)
-        ]
+    for source, types in TYPES.items():
+        names = source_topics(reader.topics, source)
+        if request.pose_topic is not None:
+            names = [name for name in reader.topics.of_type(*types) if name == request.pose_topic]
         missing = '' if names else 'no topic'
         if names and source == 'tf' and config.input.kind == 'cloud':
-            missing = missing_transforms(sampled(reader), topics, request, config)
+            missing = missing_transforms(sample(), topics, request, config)
         topic = DEFAULTS[source] if DEFAULTS[source] in names else (names or [''])[0]
         candidates.append(PoseCandidate(source, topic, missing))
     choice = choose_source(candidates)
@@ -184,10 +199,11 @@ def missing_transforms(
     parents = {
         pose.child: pose.parent
         for topic, poses in sample.poses.items()
-        if sample.topics[topic].topic.type == TYPES['tf']
+        if sample.topics[topic].topic.type in TYPES['tf'] and request.pose_topic in (None, topic)
         for pose in poses
     }
-    parents |= {pose.child: pose.parent for pose in sample.static}
+    names = [*topics, *filter(None, [request.pose_topic])]
+    parents |= {pose.child: pose.parent for pose in sample.static_for(*names)}
     parents |= dict.fromkeys(request.mounts, frames.base)
     of_clouds = {
         topic if topic in request.mounts else frame
@@ -225,14 +241,15 @@ def is_usable(offer: Offer, found: Survey) -> bool:
     if source_of(offer) != 'tf' or fixed in ('odom', 'map'):
         return True
     frames = [frame for clouds, frame in found.stamps if clouds == offer.clouds]
-    return not any(fixed == frame or mounting(found.static, fixed, frame) for frame in frames)
+    static = found.static_for(offer.clouds, offer.poses)
+    return not any(fixed == frame or mounting(static, fixed, frame) for frame in frames)
 
 
-def sampled(reader: BagReader) -> Survey:
-    """Return a survey of the first clouds of a bag."""
+def sampled(reader: BagReader, offsets_ns: Mapping[str, int]) -> Survey:
+    """Return a survey of the first clouds of a bag, with offsets added to their stamps."""
     length_ns = SAMPLE_NS
     while True:
-        found = survey(reader, stop_ns=reader.start_ns + length_ns)
+        found = survey(reader, stop_ns=reader.start_ns + length_ns, offsets_ns=offsets_ns)
         if found.stamps or reader.start_ns + length_ns > reader.end_ns:
             return found
         length_ns *= 4

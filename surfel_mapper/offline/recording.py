@@ -73,7 +73,8 @@ def open_recording(request: Request, config: Config) -> Iterator[Recording]:
     """
     poses = None if request.poses is None else PosePath(request.poses, request.poses_format)
     if is_scans(request.path):
-        named = [*request.topics, *request.mounts, *filter(None, [request.pose_topic])]
+        named = [*request.topics, *request.mounts, *request.static_topics]
+        named += filter(None, [request.pose_topic])
         if named:
             raise BagError(f'{request.path}: files of scans have no topic {named[0]}')
         yield ScanFolder(request, config, poses)

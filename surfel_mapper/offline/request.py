@@ -35,30 +35,39 @@ class Request:
         Topics of clouds; empty: the only one of the bag.
     pose_topic : str, optional
         Topic of poses, if there are several.
+    static_topics : tuple of str
+        Topics of static transforms; empty: those in the namespaces of clouds and poses.
     poses : Path, optional
         A file of poses of frames.base instead.
     poses_format : str, optional
-        tum, kitti or csv.
+        tum, kitti, csv or g2o.
     poses_from : str, optional
         Source of the poses: auto, tf, odometry, pose, file, registration or identity; without,
         the configuration decides.
     mounts : mapping of str to 7 floats
         Pose of the sensor of each topic in frames.base, x y z qx qy qz qw.
+    time_offsets : mapping of str to float
+        Seconds added to the stamps of clouds of a topic, beside ``input.time_offset_s``.
     start_s, duration_s, every : float, float, int
         The part to map; see ``part``.
+    bin_columns : int, optional
+        Number of columns of .bin files; without, that which fits their values.
 
     """
 
     path: Path
     topics: tuple[str, ...] = ()
     pose_topic: str | None = None
+    static_topics: tuple[str, ...] = ()
     poses: Path | None = None
     poses_format: str | None = None
     poses_from: str | None = None
     mounts: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    time_offsets: Mapping[str, float] = field(default_factory=dict)
     start_s: float = 0.0
     duration_s: float = math.inf
     every: int = 1
+    bin_columns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,7 +23,7 @@ from typing import Any, TYPE_CHECKING
 from surfel_mapper.bags.paths import is_storage, METADATA
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError, FileFormatError
-from surfel_mapper.files.scan_files import read_scan, scan_files, scan_suffix, SUFFIXES
+from surfel_mapper.files.scan_files import scan_files, scan_reader, SUFFIXES
 from surfel_mapper.offline import ouster_pcap
 from surfel_mapper.offline.datasets import Dataset, find_dataset
 from surfel_mapper.offline.ouster_pcap import OusterPcap
@@ -39,8 +39,17 @@ from surfel_mapper.offline.scan_times import (
     is_gapless,
     numbered,
     rows_of,
+    stem,
     times_beside,
     times_in_names,
+)
+from surfel_mapper.offline.viewpoints import (
+    NOT_USED,
+    PLACE,
+    POSES,
+    viewpoint_poses,
+    viewpoints_of,
+    with_viewpoint,
 )
 from surfel_mapper.scan import Scan
 
@@ -90,23 +99,32 @@ class ScanFolder:
 
     def __init__(self, request: Request, config: Config, poses: PosePath | None) -> None:
         self.path = request.path
-        is_packets = self.path.suffix == ouster_pcap.SUFFIX
+        is_packets = self.path.suffix.lower() == ouster_pcap.SUFFIX
         self.dataset = OusterPcap(self.path) if is_packets else find_dataset(self.path)
         if self.dataset is not None:
             self.files, self.format = self.dataset.files, self.dataset.format
         else:
             files = [self.path] if self.path.is_file() else scan_files(self.path)
             self.files = list(times_in_names(files)) or files
-        is_free = poses is None and request.poses_from is None
-        if self.dataset and self.dataset.trajectory and is_free and is_default(config):
+            self._read_file = scan_reader(self.files, request.bin_columns)
+        is_free = poses is None and request.poses_from is None and is_default(config)
+        if self.dataset and self.dataset.trajectory and is_free:
             poses = PosePath(self.dataset.poses_path or self.path, None, self.dataset.trajectory)
+        viewpoints = [] if self.dataset or poses is not None else viewpoints_of(self.files)
+        differing, reason = viewpoint_poses(viewpoints), ''
+        if differing is not None and request.poses_from is None:
+            poses = PosePath(self.path, None, differing) if is_free else None
+            reason = POSES if is_free else NOT_USED
         self.poses = poses
         self.stamps, self.times_from = self._stamps()
         self._rows, rows_reason = self._pose_rows()
-        missing = self.dataset.missing if isinstance(self.dataset, Dataset) else ''
+        missing = self.dataset.missing if isinstance(self.dataset, Dataset) else reason
         first = self.first_scan()
         choice = choose_for_folder(request, config, poses is not None, first, missing)
-        self.config, self.pose_reason = choice.config, choice.reason or rows_reason
+        self.config, self.pose_reason = choice.config, choice.reason or rows_reason or reason
+        is_alone = self.config.pose.source == 'identity' or (len(self.files) == 1 and is_free)
+        if is_alone and (seen_from := with_viewpoint(config, viewpoints)):
+            self.config, self.pose_reason = seen_from, PLACE
         self.deskew_reason = why_not_deskewed(self.config, [first] if first else [])
         self.span: Span = part(
             str(self.path),
@@ -189,7 +207,7 @@ class ScanFolder:
 
     def _read(self, number: int, stamp_ns: int, frame: str) -> Scan:
         if self.dataset is None:
-            points, columns = read_scan(self.files[number])
+            points, columns = self._read_file(self.files[number])
             if columns.keys() >= SURFEL_COLUMNS:
                 raise BagError(
                     f'{self.files[number]}: surfels of a map, expected scans; merge, extract, '
@@ -237,6 +255,9 @@ class ScanFolder:
         """Return the number of the pose of every scan, for poses without times, and its reason."""
         num_scans = len(self.files)
         num_poses = 0 if self.poses is None else len(self.poses.trajectory)
+        numbers = None if self.poses is None else self.poses.trajectory.number
+        if numbers is not None:
+            return self._numbered_rows(set(numbers.tolist()))
         if self.poses is None or self.poses.has_stamps or num_poses <= num_scans:
             return list(range(num_scans)), ''
         rows = rows_of(self.files, num_poses)
@@ -248,11 +269,24 @@ class ScanFolder:
             )
         return rows, f'{self.files[0].name} has pose {rows[0]}, counted from 0, of {num_poses}'
 
+    def _numbered_rows(self, numbers: set[int]) -> tuple[list[int], str]:
+        """Return the number of every scan, by its name or its place, for poses of some scans."""
+        names = [stem(file) for file in self.files]
+        is_named = all(map(str.isdecimal, names))
+        rows = [int(name) for name in names] if is_named else list(range(len(names)))
+        posed = numbers.intersection(rows)
+        if not posed:
+            raise BagError(
+                f'{self.path}: scans {rows[0]} to {rows[-1]}, poses of {min(numbers)} to '
+                f'{max(numbers)}; expected scans named by the numbers of their poses'
+            )
+        return rows, f'{len(posed)} of {len(rows)} scans have a pose of their number'
+
 
 def is_scans(path: Path) -> bool:
     """Return whether a path is a file of points, or a directory of scans and not of a bag."""
     if path.is_file():
-        return path.suffix == ouster_pcap.SUFFIX or scan_suffix(path) in SUFFIXES
+        return path.suffix.lower() in (ouster_pcap.SUFFIX, *SUFFIXES)
     if not path.is_dir() or (path / METADATA).exists():
         return False
     if find_dataset(path) is not None:

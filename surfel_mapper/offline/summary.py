@@ -9,6 +9,9 @@ from typing import Any
 
 from surfel_mapper.counters import decimals
 
+LEAST_MAPPED = 0.95
+"""Share of the scans that came which a map needs; with fewer, something is wrong."""
+
 MOST_SURROUNDED = 5
 """Scans that may seem to be surrounded by what moves along, before a replay says so."""
 
@@ -84,8 +87,26 @@ def in_order(values: Mapping[str, Any], names: Sequence[str]) -> list[tuple[str,
 
 
 def uncertain_text(summary: Mapping[str, Any]) -> str:
-    """Return which scans have no certain place on the map, and why; empty if there are none."""
-    return '\n'.join(filter(None, (apart_text(summary), surrounded_text(summary))))
+    """Return why a map is in doubt, or lacks more scans than usual; empty if neither is so."""
+    texts = apart_text(summary), surrounded_text(summary), missing_text(summary)
+    clocks = [offset['text'] for offset in summary.get('clock_offsets', [])]
+    return '\n'.join(filter(None, [*texts, *clocks]))
+
+
+def missing_text(summary: Mapping[str, Any]) -> str:
+    """Return the number of scans in the map, and the causes, if more than 5 % are not in it."""
+    scans, resets = summary['scans'], summary.get('resets', 0)
+    num_mapped = scans['mapped']
+    if resets and summary['window_scans']:  # the map has only the scans since the last one
+        num_mapped = summary['window_scans'] + sum(scans['evicted'].values())
+    num_used = num_mapped + scans['gated'] + scans.get('localised', 0)
+    if num_used >= LEAST_MAPPED * scans['received']:
+        return ''
+    causes = causes_text(scans['dropped'])
+    cleared = scans['mapped'] - num_mapped
+    if cleared > 0:
+        causes = ', '.join(filter(None, [causes, f'mapped before time was set back {cleared}']))
+    return f'only {num_used} of {scans["received"]} scans are in the map: {causes}'
 
 
 def surrounded_text(summary: Mapping[str, Any]) -> str:

@@ -10,23 +10,24 @@ Only the headers of clouds are read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain
 import math
 from typing import Any
 
 from surfel_mapper.bags.reader import BagMessage, BagReader
-from surfel_mapper.bags.topics import CLOUD, Topic
+from surfel_mapper.bags.topics import Topic, Topics
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.messages.cdr import frame_name, stamp_ns
 from surfel_mapper.messages.poses import raw_poses, StampedPose
-from surfel_mapper.offline.pose_sources import static_topics, TYPES
+from surfel_mapper.offline.pose_sources import shares_namespace, static_topics, TYPES
 from surfel_mapper.poses import TransformBuffer
 
-SOURCES = {type_: source for source, type_ in TYPES.items()}
+SOURCES = {type_: source for source, types in TYPES.items() for type_ in types}
 """The pose.source that reads each type."""
 
 ALL_TIME_S = 1e9
@@ -77,22 +78,44 @@ class Survey:
     Attributes
     ----------
     topics : dict of str to TopicSurvey
+    reader_topics : Topics
+        The topics of the bag.
     stamps : dict of (str, str) to list of int
         Stamps of the clouds, ns, by topic and frame.
     poses : dict of str to list of StampedPose
         By topic.
-    static : list of StampedPose
-        Static transforms.
+    static : dict of str to list of StampedPose
+        Static transforms, by topic.
+    leads_ns : dict of str to list of int
+        Times by which the stamps of clouds and poses are ahead of their record times, by topic.
     undecodable : int
         Number of damaged messages of clouds and poses.
 
     """
 
     topics: dict[str, TopicSurvey]
+    reader_topics: Topics
     stamps: dict[tuple[str, str], list[int]] = field(default_factory=dict)
     poses: dict[str, list[StampedPose]] = field(default_factory=dict)
-    static: list[StampedPose] = field(default_factory=list)
+    static: dict[str, list[StampedPose]] = field(default_factory=dict)
+    leads_ns: dict[str, list[int]] = field(default_factory=dict)
     undecodable: int = 0
+
+    @property
+    def sources(self) -> list[Source]:
+        """The topics of poses; that of static transforms stands for a sensor at rest."""
+        sources = [
+            Source(topic, SOURCES[self.topics[topic].topic.type], poses)
+            for topic, poses in self.poses.items()
+        ]
+        if self.static and 'tf' not in [source.kind for source in sources]:
+            sources.append(Source('/tf_static', 'tf', []))
+        return sources
+
+    def static_for(self, *names: str) -> list[StampedPose]:
+        """Return the static transforms of clouds and poses; see static_topics."""
+        chosen = static_topics(self.reader_topics, names)
+        return [pose for topic in chosen for pose in self.static.get(topic, [])]
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +148,7 @@ def survey(
     reader: BagReader,
     on_message: Callable[[], object] = lambda: None,
     stop_ns: int | None = None,
+    offsets_ns: Mapping[str, int] | None = None,
 ) -> Survey:
     """
     Read all clouds and poses of a bag.
@@ -137,6 +161,8 @@ def survey(
         Called after every message, for a progress bar.
     stop_ns : int, optional
         Record time at which to stop; without, the whole bag is read.
+    offsets_ns : mapping of str to int, optional
+        Added to the stamps of the clouds of a topic.
 
     Raises
     ------
@@ -144,11 +170,13 @@ def survey(
         If the bag is damaged.
 
     """
-    found = Survey({topic.name: TopicSurvey(topic) for topic in reader.topics})
+    found = Survey({topic.name: TopicSurvey(topic) for topic in reader.topics}, reader.topics)
     static = static_topics(reader.topics)
-    for message in reader.messages(surveyed_topics(reader), None, stop_ns):
+    moving = [name for name in surveyed_topics(reader) if name not in static]
+    for message in chain(reader.all_messages(static), reader.messages(moving, None, stop_ns)):
         try:
-            frames = note_message(found, reader, message, static)
+            offset_ns = (offsets_ns or {}).get(message.topic, 0)
+            frames = note_message(found, reader, message, static, offset_ns)
         except (BagError, CloudFormatError, PoseError):
             found.undecodable += 1
             frames = []
@@ -159,44 +187,54 @@ def survey(
 
 def surveyed_topics(reader: BagReader) -> list[str]:
     """Return the topics of clouds and poses."""
-    return [topic.name for topic in reader.topics if topic.type in (CLOUD, *SOURCES)]
+    return reader.topics.of_type(*reader.topics.clouds, *SOURCES)
 
 
 def note_message(
-    found: Survey, reader: BagReader, message: BagMessage, static: Collection[str]
+    found: Survey,
+    reader: BagReader,
+    message: BagMessage,
+    static: Collection[str],
+    offset_ns: int = 0,
 ) -> list[str]:
     """Add a message to a survey and return the frames that it names."""
-    if message.type == CLOUD:
+    if message.type in reader.topics.clouds:
         decoded = reader.decode(message)
         frame = frame_name(decoded.header.frame_id)
-        found.stamps.setdefault((message.topic, frame), []).append(stamp_ns(decoded.header))
+        stamp = (stamp_ns(decoded.header) or message.record_ns) + offset_ns
+        found.stamps.setdefault((message.topic, frame), []).append(stamp)
+        found.leads_ns.setdefault(message.topic, []).append(stamp - message.record_ns)
         return [frame]
     kind, base = SOURCES[message.type], DEFAULTS.frames.base
     poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
     if message.topic in static:
-        found.static += poses
+        found.static.setdefault(message.topic, []).extend(poses)
     else:
+        poses = [p if p.stamp_ns else p._replace(stamp_ns=message.record_ns) for p in poses]
         found.poses.setdefault(message.topic, []).extend(poses)
+        leads = found.leads_ns.setdefault(message.topic, [])
+        leads += [pose.stamp_ns - message.record_ns for pose in poses]
     return [f'{pose.parent} -> {pose.child}' for pose in poses]
 
 
 def offers(found: Survey) -> list[Offer]:
     """Return every source of poses tried on every topic of clouds, the best of each first."""
-    sources = [
-        Source(topic, SOURCES[found.topics[topic].topic.type], poses)
-        for topic, poses in found.poses.items()
-    ]
-    if found.static and 'tf' not in [source.kind for source in sources]:
-        sources.append(Source('/tf_static', 'tf', []))  # a sensor at rest
     made = [
-        tried(source, found.static, clouds, frame, stamps)
+        tried(source, found.static_for(clouds, source.topic), clouds, frame, stamps)
         for (clouds, frame), stamps in found.stamps.items()
-        for source in sources
+        for source in of_namespace(found.sources, clouds)
     ]
     kinds = list(SOURCES.values())
     return sorted(
         made, key=lambda o: (o.clouds, -o.covered, kinds.index(o.settings['pose.source']))
     )
+
+
+def of_namespace(sources: Sequence[Source], clouds: str) -> list[Source]:
+    """Return the sources of each kind in the namespace of clouds; all of a kind if none is."""
+    own = [source for source in sources if shares_namespace(source.topic, clouds)]
+    kinds = {source.kind for source in own}
+    return [source for source in sources if source in own or source.kind not in kinds]
 
 
 @dataclass(frozen=True, slots=True)

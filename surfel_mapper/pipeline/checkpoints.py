@@ -10,6 +10,8 @@ cannot be renamed at once, so layers get their second name before the map and lo
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import logging
 import os
 from pathlib import Path
@@ -20,13 +22,19 @@ from zipfile import is_zipfile
 from surfel_mapper.config import OutputConfig
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files.atomic import make_directory, replace_file
+from surfel_mapper.pipeline.drops import described
 from surfel_mapper.pipeline.mapper import Mapper
-from surfel_mapper.pipeline.saved_state import layer_files, load_mapper, save_mapper
+from surfel_mapper.pipeline.saved_state import CopiedMapper, layer_files, load_mapper
 
 LATEST = 'latest'
 """Value of map.load: the newest map or checkpoint in output.directory."""
 
 _log = logging.getLogger(__name__)
+
+
+def at_once(write: Callable[[], Path]) -> Path:
+    """Write a checkpoint in the calling thread."""
+    return write()
 
 
 class Checkpoints:
@@ -42,12 +50,32 @@ class Checkpoints:
 
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
-        self._saved_s = time.monotonic()
+        self._started_s = time.monotonic()
         self._version = mapper.map.version
+        self._is_writing = False
+        self._failure = ''
 
-    def save_if_due(self) -> Path | None:
+    @property
+    def problem(self) -> str:
+        """Why the last checkpoint failed, and the age of the last good one; empty if none did."""
+        if not self._failure:
+            return ''
+        ages_s = [
+            time.time() - path.stat().st_mtime
+            for path in checkpoint_paths(self._mapper.config.output)
+            if path.is_file()
+        ]
+        age = f'the last good one is {min(ages_s):.0f} s old' if ages_s else 'there is no good one'
+        return f'checkpoints fail ({self._failure}); {age}'
+
+    def save_if_due(self, run: Callable[[Callable[[], Path]], object] = at_once) -> Path | None:
         """
         Save the map if it has changed and the last checkpoint is old enough; return the file.
+
+        Parameters
+        ----------
+        run : callable
+            Called with the function that writes the files; another thread may call that.
 
         Raises
         ------
@@ -57,17 +85,45 @@ class Checkpoints:
         """
         mapper, now_s = self._mapper, time.monotonic()
         every_s = mapper.config.output.checkpoint_s
-        if not every_s or now_s - self._saved_s < every_s or mapper.map.version == self._version:
+        is_due = every_s and now_s - self._started_s >= every_s and not self._is_writing
+        if not is_due or mapper.map.version == self._version:
             return None
-        return self.save()
+        return self.save(run)
 
-    def save(self) -> Path:
+    def save(self, run: Callable[[Callable[[], Path]], object] = at_once) -> Path:
         """Save the map now; see save_if_due."""
-        mapper = self._mapper
-        self._saved_s, version = time.monotonic(), mapper.map.version
-        newest, before = checkpoint_paths(mapper.config.output)
+        self._started_s, version = time.monotonic(), self._mapper.map.version
+        newest, before = checkpoint_paths(self._mapper.config.output)
+        with self._reporting():
+            self._make_room(newest, before)
+            copied = CopiedMapper(newest, self._mapper)
+
+        def write() -> Path:
+            try:
+                with self._reporting():
+                    copied.write()
+            finally:
+                self._is_writing = False
+            self._version, self._failure = version, ''
+            return newest
+
+        self._is_writing = True
+        run(write)
+        return newest
+
+    @contextmanager
+    def _reporting(self) -> Iterator[None]:
+        """Keep the error of a with-block for ``problem``."""
+        try:
+            yield
+        except Exception as error:  # MemoryError too
+            self._failure = described(error)
+            raise
+
+    def _make_room(self, newest: Path, before: Path) -> None:
+        """Make the newest checkpoint the one before."""
         make_directory(newest.parent)
-        both = (layer_files(path, mapper) for path in (newest, before))
+        both = (layer_files(path, self._mapper) for path in (newest, before))
         layers = [(new, old) for (new, _), (old, _) in zip(*both, strict=True)]
         for path in (newest, before, *(path for pair in layers for path in pair)):
             if path.is_symlink():
@@ -81,9 +137,6 @@ class Checkpoints:
             os.replace(newest, before)
             for new, _ in layers:
                 new.unlink(missing_ok=True)
-        save_mapper(newest, mapper)
-        self._version = version
-        return newest
 
 
 def duplicate(path: Path, name: Path) -> None:

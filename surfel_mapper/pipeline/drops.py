@@ -15,7 +15,7 @@ import logging
 import time
 
 from surfel_mapper.counters import Counters
-from surfel_mapper.errors import one_line
+from surfel_mapper.errors import FilterError, MapError, one_line, PoseError, ScanRefusedError
 from surfel_mapper.scan import Scan
 
 _log = logging.getLogger(__name__)
@@ -23,11 +23,24 @@ _log = logging.getLogger(__name__)
 WARN_EVERY_S = 1.0
 """Shortest time between two warnings of one cause, s; every drop is counted."""
 
+MAX_CAUSES = 200
+"""Causes whose last warning is kept; some name a frame."""
+
 MAX_TOPICS = 64
 """Frames whose topics are kept; frame names may change without end."""
 
 INTERNAL = 'internal_error'
 """Cause of drops by errors that no stage expects, out of memory among them."""
+
+GATED = 'gated'
+"""Cause of scans that the motion gate leaves out, which are not counted as dropped."""
+
+CAUSES: dict[type[Exception], str] = {
+    FilterError: 'filter',
+    PoseError: 'no_pose',
+    MapError: 'map_limit',
+}
+"""Cause of the drop of a scan by the type of an error; others are INTERNAL."""
 
 REMEDIES = {
     'apart': 'it is in a map of its own; publish the pose of the robot on /initialpose',
@@ -100,14 +113,20 @@ class Drops:
             f'{f"; {remedy}" if remedy else ""}',
         )
 
-    def failure(self, scan: Scan, error: Exception, *, is_used: bool) -> None:
-        """Count an unexpected error of a scan: as a drop, unless the map has the scan."""
-        if is_used:
+    def failure(self, scan: Scan, error: Exception, *, is_mapped: bool = False) -> None:
+        """Count the error of a stage as the drop of a scan, unless the map has the scan."""
+        cause = next((cause for kind, cause in CAUSES.items() if isinstance(error, kind)), '')
+        if is_mapped:
             at = f'scan at {scan.stamp_ns / 1e9:.6f} s'
             self.message(INTERNAL, f'{at} is mapped, but not reported: {described(error)}')
+        elif not isinstance(error, ScanRefusedError):
+            self.scan(scan, cause or INTERNAL, str(error) if cause else described(error))
+        elif error.cause == GATED:
+            self.counters.gated += 1
         else:
-            self.scan(scan, INTERNAL, described(error))
-        _log.debug('scan at %d ns', scan.stamp_ns, exc_info=error)
+            self.scan(scan, error.cause, str(error))
+        if is_mapped or not (cause or isinstance(error, ScanRefusedError)):
+            _log.debug('scan at %d ns', scan.stamp_ns, exc_info=error)
 
     def message(self, cause: str, reason: str, number: int = 1) -> None:
         """Count messages other than scans as ignored for a cause."""
@@ -127,5 +146,7 @@ class Drops:
         """Log a warning, unless one of the same cause was logged just before."""
         now_s = time.monotonic()
         if not self.is_silent and now_s - self._warned_s.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
+            if len(self._warned_s) >= MAX_CAUSES:
+                self._warned_s.clear()
             self._warned_s[cause] = now_s
             _log.warning('%s', message)

@@ -13,42 +13,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
-from functools import partial
-import logging
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_whole, check_kind
-from surfel_mapper.compilation import clock, CompileStage, run_stages
+from surfel_mapper.compilation import CompileStage, run_stages
 from surfel_mapper.config import Config, declarations
-from surfel_mapper.counters import Counters
-from surfel_mapper.errors import CloudFormatError, ConfigError, MapError
+from surfel_mapper.errors import ConfigError, MapError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.layers import names as layer_names
-from surfel_mapper.mapping.channels import missing_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import checked_scans, WindowedScan
-from surfel_mapper.pipeline.drops import Drops
-from surfel_mapper.pipeline.inserter import Inserter, map_frame
+from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
-from surfel_mapper.pipeline.map_origin import MapOrigin
-from surfel_mapper.pipeline.regions import Region
+from surfel_mapper.pipeline.regions import Prism, Region
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
-from surfel_mapper.pipeline.scan_poses import ScanPoses
-from surfel_mapper.pipeline.scan_queue import ScanQueue
-from surfel_mapper.pipeline.stamp_guard import StampGuard
+from surfel_mapper.pipeline.scan_pipeline import ScanPipeline
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.pipeline.window_aligner import Alignment
 from surfel_mapper.poses import AUTO
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import SceneImage
-from surfel_mapper.sensors.deskew import point_times
-
-_log = logging.getLogger(__name__)
 
 
 class Mapper:
@@ -63,8 +52,6 @@ class Mapper:
 
     Attributes
     ----------
-    config : Config
-        The settings now; see ``reconfigure``.
     map : SurfelMap
         The map; changed by this class alone.
     window : SlidingWindow
@@ -90,22 +77,17 @@ class Mapper:
                 f'a {type(config).__name__}, expected a Config: Config.from_mapping(settings), or '
                 'load_config(path)'
             )
-        self.config = config or Config()
-        self.counters = Counters()
-        self._drops = Drops(self.counters)
-        self._guard = StampGuard(self.config.input.reset_after_s)
-        self._clears_map = False
-        settings = self.config.map
-        self.map = SurfelMap(settings.voxel_size_m, columns=settings.columns)
-        self._origin = MapOrigin(self.config, self.map)
-        self._poses = ScanPoses(self.config, self._drops, self._origin)
-        self._inserter = Inserter(self.config, self.map, self._poses, self._drops)
-        self._queue = ScanQueue(
-            self.config.pose.max_waiting_scans, self._poses, self._inserter.images, self._drops
-        )
-        self.transforms = self._poses.transforms
-        self.window = self._inserter.window
-        self.layers = self._inserter.layers.by_name
+        self._pipeline = ScanPipeline(config or Config())
+        self.counters = self._pipeline.counters
+        self.map = self._pipeline.map
+        self.window = self._pipeline.window
+        self.layers = self._pipeline.layers.by_name
+        self.transforms = self._pipeline.poses.transforms
+
+    @property
+    def config(self) -> Config:
+        """The settings now; see ``reconfigure``."""
+        return self._pipeline.config
 
     if not TYPE_CHECKING:  # hidden from mypy: the names depend on the registry
 
@@ -118,7 +100,7 @@ class Mapper:
     @property
     def registered(self) -> RegisteredPoses | None:
         """The poses found by registration; None if poses come from another source."""
-        return self._poses.registered
+        return self._pipeline.poses.registered
 
     @property
     def knows_source(self) -> bool:
@@ -128,11 +110,11 @@ class Mapper:
         A node sets it to False while ``pose.source: auto`` looks for one: scans wait, at most
         ``pose.max_waiting_scans``, and are mapped by ``insert_ready`` once it is True.
         """
-        return self._queue.is_open
+        return self._pipeline.queue.is_open
 
     @knows_source.setter
     def knows_source(self, value: bool) -> None:
-        self._queue.is_open = value
+        self._pipeline.queue.is_open = value
 
     def register_scans(self) -> None:
         """
@@ -152,13 +134,12 @@ class Mapper:
                 f'pose.source {source}, {num_used} scans mapped, map.origin {origin!r}: expected '
                 'auto, none and none to take registration'
             )
-        self._poses.register(self.config)
-        self._inserter.register(self.config)
+        self._pipeline.register()
 
     @property
     def chain(self) -> Chain:
         """The filters that scans pass."""
-        return self._inserter.preparation.chain
+        return self._pipeline.preparation.chain
 
     def add_pose(
         self,
@@ -211,16 +192,7 @@ class Mapper:
         check_kind('static', static, bool)
         for name, numbers in (('xyz', xyz), ('q_xyzw', q_xyzw)):
             check_kind(name, numbers, Iterable)
-        add = partial(self._poses.add, parent, child, stamp_ns, xyz, q_xyzw, static=static)
-        if static:
-            add()
-            return
-        refuse = partial(self._refuse_pose, parent, child)
-        own_ns = self.transforms.newest_of(child)
-        self._guard.take(stamp_ns, own_ns, self._queue.newest_ns, add, refuse)
-
-    def _refuse_pose(self, parent: str, child: str, reason: str) -> None:
-        self._drops.message('odd_stamp', f'pose of {child!r} in {parent!r} ignored: {reason}')
+        self._pipeline.add_pose(StampedPose(parent, child, stamp_ns, xyz, q_xyzw), static=static)
 
     def add_scan(self, scan: Scan, topic: str = '') -> None:
         """
@@ -234,46 +206,10 @@ class Mapper:
         check_kind('scan', scan, Scan, hint='Scan(points=..., stamp_ns=..., frame_id=...)')
         check_kind('topic', topic, str)
         self.counters.received += 1
-        if topic:
-            self._drops.name_topic(scan.frame_id, topic)
-        if not scan.frame_id:
-            self._drops.scan(scan, 'empty_frame_id', 'its header has no frame_id')
-        elif len(scan) == 0:
-            self._drops.scan(scan, 'no_points', 'it has no points')
-        elif missing := self._missing_columns(scan):
-            reason = f'its points have no {" and no ".join(missing)}'
-            self._drops.scan(scan, 'missing_column', reason)
-        elif (timed := self._timed(scan)) is not None:
-            own_ns = self._queue.newest_of(scan.frame_id)
-            other_ns = self.transforms.newest_ns
-            refuse = partial(self._drops.scan, timed, 'odd_stamp')
-            self._guard.take(scan.stamp_ns, own_ns, other_ns, partial(self._accept, timed), refuse)
-
-    def _missing_columns(self, scan: Scan) -> list[str]:
-        """Return the columns that the map sums and a scan has not, nor gets from images."""
-        missing, images = missing_columns(scan.columns, self.map.columns), self._inserter.images
-        return [name for name in missing if images is None or not images.will_give(scan, name)]
-
-    def _accept(self, scan: Scan) -> None:
-        """Queue a scan; if time was set back, and not ahead by one scan, clear the map first."""
-        newest_ns = self._queue.newest_of(scan.frame_id)
-        back_s = 0.0 if newest_ns is None else (newest_ns - scan.stamp_ns) / 1e9
-        if back_s > self.config.input.reset_after_s and not self._queue.drop_odd_before(scan):
-            self._start_anew(scan, back_s)
-        self._poses.mount(scan.frame_id)
-        self._queue.push(scan)
-
-    def _timed(self, scan: Scan) -> Scan | None:
-        """Return a scan with the times that deskewing needs; None if it has none."""
-        settings = self.config.deskew
-        if not settings.enabled:
-            return scan
-        try:
-            times = point_times(scan, settings.field, settings.unit, settings.reference)
-        except CloudFormatError as error:
-            self._drops.scan(scan, 'no_times', str(error))
-            return None
-        return scan.with_times(times)
+        drops = self._pipeline.drops
+        if topic and drops.topics.get(scan.frame_id) != topic:
+            drops.name_topic(scan.frame_id, topic)
+        self._pipeline.add_scan(scan)
 
     def refuse_clouds(
         self, cause: str, topic: str, reason: str, number: int = 1, frame_id: str = ''
@@ -298,7 +234,7 @@ class Mapper:
         self.counters.received += number
         self.counters.drop(cause, frame_id or topic, number)
         dropped = self.counters.dropped[cause]
-        self._drops.warn(
+        self._pipeline.drops.warn(
             cause, f'cloud on {topic} dropped: {reason} ({dropped} dropped for this cause)'
         )
 
@@ -309,26 +245,26 @@ class Mapper:
         A node wraps its work on messages, requests and timers in it. ``messages_ignored`` counts
         such errors, MemoryError too, as ``internal_error``.
         """
-        return self._drops.guarded(task)
+        return self._pipeline.drops.guarded(task)
 
     def ignore_message(self, cause: str, reason: str, number: int = 1) -> None:
         """Count messages other than clouds that are not used, and warn."""
-        self._drops.message(cause, reason, number)
+        self._pipeline.drops.message(cause, reason, number)
 
     def add_image(self, image: SceneImage) -> None:
         """Add an image that gives scans colours or labels; see layers.tsdf.color_topic."""
         check_kind('image', image, SceneImage)
-        if self._inserter.images is not None:
-            self._inserter.images.add(image)
+        if self._pipeline.images is not None:
+            self._pipeline.images.add(image)
 
     def end_images(self) -> None:
         """Stop waiting for images: no more come."""
-        if self._inserter.images is not None:
-            self._inserter.images.ended = True
+        if self._pipeline.images is not None:
+            self._pipeline.images.ended = True
 
     def end_scans(self) -> None:
         """Stop waiting for further scans and for poses: no more come."""
-        self._queue.ended = True
+        self._pipeline.queue.ended = True
         if self.registered is not None:
             self.registered.scans_ended = True
 
@@ -346,19 +282,7 @@ class Mapper:
             same to the bit. Call it once with False at the end.
 
         """
-        if self._clears_map:  # time was set back: these scans are of the time before
-            while self._queue.posed:
-                yield from self._insert(*self._queue.posed.popleft())
-            self._clear_map()
-        ahead = int(self._inserter.runs_ahead(self.config))
-        keeps = ahead if more_follows else 0
-        while self._queue.fill_posed(1 + ahead, self.config.pose) > keeps:
-            yield from self._insert(*self._queue.posed.popleft())
-        if self._queue.posed:
-            start = clock()
-            for scan, pose in self._queue.posed:
-                self._inserter.begin(scan, pose, self.config)
-            self.counters.add_seconds('reduce', clock() - start)
+        return self._pipeline.run(more_follows)
 
     def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> bool:
         """
@@ -389,36 +313,29 @@ class Mapper:
             except ValueError as error:
                 reason = str(error)
             else:
-                correction = self._inserter.aligner.T_map_fixed
+                correction = self._pipeline.aligner.T_map_fixed
                 self.registered.restart(compose(inverse(correction), T_map_body))
                 return True
-        self._drops.message('initial_pose', f'initial pose ignored: {reason}')
+        self._pipeline.drops.message('initial_pose', f'initial pose ignored: {reason}')
         return False
 
     def finish_layers(self) -> None:
         """Finish the layers at the end of a recording; see Layer.finish."""
-        self._inserter.layers.finish()
+        self._pipeline.layers.finish()
 
     def finish(self) -> None:
         """End the input: scans that still wait for a certain pose are dropped and counted."""
-        self._guard.drop_held()
-        self._queue.drop_waiting('no_pose', 'no pose until the end of the input')
-        if self.registered is not None:
-            self.registered.finish()
+        self._pipeline.finish()
 
     def clear(self) -> None:
         """Drop all scans, waiting ones too (counted); poses, counts and a frozen map stay."""
-        self._guard.drop_held()
-        self._queue.drop_all('cleared', 'the map was cleared')
-        if self.registered is not None:
-            self.registered.finish()
-        self._clear_map()
+        self._pipeline.clear()
 
-    def _clear_map(self) -> None:
-        """Empty the map, unless it is frozen."""
-        self._clears_map = False
-        if self.config.map.mode != 'frozen':
-            self._inserter.clear()
+    @property
+    def mount_changes(self) -> str:
+        """Sensors that have moved on the robot since the oldest scan of the map, in words."""
+        oldest = next(iter(self.window), None)
+        return self._pipeline.poses.mounts.warning(0 if oldest is None else oldest.stamp_ns)
 
     def align(self) -> Alignment:
         """
@@ -436,9 +353,7 @@ class Mapper:
             If the map refuses a scan at its new pose. Nothing has changed then.
 
         """
-        alignment = self._inserter.align(self.config)
-        _log.debug('aligned: %s', alignment)
-        return alignment
+        return self._pipeline.align()
 
     def close_loops(self, progress: Callable[[str], object] = lambda text: None) -> LoopMove:
         """
@@ -462,28 +377,26 @@ class Mapper:
             If the map refuses a scan at its new pose. Nothing has changed then.
 
         """
-        move = self._inserter.close_loops(self.config, progress)
-        _log.debug('loops: %s', move)
-        return move
+        return self._pipeline.close_loops(progress)
 
     @property
     def derives(self) -> bool:
         """Whether ``Update.changed`` is filled; False leaves it empty and saves the time."""
-        return self._inserter.derives
+        return self._pipeline.derives
 
     @derives.setter
     def derives(self, value: bool) -> None:
-        self._inserter.derives = value
+        self._pipeline.derives = value
 
     @property
     def loops(self) -> LoopCloser | None:
         """The scans and poses that loops are closed with; None without ``loops.enabled``."""
-        return self._inserter.loops
+        return self._pipeline.loops
 
     @property
     def T_map_fixed(self) -> Transform:
         """From the fixed frame of the poses to the map: its origin, and alignment's correction."""
-        return compose(self._inserter.aligner.T_map_fixed, self._origin.T_local_fixed)
+        return compose(self._pipeline.aligner.T_map_fixed, self._pipeline.origin.T_local_fixed)
 
     @property
     def origin_m(self) -> npt.NDArray[np.float64] | None:
@@ -492,7 +405,7 @@ class Mapper:
 
         None without that setting, and with ``auto`` until the first pose is known.
         """
-        origin = self._origin
+        origin = self._pipeline.origin
         return self.map.origin_m if origin.has_own_frame and origin.is_known else None
 
     def T_map_of(self, frame_id: str, stamp_ns: int) -> Transform:
@@ -513,7 +426,7 @@ class Mapper:
         if frame_id == fixed:
             return self.T_map_fixed
         at_ns = stamp_ns or self.transforms.newest_between(fixed, frame_id) or 0
-        return self._inserter.aligner.to_map(self.transforms.lookup(fixed, frame_id, at_ns))
+        return self._pipeline.aligner.to_map(self.transforms.lookup(fixed, frame_id, at_ns))
 
     @property
     def map_frame(self) -> str:
@@ -522,7 +435,7 @@ class Mapper:
 
         ``align.map_frame`` does so; with ``map.origin`` it is ``frames.fixed`` and _local.
         """
-        return map_frame(self.config)
+        return self._pipeline.map_frame
 
     def surfels(self, level: int = 0) -> Surfels:
         """
@@ -548,13 +461,21 @@ class Mapper:
         (E, 3) int32
             Indices of the surfels (``map.min_points``) that were removed.
 
+        Raises
+        ------
+        ValueError
+            If the edges of a polygon cross too many rows of voxels. Nothing has changed then.
+
         """
         check_kind('region', region, Region)
         voxel_index = self.map.moments().voxel_index
+        if isinstance(region, Prism):
+            rows = np.unique(voxel_index[:, 1]).astype(np.float64)
+            region.check_cost((rows + 0.5) * self.map.voxel_size_m)
         centers = (voxel_index.astype(np.float64) + 0.5) * self.map.voxel_size_m
         inside = voxel_index[region.contains(centers)]
-        self._inserter.layers.clear_region(region.contains)
-        return self._inserter.drop_voxels(inside, self.config.map.min_points)
+        self._pipeline.layers.clear_region(region.contains)
+        return self._pipeline.drop_voxels(inside)
 
     def restore(self, surfel_map: SurfelMap, scans: Iterable[WindowedScan]) -> None:
         """
@@ -575,9 +496,8 @@ class Mapper:
             if found != expected:
                 raise MapError(f'map with {name} {found}, expected {expected} as configured')
         moments = surfel_map.moments()  # before clearing: it may be the map of this mapper
-        self._origin.take_from(surfel_map)
-        self.clear()
-        self._inserter.restore(moments, scans)
+        self._pipeline.origin.take_from(surfel_map)
+        self._pipeline.restore(moments, scans)
 
     def reconfigure(self, config: Config) -> None:
         """
@@ -597,9 +517,7 @@ class Mapper:
                 raise ConfigError(
                     f'{declared.name}: cannot change while running; set it at the start'
                 )
-        self._inserter.reconfigure(config)
-        self._poses.reconfigure(config)
-        self.config = config
+        self._pipeline.reconfigure(config)
 
     def warm_up(self) -> None:
         """Compile the kernels that the settings need to map scans and to derive surfels."""
@@ -612,7 +530,7 @@ class Mapper:
         They change nothing of the mapper. Kernels that few inputs need are compiled when they are
         called first: for voxels of 65536 points of one scan, or after ``~/clear_polygon``.
         """
-        return self._inserter.warm_up_stages(self.config)
+        return self._pipeline.warm_up_stages()
 
     def summary(self) -> dict[str, Any]:
         """Return counts, times and figures of the map, for files, reports and diagnostics."""
@@ -626,41 +544,5 @@ class Mapper:
             'voxels': self.map.num_voxels,
             'surfels': len(self.map.surfels(self.config.map.min_points)),
             'digest': self.map.digest(),
-            **self._inserter.layers.summary(),
+            **self._pipeline.layers.summary(),
         }
-
-    def _start_anew(self, scan: Scan, back_s: float) -> None:
-        """
-        Clear the map after time was set back, and drop the poses of the time before.
-
-        Scans that have their poses are mapped first, by ``insert_ready``, so that the map does
-        not depend on ``more_follows``; those that wait for theirs are dropped.
-        """
-        reset_after_s = self.config.input.reset_after_s
-        _log.warning(
-            'scan in frame %s: time went back by %.3f s, more than input.reset_after_s '
-            '(%g s): the map is cleared',
-            scan.frame_id,
-            back_s,
-            reset_after_s,
-        )
-        self.counters.resets += 1
-        self._queue.drop_waiting('cleared', 'the map was cleared')
-        self._clears_map = True
-        if not self._queue.posed:
-            self._clear_map()
-        if self.registered is not None:
-            self.registered.restart()
-        self._queue.forget_stamps()
-        newest_pose = self.transforms.newest_ns
-        if newest_pose is not None and (newest_pose - scan.stamp_ns) / 1e9 > reset_after_s:
-            self.transforms.clear()  # else the scan would be mapped at a pose of that time
-
-    def _insert(self, scan: Scan, pose: Transform) -> Iterator[Update]:
-        """Map a scan whose pose is there, and those that waited for it; yield their updates."""
-        following = self._queue.posed[0] if self._queue.posed else None
-        updates = self._inserter.insert(scan, pose, self.config, following)
-        try:
-            yield from updates
-        except Exception as error:  # MemoryError too: the next scan may fit
-            self._drops.failure(scan, error, is_used=False)

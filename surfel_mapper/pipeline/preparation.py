@@ -3,7 +3,7 @@
 """
 Preparation of a scan for the map: motion gate, deskewing, images, filters, registration.
 
-A scan that the motion gate, the filters or the registration leave out is counted.
+A scan that the motion gate, the filters or the registration leave out is refused.
 """
 
 from __future__ import annotations
@@ -17,17 +17,12 @@ import numpy as np
 from surfel_mapper.compilation import CompileStage
 from surfel_mapper.config import Config, WindowConfig
 from surfel_mapper.counters import Laps
-from surfel_mapper.errors import (
-    CloudFormatError,
-    FilterError,
-    MapError,
-    PoseError,
-)
+from surfel_mapper.errors import CloudFormatError, MapError, PoseError, ScanRefusedError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
 from surfel_mapper.layers import Surroundings
 from surfel_mapper.mapping.channels import checked_channels, missing_columns
-from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.drops import Drops, GATED
 from surfel_mapper.pipeline.local_map import LocalMap
 from surfel_mapper.pipeline.prepared import FilteredScan, Prepared
 from surfel_mapper.pipeline.reduction import expected_type
@@ -90,8 +85,9 @@ class Preparation:
         self._drops = drops
         self.chain = Chain.load(config.filters) if config.filters else Chain()
 
-    def runs_ahead(self) -> bool:
-        """Return whether a scan can be prepared before the one before it is mapped."""
+    @property
+    def is_independent(self) -> bool:
+        """Whether a scan can be prepared before the one before it is mapped."""
         return (
             all(each.is_repeatable for each in self.chain.filters)
             and not self._needs_free_rays
@@ -154,8 +150,8 @@ class Preparation:
         """
         Deskew, filter and register a scan; return the scans that can be mapped now.
 
-        None of them if it is left out, or registration waits for the next scans to confirm its
-        place; with the scan that confirms it, all that have waited.
+        None while registration waits for the next scans to confirm its pose; with the scan that
+        confirms it, all that have waited.
 
         Parameters
         ----------
@@ -168,35 +164,37 @@ class Preparation:
         laps : Laps
             Takes the time of each stage.
         begun : callable, optional
-            Returns what another thread has done by ``ahead``, and raises its errors.
+            Returns the result of another thread by ``ahead``, and raises its errors.
+
+        Raises
+        ------
+        ScanRefusedError
+            If the motion gate, the filters or registration leave the scan out.
+        FilterError
+            If a filter cannot work.
+        PoseError
+            If poses within its sweep were forgotten since it got its own.
 
         """
-        if self._poses.registered is None and self._is_gated(scan, pose, config.window):
-            return []
-        times = scan.times
-        try:
-            found = self._filtered(scan, pose, laps) if begun is None else begun()
-        except FilterError as error:
-            self._drops.scan(scan, 'filter', str(error))
-            return []
-        except PoseError as error:  # poses within its sweep were forgotten since it got its own
-            self._drops.scan(scan, 'no_pose', str(error))
-            return []
+        times, registered = scan.times, self._poses.registered
+        if registered is None:
+            self._check_motion(scan, pose, config.window)
+        found = self._filtered(scan, pose, laps) if begun is None else begun()
         if self.chain.filters:
             laps.end('filter')
+            self._count_steps(found)
         elif begun is not None and times is not None:
             laps.end('deskew')
-        if not self._count_filtered(found) or not self._has_columns(found.filtered):
-            return []
-        prepared = Prepared(found.scan, found.filtered, pose)
-        if self._poses.registered is None:
+        if self._around.surfel_map.columns:
+            self._check_columns(found.filtered)
+        prepared = Prepared(found.scan, found.filtered, pose, windowed=found.windowed)
+        if registered is None:
             return [prepared]
-        registered = self._register(self._poses.registered, prepared, times)
+        confirmed = self._register(registered, prepared, times)
         laps.end('register')
-        if len(registered) > 1:  # those that have waited: the gate would compare them with one
-            return registered
-        gate = config.window
-        return [p for p in registered if not self._is_gated(p.scan, p.T_map_sensor, gate)]
+        if len(confirmed) == 1:  # of several the gate would compare those that waited with one
+            self._check_motion(confirmed[0].scan, confirmed[0].T_map_sensor, config.window)
+        return confirmed
 
     def _filtered(self, scan: Scan, pose: Transform, laps: Laps) -> FilteredScan:
         """Return a scan deskewed, joined with images, and filtered; raise FilterError."""
@@ -216,35 +214,27 @@ class Preparation:
         """Return a scan with all points in the sensor frame at its stamp."""
         return scan if scan.times is None else self._poses.deskewing(scan, scan.times)()
 
-    def _count_filtered(self, found: FilteredScan) -> bool:
-        """Count what the filters did; return whether points are left."""
-        scan, filtered = found.scan, found.filtered
+    def _count_steps(self, found: FilteredScan) -> None:
+        """Count what the filters did; raise if they left no points."""
+        counters, num_points = self._drops.counters, len(found.filtered)
         for s in found.steps:
-            self._drops.counters.add_filter(
-                s.name, s.points_in, s.points_out, s.milliseconds, s.not_finite
-            )
-        if not found.steps:
-            return True
-        self._drops.counters.points_left_out['filtered'] += len(scan) - len(filtered)
-        if not len(filtered):
-            self._drops.scan(scan, 'filtered_out', 'the filters left none of its points')
-        return len(filtered) > 0
+            counters.add_filter(s.name, s.points_in, s.points_out, s.milliseconds, s.not_finite)
+        counters.points_left_out['filtered'] += len(found.scan) - num_points
+        if not num_points:
+            raise ScanRefusedError('filtered_out', 'the filters left none of its points')
 
-    def _has_columns(self, scan: Scan) -> bool:
-        """Return whether a scan has the columns that the map sums; if not, count the drop."""
+    def _check_columns(self, scan: Scan) -> None:
+        """Raise unless a scan has the columns that the map sums."""
         names = self._around.surfel_map.columns
         missing = missing_columns(scan.columns, names)
         if missing:
             reason = f'its points have no {" and no ".join(missing)}, by images and filters'
-            self._drops.scan(scan, 'missing_column', reason)
-            return False
+            raise ScanRefusedError('missing_column', reason)
         try:
             for name in names:
                 checked_channels(scan.columns, name, len(scan))
         except ValueError as error:
-            self._drops.scan(scan, 'bad_cloud', str(error))
-            return False
-        return True
+            raise ScanRefusedError('bad_cloud', str(error)) from error
 
     def _register(
         self, poses: RegisteredPoses, prepared: Prepared, times: PointTimes | None
@@ -257,8 +247,7 @@ class Preparation:
         try:
             found = poses.place(prepared, times, target, T_target_fixed)
         except (MapError, PoseError) as error:
-            self._drops.scan(prepared.scan, 'not_aligned', str(error))
-            return []
+            raise ScanRefusedError('not_aligned', str(error)) from error
         for each in found:
             if each.registration is not None and len(each.registration.degenerate):
                 num = len(each.registration.degenerate)
@@ -286,20 +275,18 @@ class Preparation:
             )
         return scan
 
-    def _is_gated(self, scan: Scan, pose: Transform, gate: WindowConfig) -> bool:
+    def _check_motion(self, scan: Scan, pose: Transform, gate: WindowConfig) -> None:
         """
-        Return whether the motion gate leaves out a scan at a pose, and count it.
+        Raise if the motion gate leaves out a scan at a pose.
 
         It is compared with the last scan of its frame: sensors that are mounted apart are not at
         rest, nor in motion, because of the distance between them.
         """
         if not (gate.gate_distance_m or gate.gate_angle_deg):
-            return False
+            return
         T_map_last = self._around.window.last_pose(scan.frame_id)
-        if T_map_last is None or not stands_still(T_map_last, pose, gate):
-            return False
-        self._drops.counters.gated += 1
-        return True
+        if T_map_last is not None and stands_still(T_map_last, pose, gate):
+            raise ScanRefusedError(GATED)
 
 
 def filtered_scan(

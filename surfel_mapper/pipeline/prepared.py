@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Prepared: a scan that is ready for the map; FilteredScan: one whose place is not settled yet.
-
-Alone because preparation, registration, reduction and insertion hand them on.
-"""
+"""Prepared: a scan that is ready for the map; FilteredScan: one whose pose is not settled yet."""
 
 from __future__ import annotations
 
@@ -13,6 +9,7 @@ from dataclasses import dataclass
 from surfel_mapper.alignment.registration import RegistrationResult
 from surfel_mapper.filters.chain import Step
 from surfel_mapper.geometry import Transform
+from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.scan import Scan
 
 
@@ -29,12 +26,15 @@ class FilteredScan:
         After the filters; the same if there are none.
     steps : tuple of Step
         What each filter did.
+    windowed : WindowedScan or Exception, optional
+        Its moments, or the error of reducing it, if another thread has done so.
 
     """
 
     scan: Scan
     filtered: Scan
     steps: tuple[Step, ...] = ()
+    windowed: WindowedScan | Exception | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +54,8 @@ class Prepared:
         If poses come from registration to the map.
     T_fixed_body : (4, 4) float64, optional
         Pose of the tracked frame then.
+    windowed : WindowedScan or Exception, optional
+        Its moments at this pose, or the error of reducing it, if another thread has done so.
 
     """
 
@@ -62,3 +64,4 @@ class Prepared:
     T_map_sensor: Transform
     registration: RegistrationResult | None = None
     T_fixed_body: Transform | None = None
+    windowed: WindowedScan | Exception | None = None

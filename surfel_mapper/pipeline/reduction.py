@@ -1,20 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Reduction of scans to the exact moments that enter the map and the window, and that leave it.
-
-With two ``map.threads`` another thread deskews, filters and reduces the next scan while the map
-takes the one before it. It reads nothing of the map, so the order changes no bit. Work that was
-begun is used only for the same scan at the same pose. Otherwise it is done again.
-"""
+"""Reduction of scans to the exact moments that enter the map and the window, and that leave it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,121 +18,7 @@ from surfel_mapper.mapping.moments import point_keys, ScanMoments
 from surfel_mapper.mapping.reducer import within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SETTINGS, WindowedScan
-from surfel_mapper.pipeline.prepared import FilteredScan
 from surfel_mapper.scan import Scan
-from surfel_mapper.threads import pool
-
-
-class Ahead(NamedTuple):
-    """Result of the other thread: the points of a scan, and their moments or the error."""
-
-    points: FilteredScan
-    windowed: WindowedScan | Exception
-
-
-class Begun(NamedTuple):
-    """A scan that another thread prepares and reduces, and the arguments of both."""
-
-    scan: Scan
-    T_map_sensor: Transform
-    config: Config
-    result: Future[Ahead]
-
-    def is_of(self, scan: Scan, T_map_sensor: Transform, config: Config) -> bool:
-        """Return whether a scan is this one, at the same pose and with the same settings."""
-        if self.scan is not scan or self.config is not config:
-            return False
-        return self.T_map_sensor is T_map_sensor or np.array_equal(self.T_map_sensor, T_map_sensor)
-
-
-class Reduction:
-    """
-    Reduces scans, ahead of time if there is a thread for it.
-
-    Parameters
-    ----------
-    surfel_map : SurfelMap
-        The map that the scans are inserted into.
-    threads : int
-        With fewer than two no reduction is begun ahead of time.
-
-    """
-
-    def __init__(self, surfel_map: SurfelMap, threads: int) -> None:
-        self._map = surfel_map
-        self._pool = pool(threads)
-        self._begun: Begun | None = None
-
-    @property
-    def runs_ahead(self) -> bool:
-        """Whether another thread reduces the next scan."""
-        return self._pool is not None
-
-    def begin(
-        self,
-        scan: Scan,
-        T_map_sensor: Transform,
-        config: Config,
-        prepare: Callable[[Scan, Transform], Callable[[], FilteredScan]],
-    ) -> None:
-        """
-        Begin to prepare and reduce a scan in the other thread, unless that was begun before.
-
-        ``prepare`` is called here, the function that it returns in the other thread.
-        """
-        begun = self._begun
-        if self._pool is None or (begun and begun.is_of(scan, T_map_sensor, config)):
-            return
-        work = prepare(scan, T_map_sensor)
-        result = self._pool.submit(run_ahead, work, T_map_sensor, self._map, config)
-        self._begun = Begun(scan, T_map_sensor, config, result)
-
-    def begun(
-        self, scan: Scan, T_map_sensor: Transform, config: Config
-    ) -> Callable[[], FilteredScan] | None:
-        """
-        Return a function that waits for the points of a scan that was begun, or None.
-
-        Work that was begun for another scan, pose or settings is forgotten.
-        """
-        begun = self._begun
-        if begun is None or not begun.is_of(scan, T_map_sensor, config):
-            self._begun = None
-            return None
-        return lambda: begun.result.result().points
-
-    def reduce(self, scan: Scan, T_map_sensor: Transform, config: Config) -> WindowedScan:
-        """
-        Return a prepared scan as its moments at a pose; see ``reduced``.
-
-        Raises
-        ------
-        MapLimitError
-            If a voxel gets more than 2^23 points, or a point is out of the reach of the map.
-
-        """
-        begun, self._begun = self._begun, None
-        if begun is not None:
-            ahead = begun.result.result()
-            if ahead.points.filtered is scan:
-                if isinstance(ahead.windowed, Exception):
-                    raise ahead.windowed
-                return ahead.windowed
-        return reduced(scan, T_map_sensor, self._map, config)
-
-
-def run_ahead(
-    work: Callable[[], FilteredScan],
-    T_map_sensor: Transform,
-    surfel_map: SurfelMap,
-    config: Config,
-) -> Ahead:
-    """Prepare and reduce a scan; errors of reduction wait until its moments are asked for."""
-    points = work()
-    try:
-        return Ahead(points, reduced(points.filtered, T_map_sensor, surfel_map, config))
-    except Exception as error:
-        return Ahead(points, error)
 
 
 def reduced(

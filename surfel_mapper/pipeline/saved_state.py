@@ -10,7 +10,7 @@ because a map is often wanted without its layers, which are larger.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import logging
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from surfel_mapper.files.latest_map import map_in, RESTORABLE
 from surfel_mapper.files.map_state import FILE, load_map, save_map
 from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.layers import Layer
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.mapper import Mapper
 
@@ -46,14 +47,55 @@ def save_mapper(path: Path, mapper: Mapper, *, with_window: bool = True) -> str:
         If a file cannot be written.
 
     """
+    for write in layer_writers(path, mapper):
+        write()
+    return save_map(path, mapper.map, mapper.window if with_window else ())
+
+
+class CopiedMapper:
+    """
+    Map, window and layers of a mapper at one moment, which any thread may write.
+
+    Parameters
+    ----------
+    path : Path
+        The file of the map, with the extension npz.
+    mapper : Mapper
+        The mapper; see save_mapper.
+
+    """
+
+    def __init__(self, path: Path, mapper: Mapper) -> None:
+        self._path = path
+        self._writers = layer_writers(path, mapper)
+        self._moments = mapper.map.moments()
+        self._window = list(mapper.window)
+        self._empty = mapper.map.emptied()
+
+    def map(self) -> SurfelMap:
+        """Return the map."""
+        if not self._empty.num_voxels:
+            self._empty.insert(self._moments)
+        return self._empty
+
+    def write(self) -> str:
+        """Write the files; see save_mapper."""
+        for write in self._writers:
+            write()
+        return save_map(self._path, self.map(), self._window)
+
+
+def layer_writers(path: Path, mapper: Mapper) -> list[Callable[[], object]]:
+    """Return functions that write copies of layers; layers that cannot copy are written now."""
+    writers: list[Callable[[], object]] = []
     for file, layer in layer_files(path, mapper):
         reason = mapper.counters.layers_off.get(layer.name)
-        if reason is None:
-            layer.save(file)
-        else:
+        if reason is not None:
             file.unlink(missing_ok=True)
             _log.warning('%s: not written: layer %s is off: %s', file, layer.name, reason)
-    return save_map(path, mapper.map, mapper.window if with_window else ())
+        elif (write := layer.save(file)) is not None:
+            writers.append(write)
+    return writers
 
 
 def load_mapper(

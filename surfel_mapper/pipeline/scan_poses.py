@@ -22,9 +22,13 @@ from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.map_origin import MapOrigin
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
-from surfel_mapper.poses import MAX_EDGES, MAX_TRANSFORMS, TransformBuffer
+from surfel_mapper.poses import MAX_TRANSFORMS, MountChanges, TransformBuffer
+from surfel_mapper.poses.buffer import FrameMove
 from surfel_mapper.scan import PointTimes, Scan
 from surfel_mapper.sensors.deskew import deskewing
+
+MAX_SENSORS = 64
+"""Frames of sensors that are kept; frame names may change without end."""
 
 MAX_EARLY = 100
 """Number of poses of the fixed frame itself that wait until ``map.origin: auto`` is known."""
@@ -51,6 +55,8 @@ class ScanPoses:
     ----------
     transforms : TransformBuffer
         The tree of frames; the origin of the fixed frame is that of the map.
+    mounts : MountChanges
+        Sensors that have moved on the robot.
     registered : RegisteredPoses, optional
         The poses by registration, if ``pose.source`` is ``registration``, or auto chose it.
 
@@ -61,8 +67,11 @@ class ScanPoses:
         self._drops = drops
         self.origin = origin
         self._early: deque[tuple[str, str, int, Transform, bool]] = deque(maxlen=MAX_EARLY)
-        self._mounted: set[str] = set()
         self._warned_of_norm = False
+        self._sensors: set[str] = set()
+        self._configured: set[str] = set()  # sensors whose mount is in the configuration
+        self._last_ns: int | None = None  # stamp of the last scan that has a pose
+        self.mounts = MountChanges()
         self.transforms = TransformBuffer(reset_after_s=config.input.reset_after_s)
         self._set_max_gap(config)
         self.registered: RegisteredPoses | None = None
@@ -96,9 +105,26 @@ class ScanPoses:
                 self._drops.warn('bad_pose', text)
         except (PoseError, ValueError) as error:
             self._drops.message('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
+        move, self.transforms.move = self.transforms.move, None
+        if move is not None:
+            self._note_move(move)
         if number := self.transforms.num_forgotten - forgotten:
             reason = f'{number} old transforms dropped: over {MAX_TRANSFORMS} are held'
             self._drops.message('too_many_transforms', reason, number)
+
+    def _note_move(self, move: FrameMove) -> None:
+        """Log the move of a frame, if a sensor of earlier scans is mounted on it."""
+        fixed, transforms = self._config.frames.fixed, self.transforms
+        if self._last_ns is not None and any(
+            transforms.is_between(move.child, fixed, sensor) for sensor in self._sensors
+        ):
+            self._drops.warn(f'mount {move.child}', self.mounts.add(move, self._last_ns))
+
+    def forget_mounts(self) -> None:
+        """Forget the mounts that sensors had before, as the map holds no scan of them."""
+        self._last_ns = None
+        self.mounts.clear()
+        self.transforms.forget_former_parents()
 
     def _add(
         self, parent: str, child: str, stamp_ns: int, transform: Transform, static: bool
@@ -114,6 +140,8 @@ class ScanPoses:
                 while self._early:
                     self._add(*self._early.popleft())
             transform = self.origin.shifted(transform, is_child=child == fixed)
+        if child in self._configured:
+            raise PoseError(f'frames.base_to_sensor gives the mount of {child!r}')
         if static:
             self.transforms.add_static(parent, child, transform)
         else:
@@ -121,14 +149,16 @@ class ScanPoses:
 
     def mount(self, frame_id: str) -> None:
         """Add the configured extrinsics of a sensor when its frame is first seen."""
-        if frame_id in self._mounted:
+        if frame_id in self._sensors:
             return
-        if len(self._mounted) >= MAX_EDGES:  # frame names may change without end
-            self._mounted.clear()
-        self._mounted.add(frame_id)
+        if len(self._sensors) >= MAX_SENSORS:
+            self._sensors.clear()
+            self._configured.clear()
+        self._sensors.add(frame_id)
         values, base = self._config.frames.mount_of(frame_id), self._config.frames.base
         if values and frame_id != base:
             self.add(base, frame_id, 0, values[:3], values[3:], static=True)
+            self._configured.add(frame_id)
 
     def of(self, scan: Scan, following: Scan | None = None) -> Transform:
         """
@@ -164,6 +194,7 @@ class ScanPoses:
             else:
                 self._at(scan.frame_id, first_ns)
                 self._at(scan.frame_id, last_ns)
+        self._last_ns = max(scan.stamp_ns, self._last_ns or 0)
         return pose
 
     def newest_for(self, frame_id: str) -> int | None:

@@ -14,13 +14,9 @@ from collections.abc import Iterator
 import hashlib
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from surfel_mapper.config import Config
 from surfel_mapper.pipeline.mapper import Mapper
 from surfel_mapper.pipeline.update import Update
-from surfel_mapper.scan import Scan
 
 SWEEP_S = 1.0
 """Largest time of a point from the stamp of its scan with deskewing, s."""
@@ -42,7 +38,7 @@ class ShardMapper(Mapper):
 
     @passes_over.setter
     def passes_over(self, value: bool) -> None:
-        self._passes_over = self._drops.is_silent = value
+        self._passes_over = self._pipeline.drops.is_silent = value
 
     def outlook(self) -> str:
         """
@@ -51,25 +47,30 @@ class ShardMapper(Mapper):
         These are the newest stamps, the scans that wait, and the transforms from the oldest stamp
         on that can be looked up without time being set back.
         """
-        stamps, waiting = self._queue.stamps, self._queue.waiting
-        expected = [*stamps.values(), *(stamp_ns for _, stamp_ns in waiting)]
+        guard, queue = self._pipeline.guard, self._pipeline.queue
+        waiting = [(scan.frame_id, scan.stamp_ns) for scan in queue.waiting]
+        stamps = guard.scan_stamps
+        expected = [stamp_ns for _, stamp_ns in (*stamps, *waiting)]
         since_ns = None
         if expected:
             back_ns = round(self.config.input.reset_after_s * 1e9)
             since_ns = min(*expected, max(expected) - back_ns) - round(sweep_s(self.config) * 1e9)
         state = [
-            sorted(stamps.items()),
+            stamps,
             waiting,
-            self._guard.newest_ns,
-            self._guard.held_ns,
-            self._guard.ahead_ns,
+            guard.newest_ns,
+            guard.held_ns,
+            guard.ahead_ns,
             self.transforms.held(since_ns),
         ]
         return hashlib.sha256(repr(state).encode()).hexdigest()
 
-    def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Iterator[Update]:
-        """Map a scan, unless scans are passed over."""
-        return iter(()) if self._passes_over else super()._insert(scan, pose)
+    def insert_ready(self, *, more_follows: bool = False) -> Iterator[Update]:
+        """Map the scans that are ready, unless scans are passed over; see Mapper."""
+        if not self._passes_over:
+            return super().insert_ready(more_follows=more_follows)
+        self._pipeline.pass_over()
+        return iter(())
 
 
 def sweep_s(config: Config) -> float:

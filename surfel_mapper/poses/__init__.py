@@ -3,6 +3,7 @@
 """The tree of coordinate frames over time, and the choice of the source of poses."""
 
 from surfel_mapper.poses.buffer import MAX_EDGES, MAX_TRANSFORMS, TransformBuffer
+from surfel_mapper.poses.mount_changes import MountChanges
 from surfel_mapper.poses.source_choice import (
     AUTO,
     choose_source,
@@ -16,6 +17,7 @@ __all__ = [
     'AUTO',
     'MAX_EDGES',
     'MAX_TRANSFORMS',
+    'MountChanges',
     'PoseCandidate',
     'SourceChoice',
     'TransformBuffer',

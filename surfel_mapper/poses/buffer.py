@@ -3,25 +3,27 @@
 """
 TransformBuffer: the tree of coordinate frames over time, asked for one transform at a stamp.
 
-Every frame has at most one parent, so an edge of the tree is stored by its child. A dynamic edge
-holds transforms sorted by stamp, a static one a single transform for all time. Node and replay
-use this one class: a lookup depends only on the transforms held, not on the order they came in,
-and is composed in a fixed order (geometry.py), so both compute the same pose to the last bit.
+A frame has one parent at a time, so an edge of the tree is stored by its child. A dynamic edge
+holds transforms sorted by stamp, a static one a single transform for all time. As in tf2, a new
+parent holds from its stamp on, and a static one for all time. Node and replay use this one class:
+a lookup depends only on the transforms held, not on the order they came in, and is composed in a
+fixed order (geometry.py), so both compute the same pose to the last bit.
 Nothing is extrapolated: a robot that turns by 1 rad/s moves a point at 50 m by 5 m in the 0.1 s
 of a sweep.
 
 Callers act on two kinds of failure: after PoseNotYetError later data may answer the lookup, so the
 scan should wait; after any other PoseError none can, so it should be dropped.
 
-Frames and stamps come from messages, so the numbers of edges and transforms and the depth of the
-tree are limited, and a lookup costs the same however many other frames there are.
+Frames and stamps come from messages, so the numbers of frames and transforms are limited. A lookup
+climbs a limited number of edges, and costs the same however many other frames there are.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
-from itertools import islice, pairwise
+from dataclasses import dataclass
+from itertools import groupby, islice
 import math
 
 import numpy as np
@@ -29,8 +31,8 @@ import numpy as np
 from surfel_mapper.errors import PoseError, PoseNotYetError
 from surfel_mapper.geometry import compose, inverse, Transform
 from surfel_mapper.poses.pose_track import (
-    check_gap,
     check_held,
+    check_within,
     NS_PER_S,
     PoseTrack,
     rigid,
@@ -41,13 +43,37 @@ MAX_EDGES = 10_000
 """Largest number of edges; a robot has some hundred, and new names must not fill the memory."""
 
 MAX_DEPTH = 100
-"""Limit of the edges from a frame up to its root; an arm on a truck has some twenty."""
+"""Limit of the edges that a lookup climbs from a frame; an arm on a truck has some twenty."""
 
 MAX_TRANSFORMS = 500_000
 """Limit of the transforms held, 170 MB; 80 joints at 100 Hz have 480,000 a minute."""
 
+SAME_MOUNT = 1e-5
+"""Static transforms whose entries differ by less are the same; 10 um and 10 urad."""
+
 MAX_NAMES = 12
 """Number of frames named in a message."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameMove:
+    """
+    A frame that got a new parent, or another static transform in its parent.
+
+    Attributes
+    ----------
+    child : str
+        The frame.
+    parents : (str, str)
+        Its parent until then, and its parent now.
+    positions : ((3,) tuple, (3,) tuple)
+        Its last position in the one, and its position in the other, m.
+
+    """
+
+    child: str
+    parents: tuple[str, str]
+    positions: tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class TransformBuffer:
@@ -75,6 +101,8 @@ class TransformBuffer:
         Transforms held of all dynamic edges.
     num_forgotten : int
         Transforms dropped so far because there were too many.
+    move : FrameMove, optional
+        The last frame that moved; readers set it to None.
 
     Raises
     ------
@@ -97,8 +125,9 @@ class TransformBuffer:
         self.max_gap_s = max_gap_s
         self.num_transforms = 0
         self.num_forgotten = 0
+        self.move: FrameMove | None = None
         self._edges: dict[str, PoseTrack] = {}
-        self._heights: dict[str, int] = {}  # of every frame: edges down to its lowest descendant
+        self._frames: dict[str, None] = {}  # all that have an edge, in the order of arrival
         self._newest: PoseTrack | None = None
 
     @property
@@ -130,10 +159,17 @@ class TransformBuffer:
             return self.newest_between(target, source)
         return self.newest_ns
 
-    def _dynamic(self, target: str, source: str) -> list[PoseTrack]:
-        """Return the dynamic edges between two frames."""
-        between = {*self._edges_above(source)} ^ {*self._edges_above(target)}
-        return [edge for edge in between if not edge.is_static]
+    def is_between(self, frame: str, target: str, source: str) -> bool:
+        """Return whether a frame has its edge on the way between two frames, or to the roots."""
+        return any(edge.child == frame for edge in self._between(target, source))
+
+    def _between(self, target: str, source: str, stamp_ns: int | None = None) -> set[PoseTrack]:
+        """Return the edges between two frames, at a stamp or now; else all above them."""
+        return {*self._edges_above(source, stamp_ns)} ^ {*self._edges_above(target, stamp_ns)}
+
+    def _dynamic(self, target: str, source: str, stamp_ns: int | None = None) -> list[PoseTrack]:
+        """Return the dynamic edges between two frames, at a stamp or now."""
+        return [edge for edge in self._between(target, source, stamp_ns) if not edge.is_static]
 
     def add(
         self,
@@ -162,10 +198,9 @@ class TransformBuffer:
         Raises
         ------
         PoseError
-            If a name is empty, the transform is not rigid or not finite, the child has another
-            parent or a static transform already, the edge would close a loop, or there would be
-            more than MAX_EDGES edges, or more than MAX_DEPTH from a frame to its root. The buffer
-            is unchanged then.
+            If a name is empty, the transform is not rigid or not finite, the child has a static
+            transform in this parent, the edge would close a loop, or there would be more than
+            MAX_EDGES edges, or more than MAX_DEPTH above the child. The buffer is unchanged then.
 
         """
         edge = self._edges.get(child)
@@ -176,11 +211,12 @@ class TransformBuffer:
         if edge.stamps and stamp_ns < edge.stamps[-1] - self._reset_after_ns:
             edge.forget_oldest(before)
             is_back = edge is self._newest
-        edge.insert(stamp_ns, transform)
+        if not edge.stamps or (edge.parent != parent and stamp_ns >= edge.stamps[-1]):
+            self._note_move(edge, parent, transform)
+        edge.insert(stamp_ns, parent, transform)
         edge.forget_before(edge.stamps[-1] - self._history_ns)
         self.num_transforms += len(edge.stamps) - before
-        if child not in self._edges:
-            self._enter(edge)
+        self._enter(edge, parent)
         if is_back:
             self._newest = self._edge_of_newest()
         elif self._newest is None or edge.stamps[-1] > self._newest.stamps[-1]:
@@ -191,9 +227,10 @@ class TransformBuffer:
     def add_static(self, parent: str, child: str, T_parent_child: Transform) -> None:
         """Set the transform of an edge for all time, in the place of an earlier one; see add."""
         edge = self._edge(parent, child, is_static=True)
-        edge.transforms = [rigid(parent, child, T_parent_child)]
-        if child not in self._edges:
-            self._enter(edge)
+        transform = rigid(parent, child, T_parent_child)
+        self._note_move(edge, parent, transform)
+        edge.set_static(parent, transform)
+        self._enter(edge, parent)
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
         """
@@ -247,17 +284,19 @@ class TransformBuffer:
             for stamp_ns in (start_ns, end_ns):
                 check_held(edges, stamp_ns, self.max_gap_s)
             for edge in edges:
-                for stamp_ns, newer_ns in pairwise(_within(edge.stamps, start_ns, end_ns)):
-                    check_gap(edge, newer_ns - stamp_ns, self.max_gap_s)
+                if not edge.is_static:
+                    check_within(edge, start_ns, end_ns, self.max_gap_s)
         except PoseError as error:
             raise type(error)(f'{_request(target, source, stamp_ns)}: {error}') from None
 
     def stamps(self, target: str, source: str, start_ns: int, end_ns: int) -> list[int]:
         """Return the stamps of transforms between two frames in a span, ends included."""
-        held = (edge.stamps for edge in self._dynamic(target, source))
+        held = (edge.stamps for edge in self._dynamic(target, source, start_ns))
         return sorted({s for stamps in held for s in _within(stamps, start_ns, end_ns)})
 
-    def held(self, since_ns: int | None = None) -> list[tuple[str, str, list[int], bytes]]:
+    def held(
+        self, since_ns: int | None = None
+    ) -> list[tuple[str, list[tuple[str, int]], list[int], bytes]]:
         """
         Return the content on which lookups from a stamp on depend, to compare two buffers.
 
@@ -268,8 +307,9 @@ class TransformBuffer:
 
         Returns
         -------
-        list of (str, str, list of int, bytes)
-            For each edge, sorted: child, parent, stamps (none if static), transforms.
+        list of (str, list of (str, int), list of int, bytes)
+            For each edge, sorted: child, parents with the number of their transforms, stamps
+            (none if static), transforms.
 
         """
         found = []
@@ -278,26 +318,50 @@ class TransformBuffer:
             if since_ns is not None and not edge.is_static:
                 first = max(bisect_right(edge.stamps, since_ns) - 1, 0)
             content = b''.join(transform.tobytes() for transform in edge.transforms[first:])
-            found.append((child, edge.parent, edge.stamps[first:], content))
+            parents = [(name, len([*rows])) for name, rows in groupby(edge.parents[first:])]
+            found.append((child, parents, edge.stamps[first:], content))
         return found
 
     def clear(self) -> None:
         """Drop the dynamic edges; static ones stay."""
-        static = [edge for edge in self._edges.values() if edge.is_static]
-        self._edges, self._heights, self._newest = {}, {}, None
-        self.num_transforms = 0
-        for edge in static:
-            self._enter(edge)
+        self._keep([edge for edge in self._edges.values() if edge.is_static])
 
-    def _enter(self, edge: PoseTrack) -> None:
-        """Keep a new edge; it may raise the heights of the frames above it."""
+    def forget_former_parents(self) -> None:
+        """Drop the transforms of frames in parents that they have no more."""
+        for edge in self._edges.values():
+            edge.forget_former_parents()
+        self._keep([*self._edges.values()])
+
+    def _keep(self, edges: list[PoseTrack]) -> None:
+        """Keep these edges and their frames alone."""
+        self._edges = {edge.child: edge for edge in edges}
+        self._frames = {name: None for edge in edges for name in (edge.child, edge.parent)}
+        self.num_transforms = sum(len(edge.stamps) for edge in edges)
+        self._newest = self._edge_of_newest()
+
+    def _enter(self, edge: PoseTrack, parent: str) -> None:
+        """Keep an edge; it replaces one of the other kind."""
+        former = self._edges.get(edge.child)
+        if former is edge and parent in self._frames:
+            return  # nearly always
         self._edges[edge.child] = edge
-        height = self._heights.setdefault(edge.child, 0)
-        for above in self._edges_above(edge.child):
-            height += 1
-            if self._heights.get(above.parent, -1) >= height:
-                return
-            self._heights[above.parent] = height
+        self._frames.setdefault(edge.child)
+        self._frames.setdefault(parent)
+        if former is not None and former is not edge:
+            self.num_transforms -= len(former.stamps)
+            self._newest = self._edge_of_newest()
+
+    def _note_move(self, edge: PoseTrack, parent: str, transform: Transform) -> None:
+        """Set ``move`` if an edge had another parent, or another static transform."""
+        former = self._edges.get(edge.child)
+        if former is None or not former.parents:
+            return
+        T_former = former.transforms[-1]
+        is_same = former.parent == parent and former.is_static == edge.is_static
+        if is_same and (not edge.is_static or np.allclose(T_former, transform, 0.0, SAME_MOUNT)):
+            return
+        positions = tuple(T_former[:3, 3].tolist()), tuple(transform[:3, 3].tolist())
+        self.move = FrameMove(edge.child, (former.parent, parent), positions)
 
     def _edge_of_newest(self) -> PoseTrack | None:
         """Return the dynamic edge with the newest stamp."""
@@ -320,55 +384,62 @@ class TransformBuffer:
         if parent == child:
             raise PoseError(f'{name}: a frame cannot be its own parent')
         edge = self._edges.get(child)
-        if edge is None:
-            # a frame without an edge above it is a root: of its own tree, or of the parent's
-            below = [lower.child for lower in self._edges_above(parent)]
-            if below and self._edges[below[-1]].parent == child:
-                loop = ' -> '.join([child, *reversed(below), child])
-                raise PoseError(f'{name}: closes the loop {loop}')
-            if len(self._edges) >= MAX_EDGES:
-                raise PoseError(f'{name}: {MAX_EDGES} frames are known, no more are taken')
-            if len(below) + 1 + self._heights.get(child, 0) > MAX_DEPTH:
-                raise PoseError(f'{name}: over {MAX_DEPTH} transforms from a frame to its root')
-            return PoseTrack(parent, child, is_static)
-        if edge.parent != parent:
-            raise PoseError(f'{name}: {child!r} has the parent {edge.parent!r} already')
-        if edge.is_static != is_static:
-            found, came = ('static', 'dynamic') if edge.is_static else ('dynamic', 'static')
-            raise PoseError(f'{name}: known as {found}, a {came} transform came')
-        return edge
+        if edge is not None and edge.parent == parent:
+            if edge.is_static != is_static:
+                held, came = ('static', 'dynamic') if edge.is_static else ('dynamic', 'static')
+                raise PoseError(f'{name}: known as {held}, a {came} transform came')
+            return edge
+        above = [upper.child for upper in self._edges_above(parent)]
+        if len(above) >= MAX_DEPTH:
+            raise PoseError(f'{name}: over {MAX_DEPTH} transforms above {child!r}')
+        if child in above or (above and self._edges[above[-1]].parent == child):
+            loop = above[: above.index(child)] if child in above else above
+            raise PoseError(f'{name}: closes the loop {" -> ".join([child, *loop[::-1], child])}')
+        if (edge is None and len(self._edges) >= MAX_EDGES) or (
+            parent not in self._frames and len(self._frames) >= 2 * MAX_EDGES
+        ):
+            raise PoseError(f'{name}: {MAX_EDGES} frames are known, no more are taken')
+        if edge is not None and edge.is_static == is_static:
+            return edge
+        return PoseTrack(child, is_static)
 
     def _edges_between(
         self, target: str, source: str, stamp_ns: int
     ) -> tuple[list[PoseTrack], list[PoseTrack]]:
-        """Return the edges from source and from target up to their common frame."""
-        up, down = list(self._edges_above(source)), list(self._edges_above(target))
-        # Both lists end at the root; edges that they share at the end cancel.
-        while up and down and up[-1] is down[-1]:
-            up.pop()
-            down.pop()
-        if (up[-1].parent if up else source) != (down[-1].parent if down else target):
-            raise PoseNotYetError(
-                f'{_request(target, source, stamp_ns)}: {self._why_not_connected(target, source)}'
-            )
-        return up, down
+        """Return the edges from source and from target up to their first common frame."""
+        up = list(self._edges_above(source, stamp_ns))
+        down = list(self._edges_above(target, stamp_ns))
+        rows = {frame: row for row, frame in enumerate(_frames_along(target, down, stamp_ns))}
+        for row, frame in enumerate(_frames_along(source, up, stamp_ns)):
+            if frame in rows:
+                return up[:row], down[: rows[frame]]
+        raise PoseNotYetError(
+            f'{_request(target, source, stamp_ns)}: {self._why_not_connected(target, source)}'
+        )
 
-    def _edges_above(self, frame: str) -> Iterator[PoseTrack]:
-        """Yield the edges from a frame up to the root of its tree."""
-        edge = self._edges.get(frame)
-        while edge is not None:
+    def _edges_above(self, frame: str, stamp_ns: int | None = None) -> Iterator[PoseTrack]:
+        """Yield up to MAX_DEPTH edges from a frame upwards, at a stamp or now."""
+        for _ in range(MAX_DEPTH):
+            edge = self._edges.get(frame)
+            if edge is None:
+                return
             yield edge
-            edge = self._edges.get(edge.parent)
+            frame = edge.parent_at(stamp_ns)
 
     def _why_not_connected(self, target: str, source: str) -> str:
         """Return which of two frames is unknown, or that they are in two trees."""
-        seen = self._heights
+        seen = self._frames
         first = sorted(islice(seen, MAX_NAMES))
         names = ', '.join(first) + (', ...' if len(seen) > MAX_NAMES else '')
         unseen = ' and '.join(frame for frame in (target, source) if frame not in seen)
         if unseen:
             return f'no transform of {unseen} yet; frames seen: {names or "none"}'
         return f'no transforms lead from one to the other yet; frames seen: {names}'
+
+
+def _frames_along(frame: str, edges: list[PoseTrack], stamp_ns: int) -> list[str]:
+    """Return a frame and those above it, at a stamp."""
+    return [frame, *(edge.parent_at(stamp_ns) for edge in edges)]
 
 
 def _request(target: str, source: str, stamp_ns: int) -> str:

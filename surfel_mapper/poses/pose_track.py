@@ -3,14 +3,18 @@
 """
 PoseTrack: the transforms of one frame in its parent, over time or static.
 
+A frame that gets a new parent moves, as in tf2: at a stamp it has the parent of its newest
+transform up to there.
+
 Odometry comes at 100 Hz and more, ten times as often as scans, so every transform is checked with
 Python's own floats: numpy takes a microsecond for any operation on a few numbers.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
+from itertools import pairwise
 import math
 
 import numpy as np
@@ -26,32 +30,50 @@ MAX_SKEW = 1e-6
 
 @dataclass(slots=True, eq=False)
 class PoseTrack:
-    """Transforms of a child frame in its parent by ascending stamp; one if static."""
+    """Transforms of a child frame in its parents by ascending stamp; one if static."""
 
-    parent: str
     child: str
     is_static: bool
     stamps: list[int] = field(default_factory=list)
     transforms: list[Transform] = field(default_factory=list)
+    parents: list[str] = field(default_factory=list)
 
-    def __str__(self) -> str:
+    @property
+    def parent(self) -> str:
+        """The newest parent."""
+        return self.parents[-1]
+
+    def parent_at(self, stamp_ns: int | None) -> str:
+        """Return the parent at a stamp, that of the oldest transform before it; None: newest."""
+        if self.is_static or stamp_ns is None:
+            return self.parents[-1]
+        return self.parents[max(bisect_right(self.stamps, stamp_ns) - 1, 0)]
+
+    def describe(self, stamp_ns: int) -> str:
+        """Return the edge at a stamp and the span of its transforms."""
+        edge = f'{self.parent_at(stamp_ns)} -> {self.child}'
         if self.is_static:
-            return f'{self.parent} -> {self.child} (static)'
-        oldest, newest = seconds(self.stamps[0]), seconds(self.stamps[-1])
-        return f'{self.parent} -> {self.child} (held from {oldest} to {newest} s)'
+            return f'{edge} (static)'
+        return f'{edge} (held from {seconds(self.stamps[0])} to {seconds(self.stamps[-1])} s)'
 
-    def insert(self, stamp_ns: int, T_parent_child: Transform) -> None:
+    def set_static(self, parent: str, T_parent_child: Transform) -> None:
+        """Replace the static transform."""
+        self.transforms, self.parents = [T_parent_child], [parent]
+
+    def insert(self, stamp_ns: int, parent: str, T_parent_child: Transform) -> None:
         """Insert a transform by its stamp; it replaces one of the same stamp."""
         if not self.stamps or stamp_ns > self.stamps[-1]:  # nearly always
             self.stamps.append(stamp_ns)
             self.transforms.append(T_parent_child)
+            self.parents.append(parent)
             return
         row = bisect_left(self.stamps, stamp_ns)
         if self.stamps[row] == stamp_ns:
-            self.transforms[row] = T_parent_child
+            self.transforms[row], self.parents[row] = T_parent_child, parent
         else:
             self.stamps.insert(row, stamp_ns)
             self.transforms.insert(row, T_parent_child)
+            self.parents.insert(row, parent)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop the transforms older than a stamp."""
@@ -60,27 +82,40 @@ class PoseTrack:
 
     def forget_oldest(self, number: int) -> None:
         """Drop the oldest transforms."""
-        del self.stamps[:number], self.transforms[:number]
+        del self.stamps[:number], self.transforms[:number], self.parents[:number]
 
-    def gap_ns(self, stamp_ns: int) -> int:
-        """Return the gap between the transforms around a held stamp, ns; 0 at a stored stamp."""
-        if self.is_static:
-            return 0
-        row = bisect_left(self.stamps, stamp_ns)
-        newer = self.stamps[row]
-        return 0 if newer == stamp_ns else newer - self.stamps[row - 1]
+    def forget_former_parents(self) -> None:
+        """Keep the transforms in the newest parent alone."""
+        rows = [row for row, parent in enumerate(self.parents) if parent == self.parent]
+        self.transforms = [self.transforms[row] for row in rows]
+        self.stamps = [] if self.is_static else [self.stamps[row] for row in rows]
+        self.parents = [self.parent] * len(rows)
+
+    def rows_around(self, stamp_ns: int) -> tuple[int, int]:
+        """
+        Return the rows of the transforms to interpolate at a held stamp; equal at a stored one.
+
+        Both have the parent at the stamp. Raises PoseNotYetError if it has none after it.
+        """
+        newer = bisect_left(self.stamps, stamp_ns)
+        if self.stamps[newer] == stamp_ns:
+            return newer, newer
+        older = newer - 1
+        for row in range(newer, len(self.stamps)):
+            if self.parents[row] == self.parents[older]:
+                return older, row
+        raise PoseNotYetError(f'between the parents {self.parents[older]} and {self.parent}')
 
     def at(self, stamp_ns: int) -> Transform:
         """Return the transform at a stamp within those held."""
         if self.is_static:
             return self.transforms[0]
-        row = bisect_left(self.stamps, stamp_ns)
-        newer = self.stamps[row]
-        if newer == stamp_ns:
-            return self.transforms[row]
-        older = self.stamps[row - 1]
-        alpha = (stamp_ns - older) / (newer - older)
-        return interpolate(self.transforms[row - 1], self.transforms[row], alpha)
+        older, newer = self.rows_around(stamp_ns)
+        if older == newer:
+            return self.transforms[older]
+        start_ns = self.stamps[older]
+        alpha = (stamp_ns - start_ns) / (self.stamps[newer] - start_ns)
+        return interpolate(self.transforms[older], self.transforms[newer], alpha)
 
 
 def rigid(parent: str, child: str, T_parent_child: Transform) -> Transform:
@@ -129,18 +164,29 @@ def check_held(edges: list[PoseTrack], stamp_ns: int, max_gap_s: float) -> None:
     dynamic = [edge for edge in edges if not edge.is_static]
     for edge in dynamic:
         if stamp_ns < edge.stamps[0]:
-            raise PoseError(f'older than all of {edge}')
+            raise PoseError(f'older than all of {edge.describe(stamp_ns)}')
     for edge in dynamic:
         if stamp_ns > edge.stamps[-1]:
-            raise PosesLateError(f'newer than all of {edge}')
+            raise PosesLateError(f'newer than all of {edge.describe(stamp_ns)}')
     for edge in dynamic:
-        check_gap(edge, edge.gap_ns(stamp_ns), max_gap_s)
+        older, newer = edge.rows_around(stamp_ns)
+        check_gap(edge, edge.stamps[older], edge.stamps[newer], max_gap_s)
 
 
-def check_gap(edge: PoseTrack, gap_ns: int, max_gap_s: float) -> None:
+def check_within(edge: PoseTrack, start_ns: int, end_ns: int, max_gap_s: float) -> None:
+    """Raise if the transforms of a span, ends included, are in two parents or too far apart."""
+    first, last = bisect_left(edge.stamps, start_ns), bisect_right(edge.stamps, end_ns)
+    if not {edge.parent_at(start_ns)}.issuperset(edge.parents[first:last]):
+        raise PoseError(f'{edge.child!r} gets a new parent until {seconds(end_ns)} s')
+    for older_ns, newer_ns in pairwise(edge.stamps[first:last]):
+        check_gap(edge, older_ns, newer_ns, max_gap_s)
+
+
+def check_gap(edge: PoseTrack, older_ns: int, newer_ns: int, max_gap_s: float) -> None:
     """Raise if two transforms of an edge are too far apart to interpolate between them."""
-    gap_s = gap_ns / NS_PER_S
+    gap_s = (newer_ns - older_ns) / NS_PER_S
     if gap_s > max_gap_s:
         raise PoseNotYetError(
-            f'in a gap of {gap_s:.3f} s of {edge}, longer than {max_gap_s:g} s (pose.max_gap_s)'
+            f'in a gap of {gap_s:.3f} s of {edge.describe(older_ns)}, longer than '
+            f'{max_gap_s:g} s (pose.max_gap_s)'
         )

@@ -12,11 +12,12 @@ the node goes on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial, wraps
 import inspect
+import threading
 import types
 from typing import Any, TypeVar
 
@@ -116,11 +117,23 @@ class BaseNode(Node):
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **kwargs: Any
     ) -> Service:
         """Create a service; those that set parameters refuse values of unknown types."""
+        if srv_type is SetParameters:
+            callback = self._on_set_parameters
         if srv_type in (SetParameters, SetParametersAtomically):
-            callback = partial(_on_set_parameters, callback)
+            callback = partial(_with_known_types, callback)
         if srv_type is not ChangeState:  # its errors end the node, see MapperNode
             callback = self._answered(srv_name, callback)
         return super().create_service(srv_type, srv_name, callback, **kwargs)
+
+    def set_each(self, parameters: Sequence[Parameter]) -> Sequence[SetParametersResult]:
+        """Set each parameter of a service request, and return the results."""
+        return self.set_parameters([*parameters])  # type: ignore[no-any-return]
+
+    def _on_set_parameters(
+        self, request: SetParameters.Request, response: SetParameters.Response
+    ) -> SetParameters.Response:
+        response.results = self.set_each([*map(Parameter.from_parameter_msg, request.parameters)])
+        return response
 
     def _survived(self, task: str, callback: Callable[..., None]) -> Callable[..., None]:
         """Return a callback whose errors are reported."""
@@ -165,7 +178,7 @@ def check_length(request: Any) -> None:
             raise ConfigError(f'{number} {items}, expected at most {MAX_PARAMETERS}')
 
 
-def _on_set_parameters(set_parameters: Callable[..., Any], request: Any, response: Any) -> Any:
+def _with_known_types(set_parameters: Callable[..., Any], request: Any, response: Any) -> Any:
     """Set parameters, or refuse the whole request if one value is of an unknown type."""
     unknown = [p for p in request.parameters if p.value.type not in PARAMETER_TYPES]
     if not unknown:
@@ -191,6 +204,44 @@ def _refused(request: Any, response: Any, reason: str) -> Any:
         response.success = False
         response.message = reason
     return response
+
+
+class Ticker:
+    """
+    Calls a function at a rate in a thread of its own, whatever the executor does.
+
+    Parameters
+    ----------
+    node : BaseNode
+        Reports the errors of the function.
+    name : str
+        Name of the thread.
+    period_s : float
+        Time between two calls.
+    callback : callable
+        The function.
+
+    """
+
+    def __init__(
+        self, node: BaseNode, name: str, period_s: float, callback: Callable[[], object]
+    ) -> None:
+        self._node = node
+        self._period_s = min(period_s, LONGEST_PERIOD_S)
+        self._callback = callback
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread."""
+        self._stopping.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopping.wait(self._period_s):
+            with self._node.surviving('a timer'):
+                self._callback()
 
 
 def steady_timer(node: Node, rate_hz: float, callback: Callable[[], None]) -> Timer:

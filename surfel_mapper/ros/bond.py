@@ -17,9 +17,7 @@ from importlib import import_module
 from typing import Any
 import uuid
 
-from rclpy.timer import Timer
-
-from surfel_mapper.ros.base_node import BaseNode, steady_timer
+from surfel_mapper.ros.base_node import BaseNode, Ticker
 
 TOPIC = 'bond'
 
@@ -44,7 +42,7 @@ class Bond:
 
     def __init__(self, node: BaseNode) -> None:
         self._node = node
-        self._timer: Timer | None = None
+        self._ticker: Ticker | None = None
         self._publisher: Any = None
         self._instance_id = ''
         try:
@@ -54,21 +52,21 @@ class Bond:
 
     def start(self) -> None:
         """Send heartbeats from now on."""
-        if self._message is None or self._timer is not None:
+        if self._message is None or self._ticker is not None:
             return
         self._instance_id = str(uuid.uuid4())
         self._publisher = self._node.create_publisher(self._message, TOPIC, 1)
-        self._timer = steady_timer(self._node, 1.0 / HEARTBEAT_PERIOD_S, self._send)
         self._send()
+        self._ticker = Ticker(self._node, 'bond', HEARTBEAT_PERIOD_S, self._send)
 
     def stop(self) -> None:
         """Tell the manager that the bond ends on purpose, and send no more."""
-        if self._timer is None:
+        if self._ticker is None:
             return
-        self._node.destroy_timer(self._timer)
+        self._ticker.stop()
         self._send(active=False)
         self._node.destroy_publisher(self._publisher)
-        self._timer = self._publisher = None
+        self._ticker = self._publisher = None
 
     def _send(self, *, active: bool = True) -> None:
         """Send a heartbeat, or the end of the bond."""

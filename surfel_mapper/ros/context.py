@@ -27,6 +27,8 @@ from surfel_mapper.errors import ConfigError, LineFormatter
 
 PROFILE = Path(__file__).with_name('fastdds_shm.xml')
 
+UDP_PROFILE = Path(__file__).with_name('fastdds_udp.xml')
+
 FASTDDS_VARIABLES = (
     'FASTDDS_BUILTIN_TRANSPORTS',
     'FASTDDS_DEFAULT_PROFILES_FILE',
@@ -67,8 +69,10 @@ def context(ros_args: Sequence[str]) -> Iterator[None]:
 
 
 def explain(error: RuntimeError | UnicodeError) -> str:
-    """Return why ROS refuses to start; adds a remedy to the two messages that lack one."""
+    """Return why ROS refuses to start; adds a remedy to messages that lack one."""
     reason = str(error).partition(', at /')[0]
+    if 'log directory' in reason:
+        return f'{reason}. Set ROS_LOG_DIR to a directory that can be written'
     if 'before ros__parameters' in reason:  # such a file is one for --config of replay
         return f'{reason}; put the settings below /**: and ros__parameters:, each indented deeper'
     if os.environ.get('ROS_SECURITY_ENABLE') != 'true':

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+import os
 from pathlib import Path
 import resource
 import time
@@ -24,18 +25,30 @@ import numpy as np
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.subscription import Subscription
+from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import Header
 
 from surfel_mapper.compilation import PROGRESS
 from surfel_mapper.config import Config
+from surfel_mapper.errors import one_line
 from surfel_mapper.pipeline.reduction import standing_sensor
-from surfel_mapper.ros.base_node import CountedPublisher, steady_timer
+from surfel_mapper.ros.base_node import CountedPublisher, Ticker
+from surfel_mapper.ros.context import UDP_PROFILE
 from surfel_mapper.ros.health import ERROR, findings, Interval, OFF_S, OK
 from surfel_mapper.ros.messages import time_message
-from surfel_mapper.ros.publishers import mismatch, publishers_of
+from surfel_mapper.ros.publishers import (
+    mismatch,
+    of_other_types,
+    other_users,
+    publishers_of,
+    user_name,
+)
 from surfel_mapper.ros.session import Session
 
 LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
+
+SILENT_S = 3.0
+"""Time without a cloud of a publisher that is known, after which other users are looked for, s."""
 
 BUSY_S = 5.0
 """A mapping thread that does not answer for this time is reported as an error."""
@@ -60,8 +73,14 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._asked_s: float | None = None
         self._last = Totals()
+        self._ticker: Ticker | None = None
         if rate_hz:
-            steady_timer(node, rate_hz, self._on_timer)
+            self._ticker = Ticker(node, 'diagnostics', 1.0 / rate_hz, self._on_timer)
+
+    def stop(self) -> None:
+        """Publish no more."""
+        if self._ticker is not None:
+            self._ticker.stop()
 
     def watch(self, session: Session | None) -> None:
         """Report about a session from now on; None: the state alone."""
@@ -113,7 +132,8 @@ class Totals:
     def __init__(self) -> None:
         """Start at zero."""
         self.time_s = time.monotonic()
-        self.received = 0
+        self.received = self.mapped = 0
+        self.num_publishers = 0
         self.lost = 0
         self.dropped: Counter[str] = Counter()
         self.published: dict[str, int] = {}
@@ -124,6 +144,7 @@ class Totals:
         now = cls()
         counters = session.mapper.counters
         now.received = counters.received
+        now.mapped = counters.mapped + counters.gated + counters.localised
         now.lost = session.inputs.clouds_lost
         now.dropped = Counter(counters.dropped)
         now.published = {
@@ -136,14 +157,19 @@ class Totals:
     def since(self, last: Totals, node: Node, session: Session) -> Interval:
         """Return the interval since an earlier count; of several topics, the most silent one."""
         topic, received_s = session.inputs.most_silent
-        num_publishers, unheard = publishers(node, topic)
+        self.num_publishers, unheard = publishers(node, topic)
+        silent_s = max(self.time_s - received_s, 0.0)
+        is_silent = silent_s > SILENT_S and min(self.num_publishers, last.num_publishers) > 0
+        if is_silent and not unheard and (unheard := of_another_user(node)):
+            node.get_logger().warning(f'{topic}: {unheard}', throttle_duration_sec=60.0)
         return Interval(
             topic=topic,
-            num_publishers=num_publishers,
+            num_publishers=self.num_publishers,
             unheard=unheard,
             ever_received=self.received > 0,
             received=self.received - last.received,
-            silent_s=max(self.time_s - received_s, 0.0),
+            never_mapped=0 if self.mapped else last.received,
+            silent_s=silent_s,
             dropped=self.dropped - last.dropped,
             latency_s=latency(session, 99) if self.received > last.received else None,
             paused=session.thread.paused,
@@ -151,6 +177,8 @@ class Totals:
             loss=session.inputs.loss() if self.lost > last.lost or not self.received else '',
             alternatives=session.inputs.alternatives,
             poses=session.inputs.poses.warning,
+            checkpoints=session.checkpoints.problem,
+            mounts=session.inputs.poses.mount_changes(session.mapper.mount_changes),
         )
 
     def rates(self, last: Totals) -> dict[str, Any]:
@@ -170,12 +198,28 @@ class Totals:
 
 
 def publishers(node: Node, topic: str) -> tuple[int, str]:
-    """Return the number of publishers of a subscribed topic, and a mismatch of their QoS."""
+    """Return the number of publishers of a subscribed topic, and why they are not heard."""
     found = subscription_to(node, topic)
     if found is None:
         return node.count_publishers(topic), ''
     number = len(publishers_of(node, topic, found.msg_type))
-    return number, mismatch(node, topic, found.msg_type, found.qos_profile)
+    unheard = mismatch(node, topic, found.msg_type, found.qos_profile)
+    return number, unheard or ('' if number else of_other_types(node, topic, found.msg_type))
+
+
+def of_another_user(node: Node) -> str:
+    """Return that publishers may be silent because their user is another one, and the remedy."""
+    if not get_rmw_implementation_identifier().startswith('rmw_fastrtps'):
+        return ''
+    users = other_users(node.context.get_domain_id(), os.geteuid())
+    if not users:
+        return ''
+    return (
+        'its publisher is there, but no message arrives, and Fast DDS has shared memory of '
+        f'another user ({users}), which this one ({user_name(os.geteuid())}) cannot open. Run '
+        'driver and node as the same user, or put in front of the command of one of them: '
+        f'FASTRTPS_DEFAULT_PROFILES_FILE={UDP_PROFILE}'
+    )
 
 
 def subscription_to(node: Node, topic: str) -> Subscription | None:
@@ -259,9 +303,12 @@ def diagnostics(
     status = DiagnosticStatus(
         level=LEVELS[level],
         name=f'{name}: mapping',
-        message=text,
+        message=one_line(text),
         hardware_id=name,
-        values=[KeyValue(key=key, value=str(value)) for key, value in leaves(values)],
+        values=[
+            KeyValue(key=one_line(key), value=one_line(str(value)))
+            for key, value in leaves(values)
+        ],
     )
     return DiagnosticArray(header=Header(stamp=time_message(stamp_ns)), status=[status])
 

@@ -18,6 +18,8 @@ from surfel_mapper.pipeline.drops import REMEDIES
 OK, WARN, ERROR = 0, 1, 2
 """As in diagnostic_msgs/DiagnosticStatus."""
 
+NO_POSE = f'they wait for poses or were dropped; {REMEDIES["no_pose"]}'
+
 OFF_S = 600.0
 """
 Latencies above this mean that stamps and clock are of different times, s. A scan waits for its
@@ -42,6 +44,8 @@ class Interval:
         Whether a cloud has ever been received.
     received : int
         Clouds received.
+    never_mapped : int
+        Clouds received until the last report if none of them was ever mapped; else 0.
     silent_s : float
         Time since the last cloud.
     dropped : Counter of str
@@ -58,6 +62,10 @@ class Interval:
         The missing publisher, and the topics that could be read instead; empty if none.
     poses : str
         The poses that are missing, and the remedy; empty if none.
+    checkpoints : str
+        Why checkpoints fail, and the age of the last good one; empty if none failed.
+    mounts : str
+        The sensors that have moved on the robot, and the remedy; empty if none.
 
     """
 
@@ -66,6 +74,7 @@ class Interval:
     unheard: str = ''
     ever_received: bool = True
     received: int = 0
+    never_mapped: int = 0
     silent_s: float = 0.0
     dropped: Counter[str] = field(default_factory=Counter)
     latency_s: float | None = None
@@ -74,6 +83,8 @@ class Interval:
     loss: str = ''
     alternatives: str = ''
     poses: str = ''
+    checkpoints: str = ''
+    mounts: str = ''
 
 
 def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
@@ -83,11 +94,18 @@ def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[in
         yield WARN, interval.loss
     if interval.poses:
         yield WARN, interval.poses
+    if interval.checkpoints:
+        yield ERROR, interval.checkpoints
+    if interval.mounts:
+        yield WARN, interval.mounts
     if interval.paused:
         yield WARN, 'paused: clouds are dropped until ~/pause is called with false'
     for name, error in interval.layers_off.items():
         yield WARN, f'layer {name} is off until ~/clear, it failed repeatedly: {error}'
-    yield from _drops(interval, limits)
+    drops = list(_drops(interval, limits))
+    yield from drops
+    if interval.never_mapped and not drops and not interval.paused:
+        yield WARN, f'none of {interval.never_mapped} clouds is mapped yet: {NO_POSE}'
     yield from _latency(interval, limits)
 
 

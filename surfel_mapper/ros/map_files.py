@@ -8,7 +8,10 @@ Otherwise any client of the node's services could write, or probe for, any file 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -17,19 +20,74 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.files.atomic import make_directory
 from surfel_mapper.files.ply import write_surfels
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.pipeline.saved_state import layer_files, load_mapper, save_mapper
+from surfel_mapper.pipeline.saved_state import CopiedMapper, layer_files, load_mapper
+from surfel_mapper.ros.mapping_thread import MappingThread
 
 MAX_PATH = 4096
 """Characters of a path, as many as Linux takes; resolving one takes 20 us a component."""
 
 
-def save_map(mapper: Mapper) -> str:
+class MapWriter:
     """
-    Write the map to ``output.directory``; return a sentence that states path, sizes and digest.
+    Writes copies of the map in a thread of its own, while scans are mapped.
+
+    Parameters
+    ----------
+    mapper : Mapper
+        The mapper.
+    thread : MappingThread
+        Copies the map between two scans.
+
+    """
+
+    def __init__(self, mapper: Mapper, thread: MappingThread) -> None:
+        self._mapper = mapper
+        self._thread = thread
+        self._executor = ThreadPoolExecutor(1, 'writer')
+        self._latest: Future[str] | None = None
+
+    def save(self) -> Future[str]:
+        """
+        Write the map as it is after the clouds received so far; see copied_map.
+
+        Equal requests are one: a save that has not begun is returned again.
+        """
+        latest = self._latest
+        if latest is None or latest.running() or latest.done():
+            latest = self._latest = self._executor.submit(self._save)
+        return latest
+
+    def _save(self) -> str:
+        return self._thread.call(partial(copied_map, self._mapper)).result()()
+
+    def write(self, function: Callable[[], object]) -> None:
+        """Call a function that writes; its errors are counted and logged."""
+        self._executor.submit(self._guarded, function)
+
+    def _guarded(self, function: Callable[[], object]) -> None:
+        try:
+            function()
+        except Exception as error:  # MemoryError too
+            self._thread.report_failure('a checkpoint', error)
+
+    def close(self) -> None:
+        """Finish what is being written, after the mapping thread has ended."""
+        self._executor.shutdown()
+
+
+def save_map(mapper: Mapper) -> str:
+    """Write the map to ``output.directory`` now; see copied_map."""
+    return copied_map(mapper)()
+
+
+def copied_map(mapper: Mapper) -> Callable[[], str]:
+    """
+    Copy the map; return the function that writes it to ``output.directory``, for any thread.
 
     ``output.map_name``.ply has the surfels in ``frames.fixed``, for other programs;
     ``output.map_name``.npz the exact map and its window, from which mapping can continue; layers
-    that keep a state, as the distance field does, have a file each beside it.
+    that keep a state, as the distance field does, have a file each beside it. The function returns
+    a sentence that states path, sizes and digest.
 
     Raises
     ------
@@ -48,14 +106,18 @@ def save_map(mapper: Mapper) -> str:
     for file in (path, state, *beside):
         if not is_inside(directory, file):
             raise ConfigError(f'{file}: a link that leads out of output.directory, {directory}')
-    surfels = mapper.map.surfels(mapper.config.map.min_points)
-    write_surfels(path, surfels, mapper.map.origin_m)
-    digest = save_mapper(state, mapper)
+    copied = CopiedMapper(state, mapper)
+    min_points = mapper.config.map.min_points
+    scans = f'{len(mapper.window)} scans ({mapper.counters.received} received)'
     layers = ''.join(f', {file.name}' for file in beside)
-    return (
-        f'{path} and .npz{layers}: {len(surfels)} surfels of {len(mapper.window)} scans '
-        f'({mapper.counters.received} received), digest {digest}'
-    )
+
+    def write() -> str:
+        surfels = copied.map().surfels(min_points)
+        write_surfels(path, surfels, copied.map().origin_m)
+        digest = copied.write()
+        return f'{path} and .npz{layers}: {len(surfels)} surfels of {scans}, digest {digest}'
+
+    return write
 
 
 def load_map(mapper: Mapper, url: str) -> str:

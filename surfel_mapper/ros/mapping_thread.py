@@ -120,7 +120,7 @@ class MappingThread:
         self._on_failure = on_failure
         self._changed = threading.Condition()
         self._max_clouds = mapper.config.input.max_waiting_clouds
-        self._static: dict[tuple[str, str], StampedPose] = {}  # by parent and child
+        self._static: dict[str, StampedPose] = {}  # by child
         self._poses: deque[StampedPose] = deque()
         self._images: defaultdict[str, deque[SceneImage]] = defaultdict(deque)  # by kind
         self._work: deque[QueuedCloud | Call] = deque()
@@ -148,10 +148,10 @@ class MappingThread:
             self._thread.join()
 
     def put_poses(self, poses: Iterable[StampedPose], *, static: bool = False) -> None:
-        """Queue poses for the mapper; of the static ones of an edge, the latest."""
+        """Queue poses for the mapper; of the static ones of a frame, the latest."""
         with self._changed:
             if static:
-                self._static.update(((pose.parent, pose.child), pose) for pose in poses)
+                self._static.update((pose.child, pose) for pose in poses)
             else:
                 self._poses.extend(poses)
             while len(self._poses) > MAX_POSES:

@@ -3,9 +3,10 @@
 """
 The lifecycle node: states, parameters, and the session that does the work.
 
-There are four threads. The main thread makes the transitions and handles signals (main_thread.py).
-The subscription executor takes clouds and poses, the rclpy executor requests and timers; both pass
-them on. Only the mapping thread accesses the map, and publishes the results.
+The main thread makes the transitions and handles signals (main_thread.py). The subscription
+executor takes clouds and poses, the rclpy executor requests and timers. Both pass them on. Only
+the mapping thread accesses the map, and publishes the results. The heartbeat of the bond and the
+diagnostics have a thread each, as a request may take long.
 
     unconfigured  parameters and diagnostics
     inactive      kernels are compiled, publishers and services exist, no scan is taken
@@ -14,7 +15,7 @@ them on. Only the mapping thread accesses the map, and publishes the results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -33,14 +34,15 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
 from surfel_mapper.budget import stated_limit
+from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError, SurfelMapperError
-from surfel_mapper.filters.chain import Chain
 from surfel_mapper.pipeline.reduction import standing_sensor
 from surfel_mapper.ros.base_node import BaseNode, result_of
 from surfel_mapper.ros.bond import Bond
 from surfel_mapper.ros.diagnostics import Diagnostics
+from surfel_mapper.ros.filter_files import check_chain, FilterFiles
 from surfel_mapper.ros.main_thread import TaskQueue
-from surfel_mapper.ros.parameters import as_declared, declare_settings, refusal, settings_among
+from surfel_mapper.ros.parameters import as_declared, declare_settings, refusals, settings_among
 from surfel_mapper.ros.session import Session
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -57,6 +59,11 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
     refusal : Exception or None
         The reason why the last transition was refused.
 
+    Parameters
+    ----------
+    ros_args : sequence of str
+        The command line; see FilterFiles.
+
     Raises
     ------
     ConfigError
@@ -64,7 +71,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ros_args: Sequence[str] = ()) -> None:
         """Declare the parameters and create the services of the life cycle."""
         try:
             Node.__init__(self, 'surfel_mapper')
@@ -74,6 +81,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         self.refusal: Exception | None = None
         self._session: Session | None = None
         self._config = declare_settings(self)
+        self._filter_files = FilterFiles(self._config, ros_args)
         # reentrant, so that get_state is answered while kernels compile
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
         self._change_state = self._service_change_state.callback
@@ -121,14 +129,43 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         rclpy leaves those to the garbage collector. Until then the middleware's participant and
         its threads live on, and a node of the same name finds a service that does not answer.
         """
+        self._diagnostics.stop()
         self._state_machine.destroy_when_not_in_use()
         super().destroy_node()
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters from a service request; a refusal names the parameter and the reason."""
-        if reason := refusal(self, parameter_list):
+        parameters = [as_declared(p) for p in parameter_list]
+        for reason in refusals(self, parameters).values():
             return SetParametersResult(successful=False, reason=reason)
-        return super().set_parameters_atomically([as_declared(p) for p in parameter_list])
+        return super().set_parameters_atomically(parameters)
+
+    def set_each(self, parameters: Sequence[Parameter]) -> list[SetParametersResult]:
+        """
+        Set each parameter of a service request that is accepted; return the results.
+
+        Those accepted change the configuration together: at 20 ms for each, 500 would hold all
+        other requests for 10 s. If one name comes several times, its last value counts.
+        """
+        latest = {p.name: as_declared(p) for p in parameters}
+        reasons = refusals(self, [*latest.values()])
+        accepted = [p for p in latest.values() if p.name not in reasons]
+        if not self._check_parameters(accepted).successful:  # conditions on several settings
+            candidates, accepted, config = accepted, [], self._config
+            for parameter in candidates:
+                try:
+                    config = self._changed(config, [parameter])
+                except ConfigError as error:
+                    reasons[parameter.name] = str(error)
+                else:
+                    accepted.append(parameter)
+        result = super().set_parameters_atomically(accepted)
+        if not result.successful:
+            reasons.update((p.name, result.reason) for p in accepted)
+        return [
+            SetParametersResult(successful=p.name not in reasons, reason=reasons.get(p.name, ''))
+            for p in parameters
+        ]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Compile the kernels, then create publishers and services."""
@@ -267,9 +304,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuse values that the configuration refuses, and invalid filter files."""
         try:
-            config = self._config.replace(settings_among(parameters))
-            if config.filters and config.filters != self._config.filters:
-                Chain.load(config.filters)
+            self._changed(self._config, parameters)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -282,11 +317,20 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         of rclpy meanwhile, for example those of QoS: it must not write settings back that it has
         read before they changed.
         """
-        changed = settings_among(parameters)
-        if not changed:
+        if not settings_among(parameters):
             return
-        config = self._config.replace(changed)
+        config = self._changed(self._config, parameters)
         if config != self._config:
             self._config = config
             if self._session is not None:
                 self._session.reconfigure(config)
+
+    def _changed(self, config: Config, parameters: Sequence[Parameter]) -> Config:
+        """Return a configuration with changed settings; raise ConfigError if one is refused."""
+        changes = settings_among(parameters)
+        if isinstance(changes.get('filters'), str):
+            changes['filters'] = self._filter_files.path(changes['filters'])
+        changed = config.replace(changes)
+        if changed.filters and changed.filters != config.filters:
+            check_chain(changed.filters)
+        return changed

@@ -10,7 +10,7 @@ nearest one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 import math
 import sys
 from typing import Any
@@ -19,12 +19,22 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from surfel_mapper.config import Config, Declaration, declarations, near
+from surfel_mapper.config import checked, Config, Declaration, declarations, near
+from surfel_mapper.errors import ConfigError
 
 QOS_OVERRIDES = 'qos_overrides.'
 """rclpy declares parameters of this prefix when it subscribes to their topics."""
 
 INT64_MAX = 2**63 - 1
+
+MAX_SUGGESTIONS = 10
+"""Unknown names of a request for which a similar one is searched; a search takes 2 ms."""
+
+FLOATS = {
+    Parameter.Type.INTEGER: Parameter.Type.DOUBLE,
+    Parameter.Type.INTEGER_ARRAY: Parameter.Type.DOUBLE_ARRAY,
+}
+"""Types of integers, and the types that they are taken for where floats are declared."""
 
 LISTS = {float: Parameter.Type.DOUBLE_ARRAY, str: Parameter.Type.STRING_ARRAY}
 """Parameter types of lists, by the type of their items."""
@@ -104,21 +114,49 @@ def settings_among(parameters: Iterable[Parameter]) -> dict[str, Any]:
     return {p.name: p.value for p in parameters if p.name in names}
 
 
-def refusal(node: Node, parameters: Iterable[Parameter]) -> str:
-    """Return why parameters cannot be set on a running node: unknown or read-only; else empty."""
+def refusals(node: Node, parameters: Sequence[Parameter]) -> dict[str, str]:
+    """
+    Return why parameters cannot be set on a running node, by name.
+
+    They are unknown, read-only, of another type or out of bounds. The nearest names of unknown
+    ones are searched for MAX_SUGGESTIONS of a request, since a search takes milliseconds.
+    """
+    settings = {declared.name: declared for declared in declarations()}
+    reasons: dict[str, str] = {}
+    num_unknown = 0
     for parameter in parameters:
         name = parameter.name
         if not node.has_parameter(name):
-            known = [declared.name for declared in declarations()]
-            return f'{name}: no such setting{near(name, known)}'
-        if node.describe_parameter(name).read_only:
-            return f'{name}: read-only, cannot change while running; set it at the start'
-    return ''
+            num_unknown += 1
+            suggestion = near(name, settings) if num_unknown <= MAX_SUGGESTIONS else ''
+            reasons[name] = f'{name}: no such setting{suggestion}'
+        elif node.describe_parameter(name).read_only:
+            reasons[name] = f'{name}: read-only, cannot change while running; set it at the start'
+        elif name in settings:
+            try:
+                checked(name, parameter.value, settings[name])
+            except ConfigError as error:
+                reasons[name] = str(error)
+            else:
+                if parameter.type_.value != node.describe_parameter(name).type:
+                    reasons[name] = f'{name}: an empty list of another type'
+    return reasons
 
 
 def as_declared(parameter: Parameter) -> Parameter:
-    """Return the parameter as a float if it is declared as one and given as an integer."""
-    floats = {declared.name for declared in declarations() if isinstance(declared.default, float)}
-    if parameter.name in floats and parameter.type_ == Parameter.Type.INTEGER:
-        return Parameter(parameter.name, value=float(parameter.value))
-    return parameter
+    """Return the parameter as floats if it is declared so and given as integers."""
+    kind = FLOATS.get(parameter.type_)
+    if kind is None or parameter.name not in float_settings():
+        return parameter
+    value = parameter.value
+    is_list = kind is Parameter.Type.DOUBLE_ARRAY
+    return Parameter(parameter.name, kind, [float(v) for v in value] if is_list else float(value))
+
+
+def float_settings() -> set[str]:
+    """Return the names of the settings that are floats, or lists of them."""
+    return {
+        declared.name
+        for declared in declarations()
+        if (declared.items if declared.is_list else type(declared.default)) is float
+    }

@@ -106,7 +106,7 @@ class PoseInputs:
         self._odometry = TopicSearch(node, 'odom', Odometry)
         self._pose = TopicSearch(node, 'pose', PoseStamped)
         self._waiting: dict[str, deque[StampedPose]] = {}  # by topic, until the choice
-        self._static: dict[tuple[str, str], StampedPose] = {}  # by parent and child
+        self._static: dict[str, StampedPose] = {}  # by child
         self._missing = ''
         self._frame_id = ''
         self._first_cloud_s: float | None = None
@@ -159,6 +159,10 @@ class PoseInputs:
             f'scans wait: {self._missing}; map.origin needs poses, so that registration is not '
             f'taken; {HOW_TO_CHOOSE}'
         )
+
+    def mount_changes(self, changes: str) -> str:
+        """Return changes of mounts with the nodes that publish them; empty if there are none."""
+        return f'{changes} ({self._subscriptions.eager_publishers()})' if changes else ''
 
     def note_cloud(self, frame_id: str) -> None:
         """Take the frame of the first cloud; the waits begin with it."""
@@ -295,7 +299,7 @@ class PoseInputs:
         if not self.is_choosing:
             self._thread.put_poses(poses, static=is_static)
         elif is_static:
-            self._static.update(((pose.parent, pose.child), pose) for pose in poses)
+            self._static.update((pose.child, pose) for pose in poses)
             while len(self._static) > MAX_EDGES:  # the buffer of the mapper holds no more
                 self._static.popitem()
         else:

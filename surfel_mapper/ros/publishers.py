@@ -1,19 +1,32 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The publishers of a topic, and those that a subscription cannot hear because of its QoS.
+The publishers of a topic, and why a subscription cannot hear them.
 
 A topic may have publishers of another type, which the graph lists too: they send nothing to a
-subscription, so their quality of service does not matter.
+subscription, so their quality of service does not matter. Fast DDS uses shared memory between
+processes of one machine, and cannot open that of another user: publishers match, and are silent.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
+from pathlib import Path
+import pwd
+import re
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+SHARED_MEMORY = Path('/dev/shm')
+
+PORT = re.compile('fastrtps_port([0-9]+)')
+"""Shared memory in which a participant of Fast DDS is told of messages, by its port."""
+
+FIRST_PORT, PORTS_OF_DOMAIN = 7400, 250
+"""Ports of domain 0, and their number in each domain; from the RTPS specification."""
 
 UNHEARD = {
     'reliability': (ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
@@ -28,6 +41,43 @@ def publishers_of(node: Node, topic: str, message: Any) -> list[TopicEndpointInf
     kind = f'{package}/msg/{message.__name__}'
     found = node.get_publishers_info_by_topic(topic)
     return [publisher for publisher in found if publisher.topic_type == kind]
+
+
+def full_name(publisher: TopicEndpointInfo) -> str:
+    """Return the name of the node of a publisher."""
+    return f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'
+
+
+def of_other_types(node: Node, topic: str, message: Any) -> str:
+    """Return the publishers of a topic that send messages of another class; empty if none."""
+    expected = publishers_of(node, topic, message)
+    texts = {
+        f'{full_name(publisher)} publishes {publisher.topic_type} there'
+        for publisher in node.get_publishers_info_by_topic(topic)
+        if publisher not in expected
+    }
+    kind = f'{message.__module__.partition(".")[0]}/msg/{message.__name__}'
+    return f'{", ".join(sorted(texts))}, expected {kind}' if texts else ''
+
+
+def other_users(domain_id: int, user_id: int) -> str:
+    """Return the other users with participants of Fast DDS in a domain of this machine."""
+    first = FIRST_PORT + PORTS_OF_DOMAIN * domain_id
+    ids = set()
+    for path in SHARED_MEMORY.glob('fastrtps_port*'):
+        match = PORT.fullmatch(path.name)
+        if match and first <= int(match[1]) < first + PORTS_OF_DOMAIN:
+            with suppress(OSError):  # gone
+                ids.add(path.stat().st_uid)
+    return ', '.join(map(user_name, sorted(ids - {user_id})))
+
+
+def user_name(user_id: int) -> str:
+    """Return the name of a user, or the number without one."""
+    try:
+        return pwd.getpwuid(user_id).pw_name
+    except KeyError:
+        return str(user_id)
 
 
 def override(topic: str, policy: str) -> str:
@@ -47,7 +97,7 @@ def mismatch(node: Node, topic: str, message: Any, qos: QoSProfile) -> str:
     Reliability counts only if the user has set it, since it follows the publishers otherwise.
     """
     for publisher in publishers_of(node, topic, message):
-        name = f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'
+        name = full_name(publisher)
         for policy, (offered, wanted) in UNHEARD.items():
             found = getattr(publisher.qos_profile, policy), getattr(qos, policy)
             if found != (offered, wanted):

@@ -4,7 +4,8 @@
 The services of the node, and ~/clear_polygon: commands that change, save or load the map.
 
 Requests are carried out in the mapping thread, behind the clouds that arrived before them, so the
-answer covers all of these. The executor runs other callbacks meanwhile. Every answer states the
+answer covers all of these; ~/save_map copies the map there, and writes it in another thread. The
+executor runs other callbacks meanwhile. Every answer states the
 result and its location; it is logged too, because nav_msgs/LoadMap has no field for text.
 """
 
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Future
 from functools import partial
 from typing import Any
 
@@ -35,7 +36,7 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.drops import described
 from surfel_mapper.pipeline.regions import Ball, Box, MAX_CORNERS, Prism, Region
 from surfel_mapper.ros.base_node import result_of
-from surfel_mapper.ros.map_files import load_map, save_map
+from surfel_mapper.ros.map_files import load_map, MapWriter
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import time_message
 from surfel_mapper.ros.outputs import Outputs
@@ -74,11 +75,18 @@ class Services:
         The thread that owns the mapper.
     outputs : Outputs
         Publishes the map again after a change.
+    writer : MapWriter
+        Saves the map.
 
     """
 
     def __init__(
-        self, node: Node, mapper: Mapper, thread: MappingThread, outputs: Outputs
+        self,
+        node: Node,
+        mapper: Mapper,
+        thread: MappingThread,
+        outputs: Outputs,
+        writer: MapWriter,
     ) -> None:
         """Create the services and the subscription to ~/clear_polygon."""
         self._node = node
@@ -93,19 +101,21 @@ class Services:
             ('~/clear', self._clear),
             ('~/clear_box', self._clear_box),
             ('~/clear_radius', self._clear_radius),
-            ('~/save_map', self._save),
         ):
-            node.create_service(Trigger, name, self._trigger(action), callback_group=group)
+            start = partial(thread.call, action)
+            node.create_service(Trigger, name, self._trigger(start), callback_group=group)
+        save = self._trigger(writer.save)
+        node.create_service(Trigger, '~/save_map', save, callback_group=group)
         node.create_service(LoadMap, '~/load_map', self._on_load_map, callback_group=group)
         node.create_service(SetBool, '~/pause', self._on_pause, callback_group=group)
         node.create_subscription(PolygonStamped, '~/clear_polygon', self._on_polygon, 10)
 
-    def _trigger(self, action: Callable[[], str]) -> Callable[..., Any]:
-        """Return a service callback that runs an action in the mapping thread."""
+    def _trigger(self, start: Callable[[], Future[str]]) -> Callable[..., Any]:
+        """Return a service callback that starts an action in another thread, and awaits it."""
 
         async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             try:
-                response.message = await self._run(action)
+                response.message = await self._run(start)
                 response.success = True
             except Exception as error:  # MemoryError too
                 response.message = self._log_failure(error)
@@ -117,7 +127,7 @@ class Services:
         self, request: LoadMap.Request, response: LoadMap.Response
     ) -> LoadMap.Response:
         try:
-            await self._run(partial(self._load, request.map_url))
+            await self._run(partial(self._thread.call, partial(self._load, request.map_url)))
         except Exception as error:  # MemoryError too
             self._log_failure(error)
             response.result = next(code for kind, code in LOAD_ERRORS if isinstance(error, kind))
@@ -141,13 +151,13 @@ class Services:
         self._polygons.append(msg)
         self._thread.post(self._clear_polygons)
 
-    async def _run(self, action: Callable[[], str]) -> str:
-        """Run an action in the mapping thread; log its answer and return it."""
+    async def _run(self, start: Callable[[], Future[str]]) -> str:
+        """Start an action in another thread; log its answer and return it."""
         if self._num_waiting >= MAX_WAITING:
             raise MapError(f'{MAX_WAITING} requests wait already; try again')
         self._num_waiting += 1
         try:
-            answer = await result_of(self._thread.call(action), self._node.executor)
+            answer = await result_of(start(), self._node.executor)
         finally:
             self._num_waiting -= 1
         self._node.get_logger().info(answer)
@@ -208,9 +218,10 @@ class Services:
         return self._clear_region(Ball((x, y, z), radius_m), where)
 
     def _clear_polygons(self) -> None:
-        """Clear the regions of all polygons received on ~/clear_polygon."""
-        while self._polygons:
-            self._clear_polygon(self._polygons.popleft())
+        """Clear the region of the next polygon; those behind it follow after other work."""
+        self._clear_polygon(self._polygons.popleft())
+        if self._polygons:
+            self._thread.post(self._clear_polygons)
 
     def _clear_polygon(self, msg: PolygonStamped) -> None:
         topic, log = self._node.resolve_topic_name('~/clear_polygon'), self._node.get_logger()
@@ -230,10 +241,6 @@ class Services:
         self._mapper.clear_region(region)
         self._outputs.expire()
         return f'cleared {before - self._mapper.map.num_voxels} voxels in {where}'
-
-    def _save(self) -> str:
-        """Write the map to its files."""
-        return save_map(self._mapper)
 
     def _load(self, url: str) -> str:
         """Replace the map by the one in a file."""

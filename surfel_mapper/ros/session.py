@@ -13,16 +13,18 @@ from typing import TYPE_CHECKING
 
 from surfel_mapper.compilation import CompileStage, run_stages
 from surfel_mapper.config import Config
-from surfel_mapper.errors import SurfelMapperError
+from surfel_mapper.errors import ConfigError, SurfelMapperError
+from surfel_mapper.files.atomic import remove_abandoned
 from surfel_mapper.memory import lasting_objects
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
 from surfel_mapper.pipeline.warm_up import node_stages
 from surfel_mapper.poses import AUTO, SourceChoice
 from surfel_mapper.ros.base_node import BaseNode
+from surfel_mapper.ros.filter_files import fault_of
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.main_thread import TaskQueue
-from surfel_mapper.ros.map_files import save_map
+from surfel_mapper.ros.map_files import directory_of, MapWriter, save_map
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.outputs import Outputs
 from surfel_mapper.ros.pose_outputs import registration_outputs
@@ -50,6 +52,8 @@ class Session:
 
     Attributes
     ----------
+    checkpoints : Checkpoints
+        Saves the map from time to time.
     latencies_s : deque of float
         Times from the stamps of the latest scans until ~/changed was published, by the clock of
         the node.
@@ -73,8 +77,11 @@ class Session:
         self.mapper = Mapper(config)
         self.mapper.knows_source = config.pose.source != AUTO
         load_start(self.mapper)
-        self._checkpoints = Checkpoints(self.mapper)
+        self.checkpoints = Checkpoints(self.mapper)
+        for path in remove_abandoned(directory_of(config.output)):
+            node.get_logger().info(f'{path} removed: its process died while it wrote a file')
         self.thread = MappingThread(self.mapper, tasks.fail)
+        self._writer = MapWriter(self.mapper, self.thread)
         self.inputs = Inputs(node, config, self.thread, tasks.fail, self._on_choice)
         log, start = node.get_logger(), time.monotonic()
         log.info('loading kernels')
@@ -82,7 +89,7 @@ class Session:
             run_stages(node_stages(self.mapper))
         self.outputs = Outputs(node, self.mapper, self.thread)
         self.registration = registration_outputs(node, self.mapper, self.thread)
-        self.services = Services(node, self.mapper, self.thread, self.outputs)
+        self.services = Services(node, self.mapper, self.thread, self.outputs, self._writer)
         log.info(f'kernels ready after {time.monotonic() - start:.1f} s')
         self.latencies_s: deque[float] = deque(maxlen=LATEST)
         self._changing = threading.Lock()  # transitions and settings come from two threads
@@ -121,6 +128,7 @@ class Session:
     def close(self, *, save: bool) -> None:
         """Map the messages received so far, end the thread, save the map if asked, and log."""
         self.thread.stop()
+        self._writer.close()
         with self.mapper.guarded('the end of the outputs'):
             self.outputs.close()
             if self._viewer is not None:
@@ -130,7 +138,7 @@ class Session:
             self.mapper.finish()
         if self._tasks.has_failed and self.mapper.map.num_voxels:
             with self.mapper.guarded('a checkpoint'):
-                log.error(f'the node stops on an error; map saved: {self._checkpoints.save()}')
+                log.error(f'the node stops on an error; map saved: {self.checkpoints.save()}')
         if save:
             try:
                 log.info(f'saved {save_map(self.mapper)}')
@@ -167,7 +175,7 @@ class Session:
             if self.registration is not None:
                 self.registration.publish(update)
         with self.mapper.guarded('a checkpoint'):
-            self._checkpoints.save_if_due()
+            self.checkpoints.save_if_due(self._writer.write)
         now_ns = self._node.get_clock().now().nanoseconds
         self.latencies_s.append((now_ns - update.stamp_ns) / 1e9)
 
@@ -201,8 +209,10 @@ class Session:
         """Pass the newest settings to the mapper; called in the mapping thread."""
         try:
             self.mapper.reconfigure(self.config)
-        except SurfelMapperError as error:  # the filter file has changed since it was checked
-            self._node.get_logger().error(f'settings not applied: {error}')
+        except ConfigError:  # the filter file has changed since it was checked
+            fault = fault_of(self.config.filters)
+            text = f'settings not applied: filters: {self.config.filters}: {fault}'
+            self._node.get_logger().error(text)
         self.outputs.expire()
 
 

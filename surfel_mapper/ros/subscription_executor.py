@@ -236,6 +236,14 @@ class SubscriptionExecutor:
                 return publishers_of(self._node, topic, reader.message)
         return list(self._node.get_publishers_info_by_topic(topic))
 
+    def eager_publishers(self) -> str:
+        """Return the names of the nodes that publish eager topics, by topic."""
+        names = {
+            reader.topic: sorted({info.node_name for info in self.publishers(reader.topic)})
+            for reader in tuple(self._eager)
+        }
+        return ', '.join(f'{topic} by {" and ".join(n)}' for topic, n in names.items() if n)
+
     def start(self) -> None:
         """Start the thread."""
         self._end_s = math.inf

@@ -25,6 +25,7 @@ from surfel_mapper.files.parquet_tiles import tiles_in
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.scan_files import SUFFIXES as CLOUDS
 from surfel_mapper.files.trajectory import read_trajectory, Trajectory
+from surfel_mapper.files.trajectory import SUFFIXES as TRAJECTORIES
 from surfel_mapper.files.triangles import read_triangles
 from surfel_mapper.files.triangles import SUFFIXES as TRIANGLES
 from surfel_mapper.mapping.moments import joined_moments, ScanMoments, unpack_keys
@@ -35,8 +36,6 @@ from surfel_mapper.viz.discs import DrawnDiscs, RGB
 Array = npt.NDArray[np.float64]
 
 EXACT = ('.npz', '.parquet')
-
-TRAJECTORIES = ('.tum', '.csv', '.txt', '.kitti')
 
 BESIDE = ('mesh.ply', 'models.obj', 'models.glb', 'trajectory.tum')
 """Further files of a replay that are shown."""

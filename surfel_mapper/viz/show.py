@@ -21,6 +21,7 @@ from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.contents import Cloud, Content, ExactMap, ShownMesh, Way
 from surfel_mapper.viz.detail import DetailedMap
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
+from surfel_mapper.viz.gltf import GltfScene
 from surfel_mapper.viz.scene import ORANGE, RED, Scene
 
 Array = npt.NDArray[np.float64]
@@ -40,7 +41,7 @@ ROUND_M = 1000.0
 
 
 def show_contents(
-    scene: Scene,
+    scene: Scene | GltfScene,
     contents: Sequence[Content],
     *,
     colouring: str = 'normal',
@@ -53,7 +54,7 @@ def show_contents(
 
     Parameters
     ----------
-    scene : Scene
+    scene : Scene or GltfScene
         Where they are shown.
     contents : sequence of Content
         As ``contents`` of contents.py yields them.
@@ -96,7 +97,7 @@ def show_contents(
     positions = [discs.position for discs in drawn] + [cloud.position for cloud in clouds]
     box = box_of(positions if any(map(len, positions)) else vertices(contents, origin_m))
     meshes = [f'map/{content.name}' for content in contents if isinstance(content, ShownMesh)]
-    hidden = meshes if any(map(len, drawn)) else []
+    hidden = meshes if any(map(len, drawn)) and isinstance(scene, Scene) else []
     scene.look(*box, looked_at, hidden)
     for path, discs in tiles.items():
         scene.discs(path, discs, static=True)
@@ -162,7 +163,7 @@ def with_age(surfels: Surfels, shown: ExactMap, level: int) -> DrawnDiscs:
     return DrawnDiscs.of(surfels, {'age': ages_s(seen_ns, newest_ns)})
 
 
-def show_cloud(scene: Scene, cloud: Cloud) -> str:
+def show_cloud(scene: Scene | GltfScene, cloud: Cloud) -> str:
     """Show surfels of a file as discs, or points."""
     path = f'map/{cloud.name}'
     if cloud.discs is None:
@@ -172,7 +173,7 @@ def show_cloud(scene: Scene, cloud: Cloud) -> str:
     return f'{len(cloud.discs):,} surfels, without their moments: at one level of detail'
 
 
-def show_way(scene: Scene, way: Way, origin_m: Array) -> str:
+def show_way(scene: Scene | GltfScene, way: Way, origin_m: Array) -> str:
     """Show a trajectory as a line, and as a sensor that moves if it has stamps."""
     poses = way.trajectory
     xyz = poses.xyz - origin_m

@@ -12,12 +12,17 @@ import sqlite3
 from mcap.writer import Writer
 import numpy as np
 import pytest
+from rosbags import rosbag2
 
+from surfel_mapper.bags.compression import import_zstd
 from surfel_mapper.bags.reader import BagReader
-from surfel_mapper.bags.topics import CLOUD, ODOMETRY, POSE, TF
+from surfel_mapper.bags.topics import CLOUD, ODOMETRY, POSE, TF, Topic, Topics
 from surfel_mapper.errors import BagError
+from surfel_mapper.messages.pointcloud2 import to_scan
 from test.bags import recorded
 from test.bags.recorded import drive, NUM_SCANS, ROS1, write_ros1, write_rosbag2
+from test.messages.test_livox import custom_message, DEFINITION
+from test.messages.test_livox import TYPE as LIVOX
 
 KINDS = [
     ('mcap', 'none'),
@@ -67,6 +72,127 @@ def test_the_only_file_of_a_directory_reads_like_the_directory(tmp_path, storage
     (file,) = (file for file in path.iterdir() if file.name != 'metadata.yaml')
 
     assert_is_the_drive(read(file))
+
+
+def unpack(file):
+    with import_zstd().open(file) as packed:
+        file.with_suffix('').write_bytes(packed.read())
+    file.unlink()
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize(
+    'change',
+    [
+        unpack,
+        lambda file: file.rename(file.with_suffix('.zst')),
+        lambda file: file.rename(file.with_suffix('')),  # packed, without the name of it
+        lambda file: file.rename(file.with_name(f'renamed{"".join(file.suffixes)}')),
+        lambda file: (unpack(file), file.with_suffix('').rename(file)),
+    ],
+    ids=['unpacked', 'zst', 'suffix removed', 'renamed', 'unpacked in place'],
+)
+def test_files_that_were_unpacked_or_renamed_are_read(tmp_path, storage, change):
+    path = write_rosbag2(tmp_path / 'drive', drive(), storage, 'file')
+    (file,) = (file for file in path.iterdir() if file.name != 'metadata.yaml')
+    change(file)
+    assert_is_the_drive(read(path))
+
+
+def test_a_missing_file_of_several_is_refused_with_the_remedy(tmp_path):
+    path = write_rosbag2(tmp_path / 'drive', drive())
+    metadata = path / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('- drive.mcap', '- drive.mcap\n  - b.mcap'))
+    with pytest.raises(BagError, match=r'b.mcap .*missing; without metadata.yaml .*: drive.mcap'):
+        BagReader(path)
+
+
+def write_encoded(path, encoding, entries):
+    """Write an mcap file whose messages have another encoding than CDR."""
+    with open(path, 'wb') as stream:
+        writer = Writer(stream)
+        writer.start(encoding)
+        channels = {}
+        for topic, type_, record_ns, message in entries:
+            if topic not in channels:
+                name, text = type_.replace('/msg/', '/'), b'\n\xa3\x01\xff protobuf'
+                if encoding == 'ros1':
+                    text = ROS1.generate_msgdef(type_, ros_version=1)[0].encode()
+                schema = writer.register_schema(name, f'{encoding}msg', text)
+                channels[topic] = writer.register_channel(topic, encoding, schema)
+            raw = bytes(ROS1.serialize_ros1(message, type_))
+            writer.add_message(channels[topic], record_ns, raw, record_ns)
+        writer.finish()
+    return path
+
+
+def test_mcap_made_of_a_ros1_bag_is_read(tmp_path):
+    assert_is_the_drive(read(write_encoded(tmp_path / 'drive.mcap', 'ros1', drive(ROS1))))
+
+
+def test_another_encoding_is_named_with_the_packages_that_convert_it(tmp_path):
+    path = write_encoded(tmp_path / 'drive.mcap', 'protobuf', drive(ROS1))
+    says = r'/points \(sensor_msgs/PointCloud2 as protobuf\).*mcap-protobuf-support'
+    with BagReader(path) as reader, pytest.raises(BagError, match=says):
+        reader.topics.choose_cloud()
+
+
+@pytest.mark.parametrize(
+    ('type_', 'program'),
+    [
+        ('velodyne_msgs/msg/VelodyneScan', 'velodyne_pointcloud'),
+        ('ouster_sensor_msgs/msg/PacketMsg', 'ouster_ros'),
+        ('hesai_ros_driver/msg/UdpFrame', 'hesai_ros_driver'),
+        ('pandar_msgs/msg/PandarScan', 'hesai_ros_driver'),
+        ('nebula_msgs/msg/NebulaPackets', 'nebula_ros'),
+        ('rslidar_msg/msg/RslidarPacket', 'rslidar_sdk'),
+        ('livox_ros_driver2/msg/CustomMsg', 'xfer_format 0'),
+        ('sensor_msgs/msg/LaserScan', 'pointcloud_to_laserscan'),
+    ],
+)
+def test_messages_to_be_converted_are_named_with_the_program(type_, program):
+    topics = Topics(Path('drive'), [Topic('/raw', type_, 9)])
+    with pytest.raises(BagError, match=rf'/raw \({type_}\); to convert: {type_}: .*{program}'):
+        topics.choose_cloud()
+
+
+def with_livox(path, definition=DEFINITION):
+    """Write the clouds of a drive as CustomMsg too, with a definition."""
+    clouds = [row for row in drive() if row[1] == CLOUD]
+    with rosbag2.Writer(path, version=9) as writer:
+        connection = writer.add_connection(
+            '/livox/lidar', LIVOX, msgdef=definition, rihs01=f'RIHS01_{64 * "0"}'
+        )
+        for _, _, record_ns, message in clouds:
+            points = message.data.view('<f4').reshape(-1, 4)[:, :3]
+            stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            raw = custom_message(points, stamp_ns=stamp_ns, frame_id='lidar')
+            writer.write(connection, record_ns, raw)
+    return path, clouds
+
+
+def test_livox_messages_are_read_as_clouds(tmp_path):
+    path, clouds = with_livox(tmp_path / 'drive')
+    with BagReader(path) as reader:
+        assert reader.topics.choose_cloud() == '/livox/lidar'
+        decoded = [to_scan(reader.decode(message)) for message in reader.messages()]
+    for scan, (*_, message) in zip(decoded, clouds, strict=True):
+        np.testing.assert_array_equal(scan.points, to_scan(message).points)
+        assert (scan.stamp_ns, scan.frame_id) == (to_scan(message).stamp_ns, 'lidar')
+
+
+@pytest.mark.parametrize('definition', ['uint8 x', 'std_msgs/Header header\nfloat32[] points', ''])
+def test_livox_messages_of_another_definition_are_refused(tmp_path, definition):
+    path, _ = with_livox(tmp_path / 'drive', definition)
+    with BagReader(path) as reader, pytest.raises(BagError, match=r'CustomMsg.*xfer_format 0'):
+        reader.topics.choose_cloud()
+
+
+def test_clouds_are_chosen_before_livox_messages():
+    topics = [Topic('/livox', LIVOX, 1), Topic('/points', CLOUD, 1)]
+    both = Topics(Path('drive'), topics, (CLOUD, LIVOX))
+    assert both.choose_cloud() == '/points'
+    assert both.choose_cloud('/livox') == '/livox'
 
 
 def test_a_rosbag2_directory_may_have_the_suffix_of_ros1(tmp_path):
@@ -136,7 +262,11 @@ def test_a_topic_is_chosen_by_name_else_default_else_as_the_only_one(tmp_path):
         (ODOMETRY, None, 'several topics .* Odometry topics: /odom, /wheel_odom'),
         (CLOUD, '/pionts', 'no topic /pionts; PointCloud2 topics: /points'),
         (CLOUD, '/odom', '/odom is of type nav_msgs/msg/Odometry, not PointCloud2; .*: /points'),
-        ('sensor_msgs/msg/Imu', None, 'no topic of type sensor_msgs/msg/Imu; its topics: /odom, '),
+        (
+            'sensor_msgs/msg/Imu',
+            None,
+            r'no topic of .*/Imu; its topics: /odom \(nav_msgs/msg/Odometry\), ',
+        ),
         ('sensor_msgs/msg/Imu', '/imu', 'no topic /imu; Imu topics: none'),
     ],
 )
@@ -153,8 +283,8 @@ def test_a_path_without_a_bag_is_refused(tmp_path):
     (tmp_path / 'empty').mkdir()
     for name, says in (
         ('nothing', 'no such file or directory'),
-        ('notes.txt', 'not a bag; expected a rosbag2 directory'),
-        ('empty', 'neither metadata.yaml nor'),
+        ('notes.txt', '.txt is not read; expected a bag'),
+        ('empty', 'files in it: none; expected a bag: a directory with metadata.yaml'),
     ):
         with pytest.raises(BagError, match=f'{name}: .*{says}'):
             BagReader(tmp_path / name)
@@ -208,7 +338,7 @@ def test_overwritten_bytes_give_messages_or_a_bag_error(tmp_path, storage):
         ('{}', 'not the metadata of a bag: KeyError'),
         ('rosbag2_bagfile_information: 3', 'not the metadata of a bag: TypeError'),
         ('rosbag2_bagfile_information: {relative_file_paths: 3}', 'expected a list of names'),
-        ('rosbag2_bagfile_information: {relative_file_paths: [../x.mcap]}', 'x.mcap .*is missing'),
+        ('rosbag2_bagfile_information: {relative_file_paths: [../x.mcap, y.mcap]}', 'is missing'),
         ('rosbag2_bagfile_information: {relative_file_paths: [drive.mcap]}', 'KeyError'),
     ],
 )

@@ -12,7 +12,16 @@ from plyfile import PlyData
 import pytest
 
 from surfel_mapper.cli.main import main
-from test.bags.recorded import cut, drive, Entries, NUM_SCANS, PERIOD_NS, START_NS, write_rosbag2
+from test.bags.recorded import (
+    CLOUD,
+    cut,
+    drive,
+    Entries,
+    NUM_SCANS,
+    PERIOD_NS,
+    START_NS,
+    write_rosbag2,
+)
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 
@@ -121,10 +130,22 @@ def test_dropped_scans_are_reported_by_cause(tmp_path, capsys):
     entries[4][3].header.frame_id = ''
 
     bag = write_rosbag2(tmp_path / 'drive', entries)
-    assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 0
+    assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 4
 
-    line = capsys.readouterr().out.splitlines()[1]
+    printed = capsys.readouterr()
+    line = printed.out.splitlines()[1]
     assert line.startswith('scans 6 (1 dropped: empty frame id 1)   points 22')
+    assert 'only 5 of 6 scans are in the map: empty frame id 1' in printed.err
+
+
+@pytest.mark.parametrize(('num_dropped', 'code'), [(0, 0), (1, 0), (2, 4)])
+def test_the_exit_code_is_0_if_95_percent_of_the_scans_are_mapped(tmp_path, num_dropped, code):
+    entries = drive(num_scans=20)
+    clouds = [message for _, type_, _, message in entries if type_ == CLOUD]
+    for message in clouds[3 : 3 + num_dropped]:
+        message.header.frame_id = ''
+    bag = write_rosbag2(tmp_path / 'drive', entries)
+    assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == code
 
 
 @pytest.mark.parametrize(
@@ -236,7 +257,7 @@ def test_warnings_go_to_stderr_only(tmp_path, capsys, caplog):
     entries[4][3].point_step = 15
     bag = write_rosbag2(tmp_path / 'drive', entries)
     with caplog.at_level(logging.WARNING):
-        assert main(['replay', str(bag), '--json', '--output', str(tmp_path / 'out')]) == 0
+        assert main(['replay', str(bag), '--json', '--output', str(tmp_path / 'out')]) == 4
 
     assert '/points: ' in caplog.text
     assert json.loads(capsys.readouterr().out)['scans']['mapped'] == NUM_SCANS - 1

@@ -13,7 +13,13 @@ import sys
 import pytest
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.atomic import finite_or_none, make_directory, replace_file, write_json
+from surfel_mapper.files.atomic import (
+    finite_or_none,
+    make_directory,
+    remove_abandoned,
+    replace_file,
+    write_json,
+)
 
 
 def write(path, *chunks, then=None):
@@ -167,3 +173,20 @@ def test_json_with_nan_is_refused_and_leaves_the_old_file(tmp_path):
     with pytest.raises(ValueError, match='not JSON compliant'):
         write_json(path, {'drift': math.nan})
     assert path.read_text() == 'old'
+
+
+def test_files_of_dead_processes_are_removed_and_those_in_use_stay(tmp_path):
+    names = ['.surfel_mapper-dead.part', 'other.part', '.surfel_mapper-dead.npz']
+    for name in names:
+        (tmp_path / name).write_bytes(b'')
+    (tmp_path / '.surfel_mapper-link.part').symlink_to(tmp_path / 'other.part')
+
+    with replace_file(tmp_path / 'map.npz') as file:
+        file.write(b'a map')
+        assert remove_abandoned(tmp_path) == [tmp_path / names[0]]
+
+    assert (tmp_path / 'map.npz').read_bytes() == b'a map'
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        [*names[1:], '.surfel_mapper-link.part', 'map.npz']
+    )
+    assert remove_abandoned(tmp_path / 'nowhere') == []

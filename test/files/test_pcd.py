@@ -7,7 +7,13 @@ import pytest
 
 from surfel_mapper import SurfelMap
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.pcd import read_points, write_points, write_surfels
+from surfel_mapper.files.pcd import (
+    ORIGIN,
+    read_points,
+    read_viewpoint,
+    write_points,
+    write_surfels,
+)
 
 
 @pytest.fixture(scope='module')
@@ -161,3 +167,20 @@ def test_a_name_that_would_change_the_header_is_refused(tmp_path, name):
     with pytest.raises(FileFormatError, match='expected ASCII without spaces'):
         write_points(tmp_path / 'a.pcd', columns)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_viewpoint_is_kept(tmp_path):
+    place = (400000.125, -2.5, 3.0, 0.8, 0.0, 0.0, 0.6)
+    write_points(tmp_path / 'a.pcd', {'x': np.zeros(1)}, place)
+
+    assert read_viewpoint(tmp_path / 'a.pcd') == place
+
+
+@pytest.mark.parametrize('words', ['', '0 0 0 0 0 0 0', '1 2 3', 'nan 0 0 1 0 0 0'])
+def test_a_viewpoint_that_is_no_pose_is_the_origin(tmp_path, words):
+    write_points(tmp_path / 'a.pcd', {'x': np.zeros(1)})
+    content = (tmp_path / 'a.pcd').read_bytes()
+    changed = content.replace(b'VIEWPOINT 0 0 0 1 0 0 0', f'VIEWPOINT {words}'.encode())
+    (tmp_path / 'a.pcd').write_bytes(changed)
+
+    assert read_viewpoint(tmp_path / 'a.pcd') == ORIGIN

@@ -11,7 +11,7 @@ import pytest
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.mesh_ply import write_mesh
-from surfel_mapper.files.ply import read_points, write_points, write_surfels
+from surfel_mapper.files.ply import read_mesh, read_points, write_points, write_surfels
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 from test.messages.examples import make_surfels
@@ -20,7 +20,8 @@ NAMES = ['x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity', 'curvature', 'num_points'
 
 
 def assert_equals_surfels(columns, surfels):
-    np.testing.assert_array_equal(np.stack([columns[n] for n in 'xyz'], 1), surfels.position)
+    places = np.stack([columns[n] for n in 'xyz'], 1)
+    np.testing.assert_array_equal(places, surfels.position.astype(places.dtype))
     normal = np.stack([columns[n] for n in ('nx', 'ny', 'nz')], 1)
     np.testing.assert_array_equal(normal, surfels.normal.astype(np.float32))
     for name in ('planarity', 'curvature'):
@@ -33,13 +34,13 @@ def test_a_file_is_a_text_header_and_a_little_endian_table(tmp_path):
     write_surfels(tmp_path / 'map.ply', surfels)
     header = (
         b'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'
-        b'element vertex 1\nproperty double x\nproperty double y\nproperty double z\n'
+        b'element vertex 1\nproperty float x\nproperty float y\nproperty float z\n'
         b'property float nx\nproperty float ny\nproperty float nz\n'
         b'property float planarity\nproperty float curvature\nproperty uint num_points\n'
         b'end_header\n'
     )
     row = struct.pack(
-        '<3d5fI',
+        '<8fI',
         *surfels.position[0],
         *surfels.normal[0],
         surfels.planarity[0],
@@ -106,10 +107,13 @@ HEADER = 'ply\nformat binary_little_endian 1.0\n'
         ('', 'not a PLY file'),
         ('solid stl\nend_header\n', 'not a PLY file'),
         (HEADER + 'element vertex 1\nproperty float x\n', 'not a PLY file'),
-        (HEADER + 'end_header\n', 'not a PLY whose'),
+        (HEADER + 'end_header\n', 'no elements, expected'),
         (HEADER + 'element vertex 1\nend_header\n', 'of 0 properties'),
         (HEADER + 'element vertex 1\nproperty half x\nend_header\n', 'not a PLY whose'),
-        (HEADER + 'element vertex 1\nproperty list uchar int x\nend_header\n', 'not a PLY whose'),
+        (
+            HEADER + 'element vertex 1\nproperty list uchar int x\nend_header\n',
+            'at least one number',
+        ),
         (HEADER + 'element vertex one\nproperty float x\nend_header\n', 'not a PLY whose'),
         (HEADER + 'element vertex -1\nproperty float x\nend_header\n', '-1 x vertex'),
         (HEADER + 'element face 1\nproperty float x\nend_header\n', '1 x face'),
@@ -216,3 +220,87 @@ def test_a_name_that_would_change_the_header_is_refused(tmp_path, name):
     with pytest.raises(FileFormatError, match='expected ASCII without spaces'):
         write_points(tmp_path / 'a.ply', columns)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize('text', [True, False])
+@pytest.mark.parametrize('lengths', [(2, 2, 2), (0, 3, 1)])
+def test_lists_among_vertices_and_elements_around_them_are_left_out(tmp_path, text, lengths):
+    plyfile = pytest.importorskip('plyfile')
+    rows = [(1.5, np.arange(n, dtype='f8'), 7 + n, -2.5) for n in lengths]
+    table = np.array(rows, [('x', 'f4'), ('descriptor', 'O'), ('ring', 'u1'), ('y', 'f8')])
+    camera = np.array([(1.0, 2.0)], [('view_px', 'f4'), ('view_py', 'f4')])
+    describe = plyfile.PlyElement.describe
+    elements = [
+        describe(camera, 'camera'),
+        describe(table, 'vertex', len_types={'descriptor': 'u1'}, val_types={'descriptor': 'f8'}),
+        describe(np.array([([0, 1, 2],)], [('vertex_indices', 'i4', (3,))]), 'face'),
+    ]
+    plyfile.PlyData(elements, text=text).write(str(tmp_path / 'a.ply'))
+
+    columns = read_points(tmp_path / 'a.ply')
+
+    assert {name: values.tolist() for name, values in columns.items()} == {
+        'x': [1.5] * 3,
+        'ring': [7 + n for n in lengths],
+        'y': [-2.5] * 3,
+    }
+    assert columns['ring'].dtype == np.uint8
+
+
+def test_lists_of_big_endian_files_are_skipped(tmp_path):
+    head = 'ply\nformat binary_big_endian 1.0\nelement vertex 2\nproperty float x\n'
+    rows = struct.pack('>fB2hd', 1.5, 2, 3, 4, -2.5) + struct.pack('>fB1hd', 2.5, 1, 3, 0.125)
+    content = f'{head}property list uchar short d\nproperty double y\nend_header\n'.encode()
+    (tmp_path / 'a.ply').write_bytes(content + rows)
+
+    columns = read_points(tmp_path / 'a.ply')
+
+    assert columns['x'].tolist() == [1.5, 2.5]
+    assert columns['y'].tolist() == [-2.5, 0.125]
+
+
+@pytest.mark.parametrize('text', [True, False])
+def test_faces_of_any_number_of_corners_become_triangles(tmp_path, text):
+    plyfile = pytest.importorskip('plyfile')
+    vertices = np.array([(k, 0, 0) for k in range(5)], [(axis, 'f4') for axis in 'xyz'])
+    faces = np.empty(3, [('flags', 'u1'), ('vertex_indices', 'O')])
+    faces['flags'] = 1
+    for row, corners in enumerate(([0, 1, 2], [0, 1, 2, 3], [4, 3, 2, 1, 0])):
+        faces['vertex_indices'][row] = np.array(corners, 'i4')
+    describe = plyfile.PlyElement.describe
+    elements = [describe(vertices, 'vertex'), describe(faces, 'face')]
+    plyfile.PlyData(elements, text=text).write(str(tmp_path / 'a.ply'))
+
+    mesh = read_mesh(tmp_path / 'a.ply')
+
+    expected = [[0, 1, 2], [0, 1, 2], [0, 2, 3], [4, 3, 2], [4, 2, 1], [4, 1, 0]]
+    assert mesh.triangles.tolist() == expected
+    assert mesh.vertices[:, 0].tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ('rows', 'says'),
+    [
+        ('1 2 0.5\n', r'1 x vertex: other numbers than stated'),
+        ('1 -1\n', 'other numbers'),
+        ('1\n', 'truncated'),
+        ('1 1 0.5 7\n', 'other numbers'),
+    ],
+)
+def test_lists_of_another_length_than_stated_are_refused(tmp_path, rows, says):
+    head = 'ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n'
+    (tmp_path / 'a.ply').write_text(f'{head}property list uchar float d\nend_header\n{rows}')
+
+    with pytest.raises(FileFormatError, match=says):
+        read_points(tmp_path / 'a.ply')
+
+
+def test_coordinates_are_floats_for_pcl_unless_that_rounds_by_half_a_millimetre(tmp_path, caplog):
+    plyfile = pytest.importorskip('plyfile')
+    for centre, kind in (((8000.0, 0.0, 0.0), 'f4'), ((-9000.0, 0.0, 0.0), 'f8')):
+        surfels = make_surfels(10, centre=centre)
+        write_surfels(tmp_path / 'map.ply', surfels)
+        vertex = plyfile.PlyData.read(tmp_path / 'map.ply')['vertex']
+        assert vertex['x'].dtype == kind
+        np.testing.assert_allclose(vertex['x'], surfels.position[:, 0], rtol=0, atol=0.5e-3)
+        assert ('PCL does not read' in caplog.text) == (kind == 'f8')

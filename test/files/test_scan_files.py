@@ -33,21 +33,19 @@ def test_every_format_gives_the_same_scan(tmp_path):
     np.testing.assert_array_equal(columns['ring'], [1, 2, 3, 4])
 
 
-def test_colours_of_ply_become_one_column(tmp_path):
-    colours = {name: np.full(4, i, np.uint8) for i, name in enumerate(('red', 'green', 'blue'))}
-    ply.write_points(tmp_path / 'a.ply', {**COLUMNS, **colours})
-
-    _, columns = read_scan(tmp_path / 'a.ply')
-
-    np.testing.assert_array_equal(columns['rgb'], [[0, 1, 2]] * 4)
-
-
 def test_files_come_in_the_order_of_their_numbers(tmp_path):
     for name in ('10.bin', '9.ply', 'notes.txt', '100.pcd'):
         (tmp_path / name).touch()
     (tmp_path / '1.bin').mkdir()
 
     assert [path.name for path in scan_files(tmp_path)] == ['9.ply', '10.bin', '100.pcd']
+
+
+def test_hidden_files_are_no_scans(tmp_path):
+    for name in ('1.pcd', '._1.pcd', '.DS_Store', '.2.ply'):
+        (tmp_path / name).write_bytes(b'\0\5\x16\7')
+
+    assert [path.name for path in scan_files(tmp_path)] == ['1.pcd']
 
 
 def test_endings_in_capitals_are_those_of_scans(tmp_path):
@@ -75,10 +73,18 @@ def test_a_link_that_leads_nowhere_is_a_scan_that_cannot_be_read(tmp_path):
 @pytest.mark.parametrize(
     ('name', 'write', 'says'),
     [
-        ('a.bin', lambda path: path.write_bytes(bytes(17)), '17 bytes, expected 16 for every'),
-        ('a.pcd.bin', lambda path: path.write_bytes(bytes(16)), '16 bytes, expected 20 for every'),
+        (
+            'a.bin',
+            lambda path: path.write_bytes(bytes(17)),
+            '17 bytes, expected points of 3, 4, 5, 6 columns, .* --bin-columns',
+        ),
+        (
+            'a.pcd.bin',
+            lambda path: path.write_bytes(bytes(16)),
+            '16 bytes, expected points of 5 columns',
+        ),
         ('a.bin', lambda path: None, 'cannot be read'),
-        ('a.xyz', lambda path: path.touch(), 'expected a scan ending in .ply, .pcd, .bin'),
+        ('a.stl', lambda path: path.touch(), 'expected a scan ending in .ply, .pcd, .bin'),
         ('a.ply', lambda path: ply.write_points(path, {'x': POINTS[:, 0]}), 'no y, z among x'),
         (
             'a.pcd',

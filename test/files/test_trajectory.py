@@ -117,20 +117,132 @@ def test_csv_columns_are_found_by_name_and_stamps_by_unit(tmp_path, text):
     assert abs(found.q_xyzw[0, 3]) == 1.0
 
 
+STAMPS = [1_403_636_580_838_555_648, 1_403_636_580_938_555_648]
+QUATERNIONS = [(0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (1.5, 2.0, -1.0, 0.0, 0.0, 0.6, 0.8)]
+MATRICES = ['1 0 0 0.5 0 1 0 0 0 0 1 0', '0.28 -0.96 0 1.5 0.96 0.28 0 2 0 0 1 -1']
+
+
+def rows(*columns, separator=' '):
+    """Return lines of the numbers, or tuples of them, in columns."""
+    words = ([*np.atleast_1d(np.array(value, object))] for value in zip(*columns, strict=True))
+    flat = [
+        [w for cell in row for w in (cell if isinstance(cell, tuple) else [cell])] for row in words
+    ]
+    return '\n'.join(separator.join(map(str, row)) for row in flat)
+
+
+def wxyz(pose):
+    return (*pose[:3], pose[6], *pose[3:6])
+
+
+@pytest.mark.parametrize(
+    ('text', 'stamps', 'number'),
+    [
+        # EuRoC's #timestamp without a unit
+        (
+            '#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], '
+            'q_RS_y [], q_RS_z []\n' + rows(STAMPS, map(wxyz, QUATERNIONS), separator=','),
+            STAMPS,
+            None,
+        ),
+        # ORB-SLAM3 with EuRoC: TUM in ns
+        (rows([f'{stamp}.000000' for stamp in STAMPS], QUATERNIONS), STAMPS, None),
+        # TUM in us
+        (
+            rows([stamp // 1000 for stamp in STAMPS], QUATERNIONS),
+            [s // 1000 * 1000 for s in STAMPS],
+            None,
+        ),
+        # Newer College
+        (
+            '#sec,nsec,x,y,z,qx,qy,qz,qw\n'
+            + rows([1_403_636_580] * 2, [838_555_648, 938_555_648], QUATERNIONS, separator=','),
+            STAMPS,
+            None,
+        ),
+        # its second part, and a unit in round brackets
+        (
+            '#counter, sec, nsec, x, y, z, qx, qy, qz, qw\n'
+            + rows(
+                [0, 1],
+                [1_403_636_580] * 2,
+                [838_555_648, 938_555_648],
+                QUATERNIONS,
+                separator=', ',
+            ),
+            STAMPS,
+            None,
+        ),
+        (
+            'timestamp (ns),x,y,z,qx,qy,qz,qw\n' + rows(STAMPS, QUATERNIONS, separator=','),
+            STAMPS,
+            None,
+        ),
+        # RTAB-Map: TUM with an id
+        (
+            '#timestamp x y z qx qy qz qw id\n'
+            + rows(['1403636580.838555648', '1403636580.938555648'], QUATERNIONS, [1, 2]),
+            STAMPS,
+            None,
+        ),
+        # KITTI-360: poses.txt, and cam0_to_world.txt
+        (rows([1, 7], MATRICES), None, [1, 7]),
+        (rows([1, 7], MATRICES, ['0 0 0 1'] * 2), None, [1, 7]),
+        # Replica, in a line; Redwood and 7-Scenes, in four
+        (rows(MATRICES, ['0 0 0 1'] * 2), None, None),
+        (
+            '\n'.join(
+                f'{k} {k} {k + 1}\n'
+                + '\n'.join(' '.join(f'{m} 0 0 0 1'.split()[i : i + 4]) for i in (0, 4, 8, 12))
+                for k, m in enumerate(MATRICES)
+            ),
+            None,
+            None,
+        ),
+        # g2o, in any order, with edges
+        (
+            'VERTEX_SE3:QUAT 9 1.5 2 -1 0 0 0.6 0.8\nFIX 4\nVERTEX_SE3:QUAT 4 0.5 0 0 0 0 0 1\n'
+            'EDGE_SE3:QUAT 4 9 1 0 0 0 0 0 1 ' + '1 ' * 21,
+            None,
+            [4, 9],
+        ),
+        (
+            'VERTEX_SE3:QUAT 0 0.5 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1.5 2.0 -1.0 0 0 0.6 0.8',
+            None,
+            None,
+        ),
+    ],
+)
+def test_poses_of_programs_and_data_sets_are_read_by_their_first_line(
+    tmp_path, text, stamps, number
+):
+    found = read_trajectory(text_file(tmp_path, text))
+
+    np.testing.assert_allclose(np.hstack([found.xyz, found.q_xyzw]), QUATERNIONS, atol=1e-15)
+    assert (None if found.stamp_ns is None else found.stamp_ns.tolist()) == stamps
+    assert (None if found.number is None else found.number.tolist()) == number
+
+
 @pytest.mark.parametrize(
     ('text', 'format_', 'says'),
     [
         ('', None, 'no poses in it'),
-        ('1 2 3', None, '3 columns in the first line, expected 8 .TUM., 12'),
+        ('1 2 3', None, '3 columns in the first line, expected 8 .TUM; 9 with an id., 12'),
         ('0 0 0 0 0 0 0 1', 'kitti', ':1: 8 columns, expected 12'),
-        ('0 0 0 0 0 0 0 1', 'tmu', "format 'tmu', expected one of tum, kitti, csv"),
+        ('0 0 0 0 0 0 0 1', 'tmu', "format 'tmu', expected one of tum, kitti, csv, g2o"),
         ('0 0 0 0 0 0 0 1\n1 0 0', None, ':2: 3 columns, expected 8'),
         ('0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1', None, ':2: stamp is not after'),
         ('0 0 0 0 0 0 0 2', None, ':1: .*norm'),
         ('0 0 0 nan 0 0 0 1', None, ':1: .*finite'),
         ('0 0 0 x 0 0 0 1', None, ":1: .*'x', expected a number"),
         ('nan 0 0 0 0 0 0 1', None, ":1: time 'nan'"),
-        ('1700000000000000000 0 0 0 0 0 0 1', None, ':1: time .*, expected seconds'),
+        ('17000000000000000000 0 0 0 0 0 0 1', None, ':1: time .*, expected seconds'),
+        ('1 2 3 4', None, '1 lines of a matrix, expected four for each pose'),
+        (f'1 0 0 0 0 1 0 0 0 0 1 0 {"0 0 0 2"}', None, 'last rows of matrices, expected 0 0 0 1'),
+        ('EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1', None, 'no line VERTEX_SE3:QUAT'),
+        ('VERTEX_SE2 0 0 0 0', None, 'no line VERTEX_SE3:QUAT'),
+        ('VERTEX_SE3:QUAT 0 0 0 0 0 0 0', None, ':1: 8 columns, expected 9: number x y z q'),
+        (f'{"VERTEX_SE3:QUAT 3 0 0 0 0 0 0 1"}\n' * 2, None, 'vertices of equal numbers'),
         ('-1 0 0 0 0 0 0 1', None, ":1: time '-1'"),
         ('2 0 0 0 0 1 0 0 0 0 1 0', None, ':1: .* no rotation'),
         ('1 0 0 0 0 1 0 0 0 0 -1 0', None, ':1: .* no rotation'),

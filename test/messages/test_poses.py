@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 import pytest
 
 from surfel_mapper.errors import PoseError
-from surfel_mapper.messages.poses import poses_in, raw_poses, StampedPose
-from test.bags.recorded import Entries, ROS1, ROS2
+from surfel_mapper.messages.poses import poses_in, raw_poses, StampedPose, warn_of_child
+from test.bags.recorded import Entries, ODOMETRY, ROS1, ROS2
 
 STAMP_NS = 1_700_000_000_123_456_789
 XYZ = (1.5, -2.25, 0.125)
@@ -45,6 +45,19 @@ def test_all_transforms_of_a_message_are_yielded_in_order():
         message.transforms.extend(other.transforms)
 
     assert [pose.child for pose in poses_in('tf', message, base='')] == ['a', 'b', 'c']
+
+
+def test_odometry_without_a_child_frame_has_the_poses_of_the_base(caplog):
+    entries = Entries()
+    entries.odometry('/odom', STAMP_NS, XYZ)
+    entries[0][3].child_frame_id = ''
+    raw = ROS2.serialize_cdr(entries[0][3], ODOMETRY)
+    warn_of_child.cache_clear()
+    for _ in range(2):
+        (pose,) = raw_poses('odometry', raw, 'base', '/odom')
+        assert (pose.parent, pose.child) == ('odom', 'base')
+    assert len(caplog.records) == 1
+    assert '/odom: child_frame_id is empty' in caplog.text
 
 
 def test_numbers_are_unchanged():

@@ -12,7 +12,9 @@ from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.errors import BagError
 from surfel_mapper.offline.bag_recording import feed
 from surfel_mapper.offline.pose_sources import pose_topics
+from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import all_scans
+from surfel_mapper.offline.request import Request
 from test.bags.recorded import (
     CLOUD,
     drive,
@@ -166,3 +168,103 @@ def test_one_of_two_odometries_has_to_be_named_unless_it_is_called_odom(tmp_path
     with pytest.raises(BagError, match='Odometry topics: /lidar, /wheels'):
         mapped(path, settings)
     assert mapped(path, settings, '/wheels').counters.mapped == NUM_SCANS
+
+
+COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+
+
+def replayed(path, **request):
+    """Replay a bag as the command line does; return the mapper and the summary of the poses."""
+    with open_recording(Request(path=path, **request), Config.from_mapping(all_scans())) as bag:
+        mapper = Mapper(bag.config)
+        for _ in bag.replay(mapper):
+            pass
+        return mapper, bag.describe()
+
+
+def in_namespace(name, entries):
+    """Return entries with their topics below a name."""
+    return [(f'/{name}{topic}', *rest) for topic, *rest in entries]
+
+
+@pytest.mark.parametrize('start_s', [0.0, 0.2])
+def test_static_transforms_hold_from_the_beginning_whenever_recorded(tmp_path, start_s):
+    entries = drive()
+    late = [
+        (*row[:2], START_NS + 450_000_000, row[3]) for row in entries if row[0] == '/tf_static'
+    ]
+    moved = write_rosbag2(tmp_path / 'late', [*late, *entries[1:]])
+    expected, _ = replayed(write_rosbag2(tmp_path / 'early', entries), start_s=start_s)
+    mapper, _ = replayed(moved, start_s=start_s)
+    assert mapper.counters.mapped == expected.counters.mapped == NUM_SCANS - round(start_s * 10)
+    assert mapper.map.digest() == expected.map.digest()
+
+
+def test_a_static_transform_that_changes_holds_from_its_message_on(tmp_path):
+    entries = drive()
+    entries.transform('/tf_static', START_NS + 250_000_000, 'base_link', 'lidar', (0, 0, 5.25))
+    path = write_rosbag2(tmp_path / 'bag', sorted(entries, key=lambda row: row[2]))
+    with open_recording(Request(path=path), Config()) as bag:
+        heights = [update.T_map_sensor[2, 3] for update in bag.replay(Mapper(bag.config))]
+    assert heights == [HEIGHT_M + MOUNT_M[2]] * 3 + [HEIGHT_M + 5.25] * 3
+
+
+def test_a_bad_static_transform_is_counted_once(tmp_path):
+    entries = drive()
+    entries.transform('/tf_static', START_NS, 'base_link', 'camera', (0, 0, 0))
+    entries[-1][3].transforms[0].transform.rotation.w = 0.5
+    mapper, _ = replayed(write_rosbag2(tmp_path / 'bag', entries))
+    assert dict(mapper.counters.messages_ignored) == {'bad_pose': 1}
+
+
+@pytest.mark.parametrize('request_', [{}, {'pose_topic': '/a/tf'}])
+def test_each_robot_of_a_bag_has_its_own_mount_and_poses(tmp_path, request_):
+    entries, other = drive(), drive()
+    other[0][3].transforms[0].transform.translation.z = 9.0
+    both = [*in_namespace('a', entries), *in_namespace('b', other)]
+    path = write_rosbag2(tmp_path / 'both', sorted(both, key=lambda row: row[2]))
+    mapper, found = replayed(path, topics=('/a/points',), **request_)
+    assert mapper.map.digest() == expected_digest(entries)
+    assert found['pose_topics'] == ['/a/tf', '/a/tf_static']
+
+
+def test_static_transforms_that_disagree_are_refused_with_the_option(tmp_path):
+    entries, other = drive(), drive()
+    other[0][3].transforms[0].transform.translation.z = 9.0
+    path = write_rosbag2(tmp_path / 'both', [('/b/tf_static', *other[0][1:]), *entries])
+    mapper, _ = replayed(path)  # /b/tf_static is in no namespace of the clouds
+    assert mapper.map.digest() == expected_digest(entries)
+    named = {'static_topics': ('/tf_static', '/b/tf_static')}
+    with pytest.raises(BagError, match=r'/tf_static disagree .* lidar: at .*--static-topic'):
+        replayed(path, **named)
+
+
+def test_poses_with_covariance_are_a_source_and_named(tmp_path):
+    entries = drive()
+    with_covariance = []
+    for topic, type_, record_ns, message in entries:
+        if type_ == POSE:
+            pose = entries.make(
+                'geometry_msgs/msg/PoseWithCovariance', pose=message.pose, covariance=np.zeros(36)
+            )
+            message = entries.make(COVARIANCE, header=message.header, pose=pose)
+            with_covariance.append(('/amcl_pose', COVARIANCE, record_ns, message))
+        elif type_ == CLOUD or topic == '/tf_static':
+            with_covariance.append((topic, type_, record_ns, message))
+    mapper, found = replayed(write_rosbag2(tmp_path / 'bag', with_covariance))
+    assert mapper.map.digest() == expected_digest(entries)
+    assert found['poses_from'] == 'pose'
+    assert '/amcl_pose has them (a PoseWithCovarianceStamped' in found['poses_reason']
+    by_hand = [('/initialpose', *row[1:]) for row in with_covariance if row[1] == COVARIANCE]
+    twice = write_rosbag2(tmp_path / 'initial', [*with_covariance, *by_hand])
+    assert replayed(twice)[1]['pose_topics'] == ['/amcl_pose']
+
+
+def test_odometry_without_a_child_frame_moves_the_base(tmp_path):
+    entries = [row for row in drive() if row[1] in (CLOUD, ODOMETRY) or row[0] == '/tf_static']
+    for *_, message in entries:
+        if hasattr(message, 'child_frame_id'):
+            message.child_frame_id = ''
+    mapper, found = replayed(write_rosbag2(tmp_path / 'bag', entries))
+    assert mapper.map.digest() == expected_digest(entries)
+    assert found['poses_from'] == 'odometry'

@@ -167,6 +167,30 @@ def test_one_file_has_the_pose_of_its_number(tmp_path):
     assert mapper.map.digest() == digest_of([4])
 
 
+@pytest.mark.parametrize('kind', ['g2o', 'kitti360'])
+def test_numbered_poses_are_those_of_the_scans_of_these_numbers(tmp_path, kind):
+    folder, numbers = scan_folder(tmp_path, '.bin', range(10, 16)), [15, 11, 12, 10]
+    lines = [
+        f'VERTEX_SE3:QUAT {n} {0.5 * (n - 10)} 0 {HEIGHT_M} 0 0 0 1'
+        if kind == 'g2o'
+        else f'{n} 1 0 0 {0.5 * (n - 10)} 0 1 0 0 0 0 1 {HEIGHT_M}'
+        for n in (numbers if kind == 'g2o' else sorted(numbers))
+    ]
+    config = {**MOUNTED, 'pose.max_gap_s': 0.15}
+
+    mapper = mapped(folder, config, poses=write_lines(tmp_path / 'poses.txt', lines))
+
+    assert mapper.map.digest() == digest_of([0, 1, 2, 5])
+
+
+def test_poses_of_other_numbers_than_the_scans_are_refused(tmp_path):
+    folder = scan_folder(tmp_path, '.bin', range(10, 16))
+    poses = write_lines(tmp_path / 'poses.txt', ['VERTEX_SE3:QUAT 30 0 0 0 0 0 0 1'])
+
+    with pytest.raises(BagError, match='scans 10 to 15, poses of 30 to 30'):
+        opened(folder, poses=poses)
+
+
 def test_as_many_poses_as_scans_are_taken_in_order_whatever_the_names(tmp_path):
     folder = scan_folder(tmp_path, '.bin', [0, 1, 2, 3, 4, 6])
 

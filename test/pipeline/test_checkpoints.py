@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 
 import pytest
 
@@ -25,6 +26,9 @@ class Clock:
 
     def monotonic(self):
         return self.now_s
+
+    def time(self):
+        return time.time() + 1000.0
 
 
 @pytest.fixture
@@ -202,7 +206,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, clo
     def fail(*args):
         raise FileFormatError('no space')
 
-    monkeypatch.setattr(checkpoints, 'save_mapper', fail)
+    monkeypatch.setattr(saved_state, 'save_map', fail)
     for _ in range(3):
         drive(mapper, 2.0 + clock.now_s)
         clock.now_s += 10.0
@@ -210,6 +214,44 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, clo
             saving.save_if_due()
     assert not newest.exists()
     assert load_map(before)[0].digest() == digest
+    assert saving.problem.startswith('checkpoints fail (FileFormatError: no space); the last good')
+    assert int(saving.problem.split()[-3]) in range(999, 1600)  # the clock is 1000 s ahead
+
+    monkeypatch.undo()
+    saving.save()
+    assert saving.problem == ''
+
+
+def test_a_checkpoint_that_another_thread_writes_has_the_map_of_its_beginning(tmp_path, clock):
+    mapper = mapper_in(tmp_path, **{'layers.tsdf.enabled': True})
+    saving, (newest, _) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    drive(mapper, 1.0)
+    expected = mapper.map.digest()
+    clock.now_s += 10.0
+    jobs = []
+    assert saving.save_if_due(jobs.append) == newest
+    for stamp_s in (2.0, 3.0, 4.0, 5.0):  # evicts the scans of the checkpoint too
+        drive(mapper, stamp_s)
+        clock.now_s += 10.0
+        assert saving.save_if_due(jobs.append) is None
+    (write,) = jobs
+    write()
+
+    surfel_map, scans = load_map(newest)
+    assert surfel_map.digest() == expected
+    assert [scan.stamp_ns for scan in scans] == [10**9]
+    saving.save_if_due(jobs.append)
+    assert len(jobs) == 2
+
+
+def test_a_failure_without_any_checkpoint_says_so(tmp_path, clock):
+    (tmp_path / 'maps').write_bytes(b'')
+    mapper = mapper_in(tmp_path / 'maps')
+    drive(mapper, 1.0)
+    saving = Checkpoints(mapper)
+    with pytest.raises(FileFormatError):
+        saving.save()
+    assert saving.problem.endswith('expected a directory); there is no good one')
 
 
 def test_a_checkpoint_that_fails_after_its_layers_leaves_those_of_the_one_before(

@@ -19,19 +19,18 @@ from surfel_mapper.files.map_state import load_map
 from surfel_mapper.layers import Layer
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow
-from surfel_mapper.pipeline import inserter
 from surfel_mapper.pipeline.drops import described
 from surfel_mapper.pipeline.layer_stack import LayerStack
 from surfel_mapper.pipeline.loop_closer import LoopCloser
 from surfel_mapper.pipeline.preparation import Preparation
-from surfel_mapper.pipeline.reduction import Reduction
 from surfel_mapper.pipeline.saved_state import save_mapper
+from surfel_mapper.pipeline.window_aligner import WindowAligner
 from test.pipeline.made_scans import add_pose, assert_counts_add_up, insert, mapper_with, scan_at
 
 ERRORS = [MemoryError(), ZeroDivisionError('division by zero')]
 BEFORE = {
     'prepare': (Preparation, 'prepare'),
-    'reduce': (Reduction, 'reduce'),
+    'reduce': (SurfelMap, 'reduce'),
     'window': (SlidingWindow, 'insert'),
     'map': (SurfelMap, 'insert'),
 }
@@ -269,7 +268,7 @@ def test_scans_that_a_layer_cannot_use_do_not_switch_it_off(fragile):
 def test_an_alignment_without_memory_leaves_the_window(monkeypatch, caplog):
     settings = {'align__every_scans': 2, 'window__keep_points': True}
     mapper, expected = mapper_with(**settings), mapper_with(window__keep_points=True)
-    fail_once(monkeypatch, inserter.WindowAligner, 'align', MemoryError())
+    fail_once(monkeypatch, WindowAligner, 'align', MemoryError())
     updates = drive(mapper, 1.0, 2.0)
     drive(expected, 1.0, 2.0)
     assert len(updates) == 2

@@ -113,7 +113,7 @@ def test_later_scans_follow_the_correction_and_move_again():
     after = shifted(mapper.loops.T_map_sensor)
 
     move = mapper.loops.move(closure_at(after), mapper.config)
-    mapper._inserter.aligner.correct(move.correction)
+    mapper._pipeline.aligner.correct(move.correction)
     updates = fed(mapper, points[6:], before[6:], first=6)
 
     jump = compose(after[-1], inverse(before[5]))
@@ -409,7 +409,7 @@ def test_registration_follows_the_last_metres_alone():
     expected = inverse(seen.poses[0]) @ seen.poses[29]
     found = mapper.loops.T_map_sensor[-1]
     assert len(mapper.loops) == 30
-    assert mapper._inserter._local_map.surfel_map.num_voxels < mapper.map.num_voxels
+    assert mapper._pipeline._local_map.surfel_map.num_voxels < mapper.map.num_voxels
     np.testing.assert_allclose(found[:3, 3], expected[:3, 3], rtol=0, atol=0.2)
 
 
@@ -446,7 +446,7 @@ def test_scans_are_registered_to_the_last_metres_again_once_the_map_is_cleared(t
         first, second = feed(mapper, [room_scan(0), room_scan(1)])
         assert first.registration is None
         assert second.registration is not None
-        assert mapper._inserter._local_map.surfel_map.digest() == mapper.map.digest()
+        assert mapper._pipeline._local_map.surfel_map.digest() == mapper.map.digest()
 
 
 def test_registered_odometry_goes_on_where_it_was_when_the_map_jumps():
@@ -464,7 +464,7 @@ def test_registered_odometry_goes_on_where_it_was_when_the_map_jumps():
 
     before = tracked(0, 6)
     move = mapper.loops.move(closure_at(shifted(mapper.loops.T_map_sensor)), mapper.config)
-    mapper._inserter.aligner.correct(move.correction)
+    mapper._pipeline.aligner.correct(move.correction)
     after = tracked(6, 9)
 
     odometry = [update.T_fixed_body for update in (*before, *after)]

@@ -113,7 +113,6 @@ def test_a_sensor_whose_frame_is_the_base_needs_no_mounting():
         ((0, 0, 0), (0, 0, 0, 2.0), 'odom', 'base_link'),
         ((0, 0, 0), LEVEL, 'odom', 'odom'),
         ((0, 0, 0), LEVEL, '', 'base_link'),
-        ((0, 0, 0), LEVEL, 'somewhere', 'base_link'),
     ],
 )
 def test_a_bad_pose_is_counted_and_changes_nothing(xyz, q_xyzw, parent, child):

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import pytest
 
-from surfel_mapper.pipeline.scan_queue import MAX_FRAMES
-from surfel_mapper.pipeline.stamp_guard import MAX_AHEAD_S, StampGuard
+from surfel_mapper.pipeline.stamp_guard import MAX_AHEAD_S, MAX_FRAMES, Order, StampGuard
+from surfel_mapper.poses import TransformBuffer
 from test.pipeline.made_scans import add_pose, assert_counts_add_up, insert, mapper_with, scan_at
 
 YEAR_2033_S = 2e9
@@ -194,14 +194,25 @@ def test_a_lidar_is_mapped_after_many_frames_that_came_once():
 
 
 def test_two_odd_messages_that_do_not_agree_are_both_dropped():
-    guard, used, refused = StampGuard(1.0), [], []
-
-    def take(stamp_s):
-        own_ns = guard.newest_ns
-        refuse = lambda reason: refused.append(stamp_s)  # noqa: E731
-        guard.take(round(stamp_s * 1e9), own_ns, None, lambda: used.append(stamp_s), refuse)
-
+    guard = StampGuard(1.0, TransformBuffer())
+    judged = []
     for stamp_s in (100.0, 2e9, 50.0, 100.1):
-        take(stamp_s)
-    assert used == [100.0, 100.1]
-    assert refused == [2e9, 50.0]
+        for message, odd in guard.judge(scan_at(stamp_s)):
+            judged.append((message.stamp_ns / 1e9, bool(odd)))
+            if not odd:
+                guard.order(message)
+    assert judged == [(100.0, False), (2e9, True), (50.0, True), (100.1, False)]
+
+
+def test_a_scan_far_before_the_last_of_its_frame_is_judged_by_those_before_that():
+    def orders(*stamps_s):
+        guard = StampGuard(1.0, TransformBuffer())
+        return [guard.order(scan_at(stamp_s)) for stamp_s in stamps_s]
+
+    *_, continued = orders(100.0, 105.0, 100.1)
+    assert (continued.odd_ns, continued.back_s, continued.cause) == (105 * 10**9, 0.0, '')
+    *_, set_back, after = orders(100.0, 105.0, 99.0, 99.1)
+    assert (set_back.odd_ns, set_back.back_s, set_back.cause) == (None, 6.0, '')
+    assert after == Order()
+    *_, late, repeated = orders(100.0, 100.2, 100.1, 100.2)
+    assert (late.cause, repeated.cause) == ('stamp_back', 'stamp_repeated')

@@ -18,8 +18,8 @@ import pytest
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.look_ahead import LookAhead
 from surfel_mapper.pipeline.prepared import FilteredScan
-from surfel_mapper.pipeline.reduction import Reduction
 from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.scan import LazyPoints, Scan
 from surfel_mapper.threads import share
@@ -255,18 +255,26 @@ def test_no_scan_waits_if_scans_depend_on_the_ones_before(settings):
     assert len(list(mapper.insert_ready(more_follows=True))) == 1
 
 
-def test_a_reduction_is_used_for_the_same_scan_at_the_same_pose_only():
-    ahead, config = Reduction(SurfelMap(0.5), 2), Config()
+def test_work_that_was_begun_is_used_for_the_same_scan_at_the_same_pose_only():
+    look_ahead, config = LookAhead(SurfelMap(0.5), 2), Config()
     points = np.random.default_rng(1).uniform(-3.0, 3.0, (50, 3))
     scan = Scan(points=points, stamp_ns=1, frame_id='lidar')
     moved = np.eye(4)
     moved[0, 3] = 0.25
-    ahead.begin(scan, np.eye(4), config, lambda scan, _: lambda: FilteredScan(scan, scan))
-    assert ahead.begun(scan, moved, config) is None
-    there = ahead.reduce(scan, moved, config)
-    expected = SurfelMap(0.5).reduce(points, moved, origin=moved[:3, 3], min_range_m=0.1)
-    np.testing.assert_array_equal(there.moments.key, expected.key)
-    np.testing.assert_array_equal(there.moments.total, expected.total)
+
+    def begin():
+        look_ahead.begin(scan, np.eye(4), config, lambda scan, _: lambda: FilteredScan(scan, scan))
+
+    begin()
+    assert look_ahead.take(scan, moved, config) is None
+    begin()
+    assert look_ahead.take(scan, np.eye(4), config.replace({'map.min_points': 2})) is None
+    begin()
+    found = look_ahead.take(scan, np.eye(4), config)().windowed.moments
+    expected = SurfelMap(0.5).reduce(points, np.eye(4), origin=np.zeros(3), min_range_m=0.1)
+    np.testing.assert_array_equal(found.key, expected.key)
+    np.testing.assert_array_equal(found.total, expected.total)
+    assert look_ahead.take(scan, np.eye(4), config) is None
 
 
 @pytest.mark.parametrize('threads', [1, 2, 3])

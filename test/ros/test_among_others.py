@@ -140,7 +140,7 @@ def test_a_parameter_of_no_known_type_is_refused(start, peer, kind):
 
 
 def test_filters_change_while_running_and_bad_files_are_refused(start, peer, tmp_path):
-    node = start('node', *ARGUMENTS)
+    node = start('node', *ARGUMENTS, '-p', f'input.filters_directory:={tmp_path}')
     peer.advertise('/odom', '/points')
     client = peer.parameters()
     near, wrong = tmp_path / 'near.yaml', tmp_path / 'wrong.yaml'
@@ -156,7 +156,7 @@ def test_filters_change_while_running_and_bad_files_are_refused(start, peer, tmp
     peer.diagnosis({'scans.mapped': 1})
     for path, reason in (
         (tmp_path / 'nowhere.yaml', 'cannot be read'),
-        (wrong, 'did you mean MaxDistDataPointsFilter?'),
+        (wrong, 'no valid chain of filters'),
     ):
         refused = change(path)
         assert not refused.successful

@@ -22,12 +22,13 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.drops import INTERNAL
-from surfel_mapper.ros import services
+from surfel_mapper.ros import map_files, services
 from surfel_mapper.ros.base_node import BaseNode, steady_timer
 from surfel_mapper.ros.context import context
 from surfel_mapper.ros.line_logger import LineLogger
 from surfel_mapper.ros.main import executing
 from surfel_mapper.ros.main_thread import TaskQueue
+from surfel_mapper.ros.map_files import MapWriter
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.services import Services
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
@@ -199,8 +200,9 @@ def test_a_map_whose_reader_fails_is_refused_and_counted(peer, monkeypatch):
     thread = MappingThread(mapper, pytest.fail)
     thread.start(lambda update: None)
     monkeypatch.setattr(services, 'load_map', lambda mapper, url: int(float('inf')))
-    monkeypatch.setattr(services, 'save_map', fail)
-    Services(peer.node, mapper, thread, SimpleNamespace(expire=lambda: None))
+    monkeypatch.setattr(map_files, 'copied_map', fail)
+    writer = MapWriter(mapper, thread)
+    Services(peer.node, mapper, thread, SimpleNamespace(expire=lambda: None), writer)
     load = peer.node.create_client(LoadMap, '/peer/load_map')
     save = peer.node.create_client(Trigger, '/peer/save_map')
     peer.spin_until(lambda: load.service_is_ready() and save.service_is_ready())
@@ -211,6 +213,7 @@ def test_a_map_whose_reader_fails_is_refused_and_counted(peer, monkeypatch):
     assert not answer.success
     assert answer.message == 'MemoryError: no room'
     thread.stop()
+    writer.close()
     assert mapper.counters.messages_ignored == {INTERNAL: 2}
 
 

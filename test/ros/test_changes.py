@@ -220,7 +220,7 @@ def test_stamps_of_several_sensors_may_be_out_of_order():
     node, mirror = Node(), MapMirror(0.5)
     stamps = [5.0, 5.3, 5.2, 5.5, 5.4]
     for number, stamp_s in enumerate(stamps):
-        node.mapper._queue.forget_stamps()  # as if each were from another sensor
+        node.mapper._pipeline.guard.forget_scans()  # as if each were from another sensor
         _, message = node.map_scan(round(stamp_s * SECOND))
         mirror.change(message)
         if number == 1:

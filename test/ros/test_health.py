@@ -56,6 +56,21 @@ def test_other_topics_of_clouds_are_the_remedy_if_the_default_has_no_publisher()
     ]
 
 
+def test_clouds_of_which_none_was_ever_mapped_are_a_warning():
+    ((level, text),) = found(received=20, never_mapped=40)
+    assert level == WARN
+    assert text.startswith('none of 40 clouds is mapped yet: they wait for poses or were dropped')
+    ((_, text),) = found(received=20, never_mapped=40, dropped=Counter(no_pose=20))
+    assert text.startswith('20 scans dropped just now')
+    ((_, text),) = found(received=20, never_mapped=40, paused=True)
+    assert text.startswith('paused')
+
+
+def test_failing_checkpoints_are_an_error():
+    text = 'checkpoints fail (no space); the last good one is 70 s old'
+    assert found(received=20, checkpoints=text) == [(ERROR, text)]
+
+
 def test_missing_poses_are_a_warning():
     text = 'pose.source auto takes registration: no topic gives the poses of the clouds'
     assert found(received=20, poses=text) == [(WARN, text)]

@@ -218,7 +218,7 @@ def test_images_of_two_kinds_do_not_displace_each_other():
     bench.release()
     bench.thread.stop()
 
-    images = bench.mapper._inserter.images._images
+    images = bench.mapper._pipeline.images._images
     assert [found.stamp_ns for found in images['color']] == stamps[:60]
     assert [found.stamp_ns for found in images['label']] == stamps[3:]
     assert bench.mapper.counters.messages_ignored == {'overload': 3}

@@ -103,7 +103,6 @@ def bad_clouds(stamp_ns):
         ('bad_cloud', no_z),
         ('bad_cloud', unknown_type),
         ('bad_cloud', made(point_step=10)),
-        ('bad_cloud', made(row_step=7)),
         ('bad_cloud', made(data=array('B', bytes(100)))),
         ('bad_cloud', made(data=array('B'))),
         ('empty_frame_id', no_frame),
@@ -218,7 +217,7 @@ def test_parameters_have_descriptions_and_only_live_ones_change(start, peer):
         return response.results[0]
 
     assert 'read-only' in change('map.voxel_size_m', 0.3).reason
-    assert 'range' in change('window.max_scans', -1).reason
+    assert 'expected a value in [0, ' in change('window.max_scans', -1).reason
     assert change('window.max_scans', 2).successful
     peer.advertise('/odom', '/points')
     send(peer, drive(4))

@@ -20,6 +20,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError, PoseError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball, Box, Prism
+from surfel_mapper.ros.map_files import MapWriter
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.services import MAX_WAITING, prism, Services
 from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
@@ -241,7 +242,8 @@ def test_requests_beyond_the_queue_are_refused_at_once(peer):
     thread.start(lambda update: None)
     thread.call(lambda: (busy.set(), released.wait(TIMEOUT_S)))
     assert busy.wait(TIMEOUT_S)
-    Services(peer.node, mapper, thread, SimpleNamespace(expire=lambda: None))
+    writer = MapWriter(mapper, thread)
+    Services(peer.node, mapper, thread, SimpleNamespace(expire=lambda: None), writer)
     client = peer.node.create_client(Trigger, '/peer/clear')
     peer.spin_until(client.service_is_ready)
     answers = []

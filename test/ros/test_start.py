@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
 
+from surfel_mapper.errors import ConfigError
 from surfel_mapper.ros.context import context
 from surfel_mapper.ros.main import create_node, executing
 from test.ros.driving import ARGUMENTS, drive, mapped, send
@@ -84,3 +85,13 @@ def test_fast_dds_runs_in_real_time_if_permitted_and_the_mapper_does_not(prefork
         node.destroy_node()
     assert found == {os.SCHED_RR if may_run_in_real_time() else os.SCHED_OTHER}
     assert of_the_mapper == {os.SCHED_OTHER}
+
+
+def test_a_log_directory_that_cannot_be_made_names_the_variable(monkeypatch):
+    monkeypatch.setenv('HOME', '/proc/nowhere')
+    monkeypatch.delenv('ROS_LOG_DIR', raising=False)
+    refused = pytest.raises(
+        ConfigError, match='Set ROS_LOG_DIR to a directory that can be written'
+    )
+    with refused, context(['--ros-args']):
+        pass

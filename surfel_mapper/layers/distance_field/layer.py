@@ -22,7 +22,8 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.files.mesh_ply import write_mesh
-from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
+from surfel_mapper.files.state import save_state
+from surfel_mapper.files.tsdf_state import load_tsdf, tsdf_content
 from surfel_mapper.layers.distance_field.field import DistanceField
 from surfel_mapper.layers.distance_field.live_mesh import LiveMesh, WholeMesh
 from surfel_mapper.layers.distance_field.obstacles import clearance_slice, slice_at
@@ -282,9 +283,9 @@ class TsdfLayer(Layer):
             ),
         )
 
-    def save(self, path: Path) -> None:
-        """Write the field."""
-        save_tsdf(path, self.blocks)
+    def save(self, path: Path) -> Callable[[], object] | None:
+        """Copy the field, to be written."""
+        return partial(save_state, path, *tsdf_content(self.blocks))
 
     def load(self, path: Path) -> Callable[[], None]:
         """Read a field that ``save`` wrote; return the function that puts it in place."""

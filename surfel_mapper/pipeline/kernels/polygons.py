@@ -3,43 +3,52 @@
 """
 Points in polygons, by counting the edges that a ray crosses.
 
-Array operations visit all points once per edge: a polygon of 10,000 corners and a map of 400,000
-surfels took 40 s. The kernel visits each point once, tests the bounding box first, and keeps the
-edges in the cache.
+Centres of voxels lie in rows of equal y. The places where the edges cross a row are computed and
+sorted once, and each point of the row is searched among them. A test of each point with each edge
+took 5 s for 10,000 corners and 318,000 voxels.
 
 Source: Shimrat 1962, Algorithm 112, Position of point relative to polygon.
 """
 
 from numba import njit
+import numpy as np
 
 
 @njit(cache=True, nogil=True)
-def mark_inside(xy, corners, inside):
+def cross_rows(corners, rows, first, last, starts, crossings):
     """
-    Mark the points inside of a polygon, its last corner joined to the first.
+    Compute where the edges of a polygon cross the rows, sorted in each row.
 
-    xy       (N, 2) float64
-    corners  (C, 2) float64
-    inside   (N,) bool, out
-
-    If edges cross, a point is inside if a ray from it along x crosses an odd number of them. nan
-    is outside.
+    corners    (C, 2) float64, the last is joined to the first
+    rows       (R,) float64, y of each row, ascending
+    first      (C,) int64, first row that the edge ending at a corner crosses
+    last       (C,) int64, one past its last row
+    starts     (R + 1,) int64, where the crossings of each row start
+    crossings  (starts[R],) float64, out
     """
-    low_x, low_y = corners[0, 0], corners[0, 1]
-    high_x, high_y = low_x, low_y
+    ends = starts[:-1].copy()
+    x0, y0 = corners[-1, 0], corners[-1, 1]
     for k in range(len(corners)):
-        low_x, high_x = min(low_x, corners[k, 0]), max(high_x, corners[k, 0])
-        low_y, high_y = min(low_y, corners[k, 1]), max(high_y, corners[k, 1])
-    for i in range(len(xy)):
-        x, y = xy[i, 0], xy[i, 1]
-        inside[i] = False
-        if not (low_x <= x <= high_x and low_y <= y <= high_y):
-            continue
-        x0, y0 = corners[-1, 0], corners[-1, 1]
-        odd = False
-        for k in range(len(corners)):
-            x1, y1 = corners[k, 0], corners[k, 1]
-            if (y0 <= y) != (y1 <= y) and x < x0 + (y - y0) / (y1 - y0) * (x1 - x0):
-                odd = not odd
-            x0, y0 = x1, y1
-        inside[i] = odd
+        x1, y1 = corners[k, 0], corners[k, 1]
+        for row in range(first[k], last[k]):
+            crossings[ends[row]] = x0 + (rows[row] - y0) / (y1 - y0) * (x1 - x0)
+            ends[row] += 1
+        x0, y0 = x1, y1
+    for row in range(len(rows)):
+        crossings[starts[row] : starts[row + 1]].sort()
+
+
+@njit(cache=True, nogil=True)
+def mark_inside(x, row, starts, crossings, inside):
+    """
+    Mark the points with an odd number of crossings beyond them.
+
+    x          (N,) float64
+    row        (N,) int64
+    starts     (R + 1,) int64, where the crossings of each row start
+    crossings  (starts[R],) float64, sorted in each row
+    inside     (N,) bool, out
+    """
+    for i in range(len(x)):
+        edges = crossings[starts[row[i]] : starts[row[i] + 1]]
+        inside[i] = (len(edges) - np.searchsorted(edges, x[i], 'right')) & 1

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Columns of points: names for tables without a header, and one form of colour for all formats.
+
+A colour is the column ``rgb``, (N, 3) uint8, whatever the file has: red green blue, diffuse_red
+(MeshLab), r g b, as bytes, 16 bits or 0 to 1, or packed into 32 bits as PCL does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Columns = dict[str, npt.NDArray[Any]]
+
+RGB = ('red', 'green', 'blue')
+
+COLOURS = (RGB, tuple(f'diffuse_{name}' for name in RGB), ('r', 'g', 'b'))
+"""Names of the channels, in lower case."""
+
+PACKED = ('rgb', 'rgba')
+
+NORMALS = ('nx', 'ny', 'nz')
+
+
+def named_columns(table: npt.NDArray[Any]) -> Columns:
+    """
+    Return the columns of a table (N, C) by what they look like, the first three as x y z.
+
+    The fourth is the intensity and the fifth the ring, if they can be. The last three of six or
+    seven columns are a colour or a normal, if they can be: XYZRGB, PTS.
+    """
+    width = table.shape[1]
+    names = ['x', 'y', 'z', *(f'column_{at}' for at in range(3, width))]
+    if width > 3 and (table[:, 3] >= 0.0).all():
+        names[3] = 'intensity'
+    if width > 4 and is_whole(table[:, 4]):
+        names[4] = 'ring'
+    for at in (3, 4) if width == 7 else (3,) if width == 6 else ():
+        if is_colour(table[:, at : at + 3]):
+            names[at : at + 3] = RGB
+        elif np.allclose((table[:, at : at + 3] ** 2).sum(axis=1), 1.0, atol=1e-3):
+            names[at : at + 3] = NORMALS
+    return dict(zip(names, np.ascontiguousarray(table.T), strict=True))
+
+
+def is_whole(values: npt.NDArray[Any]) -> bool:
+    """Return whether values are whole numbers from 0 on."""
+    return bool(((values >= 0.0) & (values == np.rint(values))).all())
+
+
+def is_colour(channels: npt.NDArray[Any]) -> bool:
+    """Return whether three columns may be a colour: bytes, or 0 to 1."""
+    is_share = bool(((channels >= 0.0) & (channels <= 1.0)).all())
+    return is_share or (is_whole(channels) and bool((channels <= 255.0).all()))
+
+
+def with_one_colour(columns: Mapping[str, npt.NDArray[Any]]) -> Columns:
+    """Return columns with ``rgb``, (N, 3) uint8, instead of any form of colour."""
+    renamed = dict(columns)
+    names = {name.lower(): name for name in columns}
+    for triple in COLOURS:
+        if names.keys() >= {*triple}:
+            channels = np.stack([renamed.pop(names[name]) for name in triple], axis=1)
+            return {**renamed, 'rgb': as_bytes(channels)}
+    for name in PACKED:
+        packed = columns.get(name)
+        if packed is not None and packed.ndim == 1 and packed.dtype.itemsize == 4:
+            bits = np.ascontiguousarray(renamed.pop(name)).view(np.uint32)
+            channels = np.stack([bits >> shift & 255 for shift in (16, 8, 0)], axis=1)
+            return {**renamed, 'rgb': channels.astype(np.uint8)}
+    return renamed
+
+
+def as_bytes(channels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    """Return a colour (N, 3) as bytes: floats up to 1 times 255, numbers beyond 255 of 16 bits."""
+    if channels.dtype == np.uint8:
+        return channels
+    values = np.nan_to_num(channels.astype(np.float64))
+    top = values.max(initial=0.0)
+    scale = 255.0 if top <= 1.0 and channels.dtype.kind == 'f' else 1.0
+    scale = 255.0 / 65535.0 if top > 255.0 else scale
+    return np.rint(np.clip(values * scale, 0.0, 255.0)).astype(np.uint8)

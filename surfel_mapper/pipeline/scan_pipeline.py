@@ -1,0 +1,593 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+ScanPipeline: the way of a scan from its stamp to its update; ``run`` is that sequence.
+
+Every stage is a module beside this one or a part below. All stages run in the thread that calls
+``run``, one scan after the other. With two ``map.threads`` another thread deskews, filters and
+reduces the next scan meanwhile (look_ahead.py).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+import logging
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.compilation import clock, CompileStage
+from surfel_mapper.config import Config
+from surfel_mapper.counters import Counters, Laps
+from surfel_mapper.errors import (
+    AlignmentError,
+    CloudFormatError,
+    MapError,
+    PoseError,
+    ScanRefusedError,
+)
+from surfel_mapper.geometry import compose, inverse, Transform
+from surfel_mapper.layers import InsertedScan, Surroundings
+from surfel_mapper.layers.sensor_models import SensorModels
+from surfel_mapper.mapping.channels import missing_columns
+from surfel_mapper.mapping.moments import (
+    looks_like_millimetres,
+    MILLIMETRES,
+    pack_keys,
+    ScanMoments,
+)
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
+from surfel_mapper.memory import machine_bytes
+from surfel_mapper.messages.poses import StampedPose
+from surfel_mapper.pipeline.drops import described, Drops
+from surfel_mapper.pipeline.layer_stack import LayerStack
+from surfel_mapper.pipeline.local_map import LocalMap
+from surfel_mapper.pipeline.look_ahead import LookAhead
+from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
+from surfel_mapper.pipeline.map_origin import has_own_frame, MapOrigin
+from surfel_mapper.pipeline.preparation import Preparation
+from surfel_mapper.pipeline.prepared import Prepared
+from surfel_mapper.pipeline.reduction import moments_at, reduced
+from surfel_mapper.pipeline.reduction import warm_up_stages as reduction_stages
+from surfel_mapper.pipeline.scan_images import ScanImages
+from surfel_mapper.pipeline.scan_poses import ScanPoses
+from surfel_mapper.pipeline.scan_queue import PosedScan, ScanQueue
+from surfel_mapper.pipeline.stamp_guard import Judged, StampGuard
+from surfel_mapper.pipeline.update import Update
+from surfel_mapper.pipeline.window_aligner import Alignment, WindowAligner
+from surfel_mapper.scan import Scan
+from surfel_mapper.sensors.deskew import point_times
+
+_log = logging.getLogger(__name__)
+
+NO_ROWS, NO_VOXELS = np.empty(0, np.int32), np.empty((0, 3), np.int32)
+
+
+class ScanPipeline:
+    """
+    Owns the map, its window and the layers, and takes scans into them.
+
+    Parameters
+    ----------
+    config : Config
+        All settings.
+
+    Attributes
+    ----------
+    config, map, window, layers, counters
+        See Mapper.
+    arrived : deque of Scan
+        Scans in order of arrival, whose stamps are not judged yet.
+    loops : LoopCloser or None
+        Keeps the points of all scans, with ``loops.enabled``.
+    derives : bool
+        Whether updates hold the surfels that changed; False leaves them empty and saves the time.
+
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.counters = Counters()
+        self.drops = Drops(self.counters)
+        self.derives = True
+        self.map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
+        self.window = SlidingWindow(self.map)
+        self._set_limits()
+        self.origin = MapOrigin(config, self.map)
+        self.poses = ScanPoses(config, self.drops, self.origin)
+        self.guard = StampGuard(config.input.reset_after_s, self.poses.transforms)
+        sensors = SensorModels.configured(config, self.poses.transforms, self.poses.mount)
+        around = Surroundings(surfel_map=self.map, window=self.window, sensors=sensors)
+        self.aligner = WindowAligner(lambda scan, pose: moments_at(scan, pose, self.map, config))
+        self.loops = LoopCloser(config, self.map, self.window) if config.loops.enabled else None
+        self.layers = LayerStack(config, around, self.drops)
+        wanted = self.layers.images
+        self.images = ScanImages(wanted) if wanted.topics else None
+        self.queue = ScanQueue(config.pose.max_waiting_scans, self.poses, self.images, self.drops)
+        self.preparation = Preparation(
+            config,
+            self.poses,
+            around,
+            self.aligner,
+            self.images,
+            self.layers.needs_free_rays,
+            self.drops,
+        )
+        self._local_map: LocalMap | None = None
+        if self.poses.registered is not None:
+            self._keep_local_map()
+        self._look_ahead = LookAhead(self.map, config.map.threads or 1)
+        fixed = config.frames.fixed
+        own_frame = f'{fixed}_local' if has_own_frame(config) else fixed
+        self.map_frame = config.align.map_frame or own_frame
+        self.arrived: deque[Scan] = deque()
+        self._unreported: tuple[int, list[npt.NDArray[np.int32]]] | None = None
+        self._clears_map = self._warned_of_units = False
+
+    def run(self, more_follows: bool) -> Iterator[Update]:
+        """
+        Take the scans that arrived through all stages, in order; yield an update of each mapped.
+
+        Parameters
+        ----------
+        more_follows : bool
+            See Mapper.insert_ready.
+
+        """
+        self.judge_stamps()
+        while (posed := self._next_posed(more_follows)) is not None:
+            laps, T_map_fixed = Laps(), self.aligner.T_map_fixed
+            for prepared in self._prepared(*posed, laps):  # deskewed, filtered and registered
+                inserted, update = None, None
+                try:
+                    if self.config.map.mode == 'frozen':
+                        update = self._localised(prepared, laps)
+                    else:
+                        prepared = self._corrected(prepared, T_map_fixed)
+                        windowed = self._reduced(prepared, laps)
+                        inserted = self._inserted(prepared, windowed)
+                        self._keep(prepared.filtered, windowed)
+                        laps.end('insert')
+                        inserted = self._cleared(inserted, laps)
+                        alignment = self._align_when_due(laps)
+                        if alignment is not None:
+                            inserted = inserted.at(alignment.T_map_sensor[-1])
+                        results = self.layers.follow(inserted, laps)
+                        update = self._recorded(prepared, inserted, alignment, results, laps)
+                except Exception as error:  # MemoryError too: the next scan may fit
+                    self.drops.failure(prepared.scan, error, is_mapped=inserted is not None)
+                if update is not None:
+                    yield update
+                laps = Laps()
+
+    def add_scan(self, scan: Scan) -> None:
+        """Take a scan that can be mapped; ``run`` judges its stamp."""
+        self.queue.ended = False
+        try:
+            self.arrived.append(self._checked(scan))
+        except ScanRefusedError as refusal:
+            self.drops.failure(scan, refusal)
+        if len(self.arrived) + len(self.queue.waiting) > self.queue.max_scans:
+            self.judge_stamps()  # no more scans may wait
+
+    def judge_stamps(self) -> None:
+        """Use the scans that arrived, hold one until the next message, or drop them."""
+        while self.arrived:
+            self._settle(self.guard.judge(self.arrived.popleft()))
+
+    def add_pose(self, pose: StampedPose, *, static: bool) -> None:
+        """Use a pose, hold it until the next message, or ignore it, by its stamp."""
+        self.judge_stamps()  # of the scans that came before it
+        if static:
+            self.poses.add(*pose, static=True)
+        else:
+            self._settle(self.guard.judge(pose))
+
+    def _checked(self, scan: Scan) -> Scan:
+        """Return a scan that can be mapped, by the clock of the poses, with its times."""
+        offset_ns = round(1e9 * self.config.input.time_offset_s)
+        return self._timed(scan).moved_in_time(offset_ns)
+
+    def _timed(self, scan: Scan) -> Scan:
+        """Return a scan that can be mapped, with the times that deskewing needs; else raise."""
+        if not scan.frame_id:
+            raise ScanRefusedError('empty_frame_id', 'its header has no frame_id')
+        if len(scan) == 0:
+            raise ScanRefusedError('no_points', 'it has no points')
+        if self.map.columns:
+            missing, images = missing_columns(scan.columns, self.map.columns), self.images
+            if images is not None:
+                missing = [name for name in missing if not images.will_give(scan, name)]
+            if missing:
+                reason = f'its points have no {" and no ".join(missing)}'
+                raise ScanRefusedError('missing_column', reason)
+        deskew = self.config.deskew
+        if not deskew.enabled:
+            return scan
+        try:
+            return scan.with_times(point_times(scan, deskew.field, deskew.unit, deskew.reference))
+        except CloudFormatError as error:
+            raise ScanRefusedError('no_times', str(error)) from error
+
+    def _settle(self, judged: Sequence[Judged]) -> None:
+        """Use or drop messages whose stamps were judged."""
+        for message, odd in judged:
+            if isinstance(message, StampedPose):
+                if odd:
+                    text = f'pose of {message.child!r} in {message.parent!r} ignored: {odd}'
+                    self.drops.message('odd_stamp', text)
+                else:
+                    self.poses.add(*message, static=False)
+            elif odd:
+                self.drops.scan(message, 'odd_stamp', odd)
+            else:
+                self._enqueue(message)
+
+    def _enqueue(self, scan: Scan) -> None:
+        """Queue a scan unless it is out of order; clear the map if time was set back."""
+        order = self.guard.order(scan)
+        if order.cause:
+            self.drops.scan(scan, order.cause, order.reason)
+            return
+        if order.back_s:
+            self._start_anew(scan, order.back_s)
+        elif order.odd_ns is not None:
+            self.queue.drop_odd(scan, order.odd_ns)
+        self.poses.mount(scan.frame_id)
+        self.queue.push(scan)
+
+    def _start_anew(self, scan: Scan, back_s: float) -> None:
+        """
+        Clear the map after time was set back, and drop the poses of the time before.
+
+        Scans that have their poses are mapped first, so that the map does not depend on
+        ``more_follows``; those that wait for theirs are dropped.
+        """
+        reset_after_s = self.config.input.reset_after_s
+        _log.warning(
+            'scan in frame %s: time went back by %.3f s, more than input.reset_after_s '
+            '(%g s): the map is cleared',
+            scan.frame_id,
+            back_s,
+            reset_after_s,
+        )
+        self.counters.resets += 1
+        self.queue.drop_waiting('cleared', 'the map was cleared')
+        self._clears_map = True
+        if not self.queue.posed:
+            self._clear_map()
+        if self.poses.registered is not None:
+            self.poses.registered.restart()
+        newest_ns = self.poses.transforms.newest_ns
+        if newest_ns is not None and (newest_ns - scan.stamp_ns) / 1e9 > reset_after_s:
+            self.poses.transforms.clear()  # else the scan would be mapped at a pose of that time
+
+    def pass_over(self) -> None:
+        """Take the scans that arrived as far as their poses; none is mapped."""
+        self.judge_stamps()
+        while self._next_posed(more_follows=False) is not None:
+            pass
+
+    def _next_posed(self, more_follows: bool) -> PosedScan | None:
+        """Return the next scan and its T_fixed_sensor; None until more input comes."""
+        posed = self.queue.posed
+        if self._clears_map and posed:  # of the time before time was set back
+            return posed.popleft()
+        if self._clears_map:
+            self._clear_map()
+        ahead = int(self._looks_ahead)
+        keeps = ahead if more_follows else 0
+        newest_ns = self.guard.newest_scan_ns
+        if self.queue.fill_posed(1 + ahead, newest_ns, self.config.pose) > keeps:
+            return posed.popleft()
+        if posed:
+            start = clock()
+            self._begin(*posed[0])
+            self.counters.add_seconds('reduce', clock() - start)
+        return None
+
+    @property
+    def _looks_ahead(self) -> bool:
+        """Whether another thread prepares the next scan while one is mapped."""
+        if self._look_ahead.pool is None or self.config.map.mode == 'frozen':
+            return False
+        return self.preparation.is_independent
+
+    def _begin(self, scan: Scan, T_fixed_sensor: Transform) -> None:
+        """
+        Begin to prepare and reduce a scan in another thread.
+
+        Without the poses of its sweep nothing is begun; the scan is counted later.
+        """
+        pose = self.aligner.to_map(T_fixed_sensor)
+        with suppress(PoseError):
+            self._look_ahead.begin(scan, pose, self.config, self.preparation.ahead)
+
+    def _prepared(self, scan: Scan, T_fixed_sensor: Transform, laps: Laps) -> Sequence[Prepared]:
+        """
+        Return a scan deskewed, filtered and registered; none if it is dropped.
+
+        None either while registration waits for the next scans to confirm its pose. The scan that
+        confirms it comes with those that have waited.
+        """
+        ready: Sequence[Prepared] = ()
+        pose = self.aligner.to_map(T_fixed_sensor)
+        try:
+            begun = self._look_ahead.take(scan, pose, self.config)
+            ready = self.preparation.prepare(scan, pose, self.config, laps, begun)
+        except Exception as error:  # MemoryError too: the next scan may fit
+            self.drops.failure(scan, error)
+        if not ready and len(laps.milliseconds) > 1:
+            self.counters.add_times(laps.milliseconds)
+        return ready
+
+    def _corrected(self, prepared: Prepared, T_map_fixed: Transform) -> Prepared:
+        """Return a scan corrected by the alignments since its pose, those of scans before it."""
+        if self.aligner.T_map_fixed is T_map_fixed:
+            return prepared
+        T_fixed_sensor = compose(inverse(T_map_fixed), prepared.T_map_sensor)
+        pose = self.aligner.to_map(T_fixed_sensor)
+        return replace(prepared, T_map_sensor=pose, windowed=None)
+
+    def _reduced(self, prepared: Prepared, laps: Laps) -> WindowedScan:
+        """Return the moments of a scan; the next one is then prepared by another thread."""
+        windowed = prepared.windowed
+        if isinstance(windowed, Exception):
+            raise windowed
+        if windowed is None:
+            scan, pose = prepared.filtered, prepared.T_map_sensor
+            windowed = reduced(scan, pose, self.map, self.config)
+        if self.queue.posed:
+            self._begin(*self.queue.posed[0])
+        laps.end('reduce')
+        left_out = windowed.moments.left_out
+        self.counters.points_left_out.update(left_out)
+        if not len(windowed.moments):
+            cause = 'map_limit' if 'beyond_map' in left_out else 'no_valid_points'
+            raise ScanRefusedError(cause, f'left out: {left_out}')
+        if not self._warned_of_units and looks_like_millimetres(windowed.moments):
+            self._warned_of_units = True
+            _log.warning('scan in frame %s: %s', prepared.scan.frame_id, MILLIMETRES)
+        return windowed
+
+    def _inserted(self, prepared: Prepared, windowed: WindowedScan) -> InsertedScan:
+        """Add a scan to the map, and evict those that leave the window."""
+        version, removed = self._unreported or (self.map.version, [NO_VOXELS])
+        evictions = self.window.insert(windowed, self.config.map.min_points)
+        self._unreported = version, [*removed, *(eviction.fallen for eviction in evictions)]
+        num_points = windowed.moments.num_points
+        self.counters.mapped += 1
+        self.counters.points += num_points
+        self.counters.evicted.update(eviction.limit for eviction in evictions)
+        return InsertedScan(
+            scan=prepared.filtered,
+            T_map_sensor=prepared.T_map_sensor,
+            keys=windowed.moments.key,
+            num_points=num_points,
+            evictions=tuple(evictions),
+        )
+
+    def _keep(self, scan: Scan, windowed: WindowedScan) -> None:
+        """Keep a mapped scan for registration and for loops; without it loops are not closed."""
+        pose = windowed.T_map_sensor
+        if self.loops is not None:
+            try:
+                self.loops.add(scan, pose, self.config)
+            except Exception as error:  # the disk is full, or out of memory
+                self.drops.warn('loops', f'{described(error)}; loops are not closed')
+                self.loops.clear()
+                self.loops = None
+        local_map = self.preparation.local_map
+        if local_map is not None:  # last: it may refuse the scan, which loops must have
+            local_map.add(scan, windowed, self.aligner.to_fixed(pose), self.config)
+
+    def _cleared(self, inserted: InsertedScan, laps: Laps) -> InsertedScan:
+        """Clear the voxels that layers want cleared after a scan."""
+        cleared = self.layers.voxels_to_clear(inserted, laps)
+        if not len(cleared):
+            return inserted
+        fallen = self.drop_voxels(cleared)
+        assert self._unreported is not None, 'of the scan that was inserted'
+        self._unreported[1].append(fallen)
+        return replace(inserted, cleared=cleared)
+
+    def _align_when_due(self, laps: Laps) -> Alignment | None:
+        """Align the window every ``align.every_scans`` scans; warn if that fails."""
+        if not self.aligner.is_due(self.config.align.every_scans) or len(self.window) < 2:
+            return None
+        try:
+            alignment = self.aligner.align(self.window, self.config)
+            if self.loops is not None:
+                self.loops.follow_window()
+        except (AlignmentError, MapError, MemoryError) as error:
+            self.drops.warn('alignment', f'the window is not aligned: {described(error)}')
+            return None
+        _log.debug('aligned: %s', alignment)
+        laps.end('align')
+        return alignment
+
+    def _recorded(
+        self,
+        prepared: Prepared,
+        inserted: InsertedScan,
+        alignment: Alignment | None,
+        results: dict[str, Any],
+        laps: Laps,
+    ) -> Update:
+        """Return the update of a mapped scan, with those before it that were not reported."""
+        assert self._unreported is not None, 'of the scan that was inserted'
+        version, removed = self._unreported
+        changed = (
+            self.map.surfels_changed(version, self.config.map.min_points)
+            if self.derives
+            else self.map.surfels_of(NO_ROWS)
+        )
+        laps.end('normals')
+        update = Update(
+            scan=prepared.scan,
+            filtered=prepared.filtered,
+            stamp_ns=prepared.scan.stamp_ns,
+            frame_id=self.map_frame,
+            T_map_sensor=inserted.T_map_sensor,
+            num_points=inserted.num_points,
+            changed=changed,
+            removed_voxel_index=removed_voxels(removed, alignment, changed),
+            evictions=inserted.evictions,
+            milliseconds=laps.milliseconds,
+            layers=results,
+            alignment=alignment,
+            registration=prepared.registration,
+            T_fixed_body=prepared.T_fixed_body,
+        )
+        self._unreported = None
+        self.counters.add_times(update.milliseconds)
+        return update
+
+    def _localised(self, prepared: Prepared, laps: Laps) -> Update:
+        """Return the pose of a scan in a frozen map, which takes no scan."""
+        self.counters.localised += 1
+        self.counters.add_times(laps.milliseconds)
+        return Update(
+            scan=prepared.scan,
+            filtered=prepared.filtered,
+            stamp_ns=prepared.scan.stamp_ns,
+            frame_id=self.map_frame,
+            T_map_sensor=prepared.T_map_sensor,
+            num_points=0,
+            changed=self.map.surfels_of(NO_ROWS),
+            removed_voxel_index=NO_VOXELS,
+            evictions=(),
+            milliseconds=laps.milliseconds,
+            registration=prepared.registration,
+            T_fixed_body=prepared.T_fixed_body,
+        )
+
+    # Between two scans.
+
+    def register(self) -> None:
+        """Find the poses by registration from now on."""
+        self.poses.register(self.config)
+        self._keep_local_map()
+
+    def _keep_local_map(self) -> None:
+        """Keep the map that scans are registered to, if loops are closed."""
+        if self.config.loops.enabled:
+            self._local_map = LocalMap(self.config)
+            if not self.map.num_voxels:  # else scans are registered to the map that was loaded
+                self.preparation.local_map = self._local_map
+
+    def reconfigure(self, config: Config) -> None:
+        """Take new settings; if preparation refuses them, nothing has changed."""
+        self.preparation.load_filters(config.filters)
+        self.config = config
+        self.layers.reconfigure(config)
+        self._set_limits()
+        self.poses.reconfigure(config)
+
+    def _set_limits(self) -> None:
+        """Set the limits of the window."""
+        wanted = self.config.map.max_bytes
+        self.window.config = self.config.window
+        self.window.max_total_bytes = max(wanted, 0)
+        if wanted < 0 and self.window.keeps_scans:
+            self.window.max_total_bytes = machine_bytes() // 2
+
+    def finish(self) -> None:
+        """End the input; see Mapper.finish."""
+        self.judge_stamps()
+        self._settle(self.guard.release())
+        self.queue.drop_waiting('no_pose', 'no pose until the end of the input')
+        if self.poses.registered is not None:
+            self.poses.registered.finish()
+
+    def clear(self) -> None:
+        """Drop all scans; see Mapper.clear."""
+        self.judge_stamps()
+        self._settle(self.guard.release())
+        self.queue.drop_all('cleared', 'the map was cleared')
+        if self.poses.registered is not None:
+            self.poses.registered.finish()
+        self._clear_map()
+
+    def _clear_map(self) -> None:
+        """Empty map, window and layers, unless the map is frozen."""
+        self._clears_map = False
+        self.poses.forget_mounts()
+        if self.config.map.mode != 'frozen':
+            self._empty()
+
+    def _empty(self) -> None:
+        """Empty map, window and layers."""
+        self.window.clear()
+        self.aligner.reset()
+        self.layers.clear()
+        for kept in (self.loops, self._local_map):
+            if kept is not None:
+                kept.clear()
+        self.preparation.local_map = self._local_map
+
+    def restore(self, moments: ScanMoments, scans: list[WindowedScan]) -> None:
+        """Replace map and window by saved ones, which scans are registered to until cleared."""
+        self.clear()
+        self._empty()
+        self.map.insert(moments)
+        self.window.restore(scans)
+        self.preparation.local_map = None
+        if self.loops is not None:
+            self.drops.warn(
+                'loops',
+                'a map was loaded: loops are closed only among the scans that come after it',
+            )
+
+    def drop_voxels(self, voxel_index: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+        """Empty voxels for good, in all scans; see SlidingWindow.drop_voxels."""
+        fallen = self.window.drop_voxels(voxel_index, self.config.map.min_points)
+        if self.loops is not None:
+            self.loops.drop_voxels(pack_keys(voxel_index))
+        return fallen
+
+    def close_loops(self, progress: Callable[[str], object]) -> LoopMove:
+        """Find the loops and move the scans; see Mapper.close_loops."""
+        if self.loops is None:
+            raise AlignmentError('no points are kept to close loops with: set loops.enabled')
+        with self.counters.timed('loops'):
+            move = self.loops.close(self.config, progress)
+        self.aligner.correct(move.correction)
+        _log.debug('loops: %s', move)
+        return move
+
+    def align(self) -> Alignment:
+        """Move the scans of the window to poses at which they agree; see Mapper.align."""
+        with self.counters.timed('align'):
+            alignment = self.aligner.align(self.window, self.config)
+        if self.loops is not None:
+            self.loops.follow_window()
+        _log.debug('aligned: %s', alignment)
+        return alignment
+
+    def warm_up_stages(self) -> list[CompileStage]:
+        """Return the stages that compile kernels; see Mapper.warm_up_stages."""
+        return [
+            *reduction_stages(self.config),
+            *self.preparation.warm_up_stages(self.config),
+            *self.layers.warm_up_stages(),
+        ]
+
+
+def removed_voxels(
+    removed: Sequence[npt.NDArray[np.int32]],
+    alignment: Alignment | None,
+    changed: Surfels,
+) -> npt.NDArray[np.int32]:
+    """Return the voxels (K, 3) that were surfels before the scan and are none after it."""
+    if alignment is None:
+        return np.concatenate(removed)
+    gone = np.unique(np.concatenate([*removed, alignment.removed_voxel_index]), axis=0)
+    left: npt.NDArray[np.int32] = gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]
+    return left

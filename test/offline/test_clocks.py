@@ -1,0 +1,133 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Offsets of clocks are measured from record times, named, and corrected by a setting."""
+
+import json
+
+import numpy as np
+import pytest
+
+from surfel_mapper.bags.reader import BagReader
+from surfel_mapper.cli.main import main
+from surfel_mapper.offline.clocks import clock_offsets, ClockOffset, offset_s
+from surfel_mapper.offline.survey import survey
+from test.bags.recorded import CLOUD, drive, NUM_SCANS, TF, write_rosbag2
+
+pytestmark = pytest.mark.usefixtures('undrawn')
+
+MS = 10**6
+
+
+def with_clouds_ahead(path, offset_ns, entries=None):
+    """Write a drive whose clouds have stamps of another clock, recorded when they were sent."""
+    entries = entries or drive()
+    for _, type_, _, message in entries:
+        if type_ == CLOUD:
+            stamp = message.header.stamp
+            stamp_ns = stamp.sec * 10**9 + stamp.nanosec + offset_ns
+            stamp.sec, stamp.nanosec = divmod(stamp_ns, 10**9)
+    return write_rosbag2(path, [row for row in entries if row[1] in (CLOUD, TF)])
+
+
+def replayed(tmp_path, bag, *arguments):
+    """Replay a bag; return the exit code and the summary."""
+    code = main(['replay', str(bag), '-o', str(tmp_path / 'out'), '--overwrite', *arguments])
+    return code, json.loads((tmp_path / 'out' / 'summary.json').read_text())
+
+
+@pytest.mark.parametrize('seconds', [37.0, -3600.0, 0.9, -1_699_000_000.0])
+def test_the_offset_is_the_difference_of_the_median_delays(seconds):
+    rng = np.random.default_rng(3)
+    poses = [-2 * MS - int(n) for n in rng.integers(0, 10 * MS, 100)]
+    clouds = [round(seconds * 1e9) - 90 * MS - int(n) for n in rng.integers(0, 10 * MS, 30)]
+    assert offset_s(clouds, poses) == pytest.approx(seconds - 0.088, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ('clouds', 'poses'),
+    [
+        ([], [0]),
+        ([0], []),
+        ([-400 * MS] * 9, [0] * 9),  # late, as after a long computation
+        ([k * 10**9 for k in range(20)], [0] * 9),  # replayed at another speed
+    ],
+)
+def test_delays_and_clocks_that_are_not_steady_are_no_offset(clouds, poses):
+    assert offset_s(clouds, poses) is None
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'text'),
+    [
+        (36.995, 'are 36.995 s ahead of those of /tf: the clocks differ (TAI is ahead of UTC'),
+        (-7200.01, 'are 7200.010 s behind those of /tf: the clocks differ (another time zone)'),
+        (-1.6e9, 's behind those of /tf: the clocks differ (one counts from its start)'),
+        (
+            5.5,
+            'are 5.500 s ahead of those of /tf: the clocks differ; --time-offset /points=-5.500',
+        ),
+    ],
+)
+def test_an_offset_names_topics_seconds_cause_and_option(seconds, text):
+    assert text in str(ClockOffset('/points', '/tf', seconds))
+
+
+@pytest.mark.parametrize('seconds', [37, -3600, 1])
+def test_an_offset_is_named_and_the_option_that_corrects_it_gives_the_right_map(
+    tmp_path, capsys, seconds
+):
+    _, right = replayed(tmp_path, write_rosbag2(tmp_path / 'right', drive()))
+    bag = with_clouds_ahead(tmp_path / 'bag', seconds * 10**9)
+    capsys.readouterr()
+    code, summary = replayed(tmp_path, bag)
+    side = 'ahead of' if seconds > 0 else 'behind'
+    says = f'stamps of /points are {abs(seconds)}.000 s {side} those of /tf'
+    assert (code, summary['clock_offsets'][0]['seconds']) == (4, pytest.approx(seconds, abs=1e-3))
+    assert says in capsys.readouterr().err
+    assert main(['info', str(bag)]) == 0
+    assert f'clocks: by the record times, {says}' in capsys.readouterr().out
+    for option in (f'{-seconds}', f'/points={-seconds}'):
+        code, summary = replayed(tmp_path, bag, '--time-offset', option)
+        assert (code, summary['clock_offsets']) == (0, [])
+        assert (summary['digest'], summary['poses_from']) == (right['digest'], 'tf')
+
+
+def test_without_poses_clouds_are_compared_with_other_clouds(tmp_path):
+    entries = drive()
+    rows = [row for row in entries if row[1] == CLOUD]
+    second = drive()
+    with_clouds_ahead(tmp_path / 'unused', -(10**15), second)
+    rows += [('/b', *row[1:]) for row in second if row[1] == CLOUD]
+    bag = write_rosbag2(tmp_path / 'bag', sorted(rows, key=lambda row: row[2]))
+    with BagReader(bag) as reader:
+        (offset,) = clock_offsets(survey(reader), ['/points', '/b'])[:1]
+    assert (offset.clouds, offset.reference) == ('/points', '/b')
+    assert offset.seconds == pytest.approx(1e6, abs=0.1)
+
+
+def test_stamps_that_are_not_set_are_replaced_by_record_times(tmp_path, caplog):
+    entries = drive()
+    for _, type_, _, message in entries:
+        if type_ == CLOUD:
+            message.header.stamp.sec = message.header.stamp.nanosec = 0
+    rows = [(*r[:2], r[2] - 1000 * (r[1] == CLOUD), r[3]) for r in entries if r[1] in (CLOUD, TF)]
+    _, right = replayed(tmp_path, write_rosbag2(tmp_path / 'right', drive()))
+    code, summary = replayed(tmp_path, write_rosbag2(tmp_path / 'bag', rows))
+    assert (code, summary['digest']) == (0, right['digest'])
+    assert summary['scans']['mapped'] == NUM_SCANS
+    assert '/points: header.stamp is 0, not set: the record times are used' in caplog.text
+
+
+def test_a_single_stamp_of_0_is_not_replaced(tmp_path):
+    entries = drive()
+    first = next(row for row in entries if row[1] == CLOUD)
+    first[3].header.stamp.sec = first[3].header.stamp.nanosec = 0
+    code, summary = replayed(tmp_path, write_rosbag2(tmp_path / 'bag', entries))
+    assert (code, summary['scans']['mapped']) == (4, NUM_SCANS - 1)
+
+
+@pytest.mark.parametrize('option', ['abc', '/points=', 'nan', '1e11'])
+def test_an_offset_that_is_no_number_of_seconds_is_wrong_usage(tmp_path, capsys, option):
+    with pytest.raises(SystemExit, match='2'):
+        main(['replay', str(tmp_path), '--time-offset', option])
+    assert 'expected seconds, or TOPIC=SECONDS' in capsys.readouterr().err
