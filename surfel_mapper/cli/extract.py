@@ -73,6 +73,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'lists all)',
     )
     parser.add_argument(
+        '--profile',
+        type=lambda name: ('models.profile', name),
+        dest='settings',
+        action='append',
+        help="robust (default), or paper: the paper's rules to the letter",
+    )
+    parser.add_argument(
         '--viewpoint',
         type=real,
         nargs=3,

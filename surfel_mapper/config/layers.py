@@ -8,7 +8,7 @@ blocks have 16 voxels a side, ours 8: a band of 2 tau through a block of 16 leav
 voxels unused, and a lidar scan at 0.2 m takes 1.6 times as long.
 
 Defaults of the models are those of Gao and Dong 2025 except where real sensors and axis-aligned
-buildings break its rules. Lengths are in voxels, the unit of the
+buildings break its rules; profile paper restores those. Lengths are in voxels, the unit of the
 method, so that one number suits a table and a hall.
 """
 
@@ -285,6 +285,17 @@ class ModelsConfig(Stage):
 
     voxel_size_m: float = setting(
         0.04, 'Points are thinned to one per voxel of this edge, m.', low=0.001, high=10.0
+    )
+    profile: str = setting(
+        'robust',
+        'robust: rules that allow for noise, outliers, bends and any direction; paper: the rules '
+        'of the paper unchanged.',
+        choices=('robust', 'paper'),
+    )
+    kinds: str = setting(
+        'all',
+        'all: planes, surfaces and Gaussians; gaussians: every cluster is a Gaussian.',
+        choices=('all', 'gaussians'),
     )
     max_mixture_points: int = setting(
         200,

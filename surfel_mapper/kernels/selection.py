@@ -67,3 +67,18 @@ def copy_ranges(points, ranges, out):
             for j in range(3):
                 out[row, j] = points[i, j]
             row += 1
+
+
+@njit(cache=True, nogil=True)
+def number_ranges(ranges, numbers, order, out):
+    """
+    Assign the number of a range to its items, at their positions before sorting.
+
+    ranges   (K, 2) int64, first item of each range, and the item after its last
+    numbers  (K,) int64, number of each range
+    order    (M,) int64, position of each sorted item before sorting
+    out      (M,) int32, out
+    """
+    for k in range(len(ranges)):
+        for i in range(ranges[k, 0], ranges[k, 1]):
+            out[order[i]] = numbers[k]

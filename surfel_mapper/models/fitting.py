@@ -25,7 +25,7 @@ from surfel_mapper.compilation import clock
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import AXIS_BITS, KEY_BITS
-from surfel_mapper.kernels.selection import copy_ranges
+from surfel_mapper.kernels.selection import copy_ranges, number_ranges
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.cloud_noise import estimate_noise
 from surfel_mapper.models.coarse_growth import (
@@ -47,6 +47,7 @@ from surfel_mapper.models.patches import fit_patches, PatchPoints
 from surfel_mapper.models.seams import with_smooth_seams
 from surfel_mapper.models.segmentation import (
     Clusters,
+    is_paper,
     mean_normal,
     merge_clusters,
     segment_cloud,
@@ -68,7 +69,7 @@ MOST_JOINED = 16.0
 """Largest of these in which patches are joined, too."""
 
 STAGES = ('thin', 'neighbours', 'cluster', 'merge', 'fit', 'grow', 'refit')
-"""Names of the stages of a fit."""
+"""Names of the stages of a fit with growth."""
 
 
 def fit(
@@ -112,20 +113,25 @@ def fit(
     laps = [clock()]
     thinned = thin(points.reshape(-1, 3), config.voxel_size_m)
     laps.append(clock())
-    if not len(thinned.means):
-        return no_models(thinned, config)
-    model = fit_points(thinned, config, view, laps)
+    grows = not is_paper(config) and config.kinds == 'all' and len(thinned.means) > 0
+    model = (fit_points if grows else fit_means)(thinned, config, view, laps)
     laps.append(clock())
+    names = ('thin', 'cluster', 'merge', 'fit') if len(laps) == 5 else STAGES
     times = [1e3 * (end - start) for start, end in pairwise(laps)]
-    return replace(model, milliseconds=dict(zip(STAGES, times, strict=True)))
+    return replace(model, milliseconds=dict(zip(names, times, strict=True)))
 
 
-def no_models(thinned: Thinned, config: ModelsConfig) -> MultiModel:
-    """Return the models of a cloud without a finite point."""
-    none: Indices = np.empty(0, np.int64)
-    gaussians = Gaussians(none, none, np.empty((0, 3)), np.empty((0, 3, 3)))
-    labels = thinned.point_labels(none.astype(np.int32))
-    return MultiModel([], [], gaussians, labels, config.voxel_size_m, 0)
+def fit_means(
+    thinned: Thinned, config: ModelsConfig, view: Array, laps: list[float]
+) -> MultiModel:
+    """Fit models to one point a voxel, as in the paper."""
+    clusters = segment_cloud(thinned.means, config, view)
+    laps.append(clock())
+    surfaces = merge_clusters(clusters, config, view) if config.kinds == 'all' else []
+    laps.append(clock())
+    patches = fitted_patches(clusters, surfaces, config, view)
+    model, labels = assembled(clusters, patches, config)
+    return replace(model, labels=thinned.point_labels(labels))
 
 
 def fit_points(
@@ -296,8 +302,9 @@ def fitted_patches(
     clusters: Clusters, surfaces: list[Indices], config: ModelsConfig, viewpoint: Array
 ) -> list[tuple[Plane, Indices]]:
     """Return the patches that could be fitted, each with the rows of its clusters."""
+    least = 1 if is_paper(config) else config.min_surface_points
     counts = clusters.num_points
-    kept = [m for m in surfaces if counts[m].sum() >= config.min_surface_points]
+    kept = [members for members in surfaces if counts[members].sum() >= least]
     if not kept:
         return []
     starts = np.concatenate([[0], np.cumsum([counts[members].sum() for members in kept])])
@@ -312,6 +319,37 @@ def fitted_patches(
     )
     patches = fit_patches(groups, config, viewpoint)
     return [(p, members) for p, members in zip(patches, kept, strict=True) if p is not None]
+
+
+def assembled(
+    clusters: Clusters, patches: list[tuple[Plane, Indices]], config: ModelsConfig
+) -> tuple[MultiModel, npt.NDArray[np.int32]]:
+    """Return the model, with ids from 0, and the labels (M,) of the thinned points."""
+    planes = [patch for patch in patches if not isinstance(patch[0], Surface)]
+    surfaces = [patch for patch in patches if isinstance(patch[0], Surface)]
+    of_cluster = np.full(len(clusters), -1, np.int64)
+    numbered: list[Plane] = []
+    for number, (patch, members) in enumerate([*planes, *surfaces]):
+        of_cluster[members] = number
+        numbered.append(replace(patch, id=number))
+    rest = np.flatnonzero(of_cluster < 0)
+    of_cluster[rest] = len(numbered) + np.arange(len(rest))
+    labels = np.empty(len(clusters.points), np.int32)
+    number_ranges(clusters.rows, of_cluster, clusters.order, labels)
+    model = MultiModel(
+        planes=numbered[: len(planes)],
+        surfaces=[patch for patch in numbered if isinstance(patch, Surface)],
+        gaussians=Gaussians(
+            id=of_cluster[rest],
+            num_points=clusters.num_points[rest],
+            mean=clusters.mean[rest],
+            covariance=clusters.covariances()[rest],
+        ),
+        labels=labels,
+        voxel_size_m=config.voxel_size_m,
+        num_thinned=len(clusters.points),
+    )
+    return model, labels
 
 
 ABOVE_EXTENTS = 1.0

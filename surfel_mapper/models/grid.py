@@ -143,9 +143,11 @@ class Cells:
         patch: Indices,
         pitches: Array,
         margin_m: float,
+        *,
+        snapped: bool,
     ) -> Cells:
         """
-        Return the cells that hold points, from multiples of their edge on; cut boundary cells.
+        Return the cells that hold points, and cut the boundary cells.
 
         A boundary cell loses two strips and a triangle that hold no points, at the corner
         farthest from the mean of its points, unless the three other cells there hold points.
@@ -160,13 +162,15 @@ class Cells:
             Edges of the cells.
         margin_m : float
             Distance left between a cut and the points, m.
+        snapped : bool
+            Whether grids start at multiples of their pitch, else at the first point.
 
         """
         starts, pitch = np.searchsorted(patch, np.arange(len(pitches))), pitches[:, None]
         xy = local[:, :2]
         low = np.minimum.reduceat(xy, starts) if len(xy) else np.empty((0, 2))
         high = np.maximum.reduceat(xy, starts) if len(xy) else np.empty((0, 2))
-        origins = np.floor(low / pitch) * pitch
+        origins = np.floor(low / pitch) * pitch if snapped else low
         sizes = ((high - origins) / pitch).astype(np.int64) + 1
         ends = sizes.prod(axis=1).cumsum()
         first, total = ends - sizes.prod(axis=1), int(ends[-1]) if len(ends) else 0

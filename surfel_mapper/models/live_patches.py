@@ -170,7 +170,7 @@ class PatchFitter:
         origins = self._steadied(before, groups)
         pitches = np.where(curved, self._surface_pitch_m, PLANE_PITCH_VOXELS * self._size_m)
         placed = origins, frames, pitches
-        cells, _ = cells_of(samples, placed, 0.5 * self._size_m)
+        cells, _ = cells_of(samples, placed, 0.5 * self._size_m, snapped=True)
         ends = np.array([len(part) for part in beyond])
         fields = fields_of(cells, np.flatnonzero(curved & (ends == 0)))
         seams = np.flatnonzero(curved & (ends > 0))
@@ -213,7 +213,7 @@ class PatchFitter:
         starts = np.concatenate([[0], ends])
         groups = PatchPoints(points, starts, samples.normals[chosen], samples.thickness[chosen])
         origins, axes, pitches = (part[chosen] for part in frames)
-        return cells_of(groups, (origins, axes, pitches), 0.5 * self._size_m)[0]
+        return cells_of(groups, (origins, axes, pitches), 0.5 * self._size_m, snapped=True)[0]
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
         """Return number, mean and covariance of all points of groups of voxels."""
@@ -235,7 +235,7 @@ class PatchFitter:
 
     def _frames(self, groups: PatchPoints) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Return the frames (K, 3, 3) of groups as surfaces, and whether they are curved."""
-        rules = groups.thickness, self._surface_pitch_m, True
+        rules = groups.thickness, self._surface_pitch_m, True, True
         _, _, frames, curved = described(groups, np.zeros(3), rules)
         return frames, curved
 

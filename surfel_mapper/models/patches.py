@@ -19,10 +19,13 @@ from surfel_mapper.models.bspline import fit_cells, HeightField
 from surfel_mapper.models.frames import eigen, means_and_scatters
 from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.multi_model import Plane, Surface
+from surfel_mapper.models.segmentation import is_paper
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+PAPER_PLANE_PITCH_VOXELS = 5.0
+"""Edge of the cells of planes in profile paper."""
 SURFACE_PITCH_VOXELS = 3.0
 """Edge of the cells of surfaces."""
 LEAST_CELLS = 8
@@ -66,14 +69,16 @@ class PatchPoints:
 
 def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> list[Plane | None]:
     """Return a Plane or Surface for every group, in order; None for multi-valued ones."""
-    number, a = len(groups.thickness), config.voxel_size_m
-    thickness, bent = groups.thickness, True
+    number, by_paper = len(groups.thickness), is_paper(config)
+    a = config.voxel_size_m
+    thickness, bent = groups.thickness, not by_paper
     if groups.curved is not None:
         thickness, bent = np.where(groups.curved, 0.0, np.inf), False
-    rules = thickness, SURFACE_PITCH_VOXELS * a, bent
+    rules = thickness, SURFACE_PITCH_VOXELS * a, bent, not by_paper
     means, covariances, frames, curved = described(groups, viewpoint, rules)
-    pitches = np.where(curved, SURFACE_PITCH_VOXELS, config.plane_pitch_voxels) * a
-    cells, local = cells_of(groups, (means, frames, pitches), a)
+    plane_pitch = PAPER_PLANE_PITCH_VOXELS if by_paper else config.plane_pitch_voxels
+    pitches = np.where(curved, SURFACE_PITCH_VOXELS, plane_pitch) * a
+    cells, local = cells_of(groups, (means, frames, pitches), a, snapped=not by_paper)
     splines = splines_of(cells, np.flatnonzero(curved), config)
     numbers, grids = np.diff(groups.starts), cells.grids()
     rms_m = rms_across(covariances, frames[:, 2], numbers)
@@ -95,7 +100,7 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
 
 
 def described(
-    groups: PatchPoints, viewpoint: Array, rules: tuple[Array, float, bool]
+    groups: PatchPoints, viewpoint: Array, rules: tuple[Array, float, bool, bool]
 ) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
     """
     Return mean (K, 3), covariance and frame (K, 3, 3) of every patch, and which are curved.
@@ -108,10 +113,10 @@ def described(
         Normals face it.
     rules : tuple
         Thickness (K,) of a plane, m; edge of the cells for the test of curvature, m; whether it
-        is tested.
+        is tested; whether the z of a surface is its mean normal.
 
     """
-    thickness, pitch_m, bent = rules
+    thickness, pitch_m, bent, mean_normal = rules
     starts, weights = groups.starts, np.ones(len(groups.points))
     _, means, scatters = means_and_scatters(groups.points, weights, starts)
     covariances = scatters / np.maximum(np.diff(starts) - 1, 1)[:, None, None]
@@ -125,7 +130,8 @@ def described(
         bend_m = bend_height(local, pitch_m)
         if bend_m >= 0.0:
             curved[k] = bend_m > thickness[k] or thick[k] >= 2.0 * thickness[k]
-    frames[curved] = turned[curved]
+    if mean_normal:
+        frames[curved] = turned[curved]
     return means, covariances, frames, curved
 
 
@@ -184,7 +190,7 @@ def weighted_fit(basis: Array, z: Array, weight: Array) -> Array:
 
 
 def cells_of(
-    groups: PatchPoints, frames: tuple[Array, Array, Array], a: float
+    groups: PatchPoints, frames: tuple[Array, Array, Array], a: float, *, snapped: bool
 ) -> tuple[Cells, Array]:
     """
     Return the cells of all patches, and the points (N, 3) in their frames.
@@ -197,17 +203,20 @@ def cells_of(
         Origins (K, 3) and axes (K, 3, 3) of the frames, edges of the cells (K,), m.
     a : float
         Edge of the voxels, m.
+    snapped : bool
+        Whether grids start at multiples of the edges of their cells.
 
     """
     origins, axes, pitches = frames
     patch = np.repeat(np.arange(len(origins)), np.diff(groups.starts))
     local = np.einsum('nij,nj->ni', axes[patch], groups.points - origins[patch])
-    return Cells.around(local, patch, pitches, MARGIN_VOXELS * a), local
+    return Cells.around(local, patch, pitches, MARGIN_VOXELS * a, snapped=snapped), local
 
 
 def splines_of(cells: Cells, curved: Indices, config: ModelsConfig) -> dict[int, HeightField]:
     """Return the splines of the curved patches."""
-    return {k: fit_cells(cells, k, config.degree, config.smoothing) for k in curved.tolist()}
+    smoothing = None if is_paper(config) else config.smoothing
+    return {k: fit_cells(cells, k, config.degree, smoothing) for k in curved.tolist()}
 
 
 def surface_of(plane: Plane, spline: HeightField, points: Array, far_m: float) -> Surface | None:

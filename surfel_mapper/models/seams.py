@@ -82,7 +82,7 @@ def with_smooth_seams(
     frames = np.array([surfaces[number].R_patch_map for number in chosen])
     pitches = np.full(len(chosen), PITCH_VOXELS * config.voxel_size_m)
     placed = means, frames, pitches
-    cells, _ = cells_of(groups, placed, config.voxel_size_m)
+    cells, _ = cells_of(groups, placed, config.voxel_size_m, snapped=True)
     splines = splines_of(cells, np.arange(len(chosen)), config)
     found = list(surfaces)
     for k, number in enumerate(chosen):

@@ -80,6 +80,11 @@ class Clusters:
         return result
 
 
+def is_paper(config: ModelsConfig) -> bool:
+    """Return whether the rules are those of the paper."""
+    return config.profile == 'paper'
+
+
 def segment_cloud(points: Array, config: ModelsConfig, viewpoint: Array) -> Clusters:
     """Cluster (N, 3) points; normals face the viewpoint (3,), m."""
     number = len(points)
@@ -87,14 +92,16 @@ def segment_cloud(points: Array, config: ModelsConfig, viewpoint: Array) -> Clus
     rows, flat = np.empty((number, 2), np.int64), np.empty(number, np.bool_)
     means, values = np.empty((2, number, 3))
     frames = np.empty((number, 3, 3))
+    by_paper = is_paper(config)
     rules = (
         config.voxel_size_m,
         config.min_density_radius,
         float(config.max_mixture_points),
         float(config.min_points),
-        config.outlier_share,
-        config.noise_m,
-        config.noise_per_range_sq,
+        0.0 if by_paper else config.outlier_share,
+        0.0 if by_paper else config.noise_m,
+        0.0 if by_paper else config.noise_per_range_sq,
+        0.0 if by_paper else 1.0,
     )
     num = bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, values, frames)
     at = np.argsort(rows[:num, 0])
@@ -103,6 +110,8 @@ def segment_cloud(points: Array, config: ModelsConfig, viewpoint: Array) -> Clus
 
 def thickness(means: Array, config: ModelsConfig, viewpoint: Array) -> Array:
     """Return the largest thickness, 6 sigma, of a plane at (K, 3) locations, m."""
+    if is_paper(config):
+        return np.full(len(means), config.voxel_size_m)
     range_sq = ((means - viewpoint) ** 2).sum(axis=1)
     sigma = NOISE_SPREAD * (config.noise_m + config.noise_per_range_sq * range_sq)
     result: Array = np.sqrt(config.voxel_size_m**2 + 36.0 * sigma**2)
@@ -157,11 +166,11 @@ def merged(
     clusters: Clusters, members: Indices, scales: Array, config: ModelsConfig
 ) -> list[Indices]:
     """Return the connected components of some clusters."""
-    a = config.voxel_size_m
+    a, by_paper = config.voxel_size_m, is_paper(config)
     rules = (
         math.cos(math.radians(config.max_angle_deg)),
         config.max_offset_voxels * a,
-        math.cos(math.radians(config.arc_angle_deg)),
+        2.0 if by_paper else math.cos(math.radians(config.arc_angle_deg)),
         config.arc_offset_voxels * a,
         FAR_GAP_VOXELS * a,
         NEAR_GAP_VOXELS * a,

@@ -24,7 +24,7 @@ from test.bench import tabletop
 from test.bench.machine import one_core
 from test.bench.options import Options
 from test.bench.report import Row, spread
-from test.models.scenes import gaussians_alone, room, VIEW
+from test.models.scenes import room, VIEW
 
 KINECT = 1.425e-3
 """Its sigma by range^2, 1/m."""
@@ -85,8 +85,12 @@ def fastest_stages(models: Sequence[MultiModel]) -> dict[str, float]:
 def accuracy(points: npt.NDArray[np.float32], config: ModelsConfig) -> dict[str, Any]:
     """Return precision and completeness of the models, and of Gaussians alone."""
     found = evaluate(fit(points, config, VIEW), points)
-    noise = {'noise_per_range_sq': config.noise_per_range_sq}
-    theirs = evaluate(gaussians_alone(points, config.voxel_size_m, **noise), points)
+    alone = ModelsConfig(
+        voxel_size_m=config.voxel_size_m,
+        noise_per_range_sq=config.noise_per_range_sq,
+        kinds='gaussians',
+    )
+    theirs = evaluate(fit(points, alone, VIEW), points)
     return {
         'planes': found.num_planes,
         'surfaces': found.num_surfaces,

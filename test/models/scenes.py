@@ -10,12 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfel_mapper.config import ModelsConfig
-from surfel_mapper.models import MultiModel
-from surfel_mapper.models.multi_model import Gaussians
-from surfel_mapper.models.segmentation import segment_cloud
-from surfel_mapper.models.thinning import thin
-
 A = 0.03
 """Voxel size that the room is judged at, m."""
 
@@ -96,14 +90,3 @@ def round_hit(d, start, radius):
     under_root = b * b - a * c
     t = (-b - np.sqrt(np.maximum(under_root, 0.0))) / a
     return np.where((under_root > 0) & (t > 0), t, np.inf)
-
-
-def gaussians_alone(points, voxel_size_m, viewpoint=VIEW, **settings):
-    """Return the model of a cloud in which every cluster is a Gaussian, for comparison."""
-    config = ModelsConfig(voxel_size_m=voxel_size_m, **settings)
-    means = thin(points.reshape(-1, 3), voxel_size_m).means
-    clusters = segment_cloud(means, config, viewpoint)
-    gaussians = Gaussians(
-        np.arange(len(clusters)), clusters.num_points, clusters.mean, clusters.covariances()
-    )
-    return MultiModel([], [], gaussians, np.empty(0, np.int32), voxel_size_m, len(means))

@@ -13,6 +13,7 @@ from surfel_mapper.models.bspline import (
     basis,
     design,
     fit_cells,
+    fit_lsqr,
     fit_pspline,
     initial_field,
     knots,
@@ -55,9 +56,11 @@ def scene(function, cells=(9, 6), holes=False):
 
 
 @pytest.mark.parametrize('cells', [(1, 1), (2, 1), (3, 4), (9, 6), (5, 30)])
-def test_planes_are_reproduced(cells):
+@pytest.mark.parametrize('solver', ['lsqr', 'pspline'])
+def test_planes_are_reproduced(cells, solver):
     start, xy, z = scene(lambda x, y: 0.3 * x - 0.2 * y + 0.1, cells)
-    field = fit_pspline(start, xy, z, np.ones(len(z)), 1e-2)
+    ones = np.ones(len(z))
+    field = fit_lsqr(start, xy, z) if solver == 'lsqr' else fit_pspline(start, xy, z, ones, 1e-2)
     scale = max(np.ptp(z), 0.1)
     assert np.abs(field.heights(xy) - z).max() < 1e-4 * scale
 
@@ -73,6 +76,22 @@ def test_quadrics_are_reproduced_and_holes_are_filled():
     expected = bowl(hole[:, 0], hole[:, 1])
     usual = fit_pspline(start, xy, z, np.ones(len(z)), 1e-2)
     np.testing.assert_allclose(usual.heights(hole), expected, atol=0.05 * np.ptp(z))
+
+
+def test_lsqr_equals_the_limit_of_gradient_descent():
+    start, xy, z = scene(lambda x, y: np.sin(2 * x) + y**2, (4, 3))
+    rows, weights, _ = design(start, xy)
+    matrix = np.zeros((len(z), start.control.size))
+    np.add.at(matrix, (np.arange(len(z))[:, None], rows), weights)
+    control = start.control.ravel().copy()
+    step = 1.0 / np.linalg.norm(matrix, 2) ** 2
+    for _ in range(200_000):
+        change = step * (matrix.T @ (z - matrix @ control))
+        control += change
+        if np.abs(change).max() < 1e-13:
+            break
+    found = fit_lsqr(start, xy, z).control.ravel()
+    np.testing.assert_allclose(found, control, atol=1e-6)
 
 
 @pytest.mark.parametrize('cells', [(9, 6), (1, 1), (2, 7), (1, 8)])
@@ -103,7 +122,7 @@ def test_cells_are_fitted_at_the_means_of_their_points_by_their_number():
     rng = np.random.default_rng(6)
     local = rng.uniform(0.0, [2.0, 1.5, 0.1], (400, 3))
     local = local[~((local[:, 0] > 1.0) & (local[:, 1] > 1.0))]
-    cells = Cells.around(local, np.zeros(len(local), int), np.full(1, 0.25), 0.0)
+    cells = Cells.around(local, np.zeros(len(local), int), np.full(1, 0.25), 0.0, snapped=True)
     field = fit_cells(cells, 0, 3, 1e-2)
     cell = np.floor(local[:, :2] / 0.25).astype(int)
     means, number = np.full((8, 6, 3), np.nan), np.zeros((8, 6))

@@ -26,7 +26,6 @@ from test.models.scenes import (
     CENTRE,
     CYLINDER,
     FLAT,
-    gaussians_alone,
     room,
     sheet,
     VIEW,
@@ -109,7 +108,7 @@ def test_exact_plane_is_recovered():
 
 def test_the_models_are_twice_as_precise_as_gaussians_alone(seen):
     points, _, model = seen
-    alone = gaussians_alone(points, A)
+    alone = fit(points, ModelsConfig(voxel_size_m=A, kinds='gaussians'), VIEW)
     assert not alone.patches
     assert len(alone.gaussians) > len(model.gaussians)
     ours, theirs = evaluate(model, points), evaluate(alone, points)
@@ -130,7 +129,7 @@ def test_real_frames_are_twice_as_precise_as_gaussians(data_folder, voxel_size_m
     found = []
     for file in sorted((data_folder / 'data' / 'osd').glob('*.pcd')):
         points, _, all_kinds = fitted_frame(file, voxel_size_m)
-        gaussians = gaussians_alone(points, voxel_size_m, viewpoint=np.zeros(3))
+        gaussians = fit(points, ModelsConfig(voxel_size_m=voxel_size_m, kinds='gaussians'))
         for model in (all_kinds, gaussians):
             row = evaluate(model, points)
             found.append((row.precision_rms_m, row.completeness_rms_m))
@@ -306,7 +305,7 @@ def test_a_spacing_of_samples_that_is_no_distance_is_refused(step_m):
 def test_samples_of_gaussians_end_at_three_sigma_and_have_their_moments():
     rng = np.random.default_rng(8)
     blob = rng.standard_normal((30_000, 3)) * [0.3, 0.2, 0.1]
-    model = gaussians_alone(blob, 0.02, min_points=100_000)
+    model = fit(blob, ModelsConfig(voxel_size_m=0.02, kinds='gaussians', min_points=100_000))
     (mean,), (covariance,) = model.gaussians.mean, model.gaussians.covariance
     drawn = model.resample()
     assert len(drawn) == model.num_thinned
@@ -343,7 +342,7 @@ def test_invalid_clouds_are_refused(points, viewpoint):
 
 
 @pytest.mark.parametrize(
-    'settings', [{'degree': 9}, {'voxel_size_m': 0.0}, {'min_density_radius': 3.0}]
+    'settings', [{'profile': 'quick'}, {'voxel_size_m': 0.0}, {'min_density_radius': 3.0}]
 )
 def test_settings_out_of_bounds_are_refused(settings):
     with pytest.raises(ConfigError, match=next(iter(settings))):

@@ -36,9 +36,10 @@ def test_area_equals_the_shape_within_one_and_a_half_cells_of_boundary(name):
     assert plane.grid.area_m2() == pytest.approx(area, abs=0.75 * perimeter * PITCH)
 
 
-def test_patch_covers_all_its_points():
+@pytest.mark.parametrize('profile', ['robust', 'paper'])
+def test_patch_covers_all_its_points(profile):
     points, _ = room(160, 120)
-    config = ModelsConfig(voxel_size_m=A)
+    config = ModelsConfig(voxel_size_m=A, profile=profile)
     model = fit(points, config, VIEW)
     # a cloud of voxel means goes through unchanged, so its labels are those of the means
     means = fitted_points(points)
@@ -105,7 +106,7 @@ def test_a_corner_that_cells_surround_is_not_cut():
     around = [(x, y) for x in range(3) for y in range(3) if (x, y) not in ((1, 1), (2, 1))]
     middles = [(x + 0.5, y + 0.5) for x, y in around]
     local = np.array([(x, y, 0.0) for x, y in [*middles, (1.9, 1.4), (2.99, 2.99), (0.0, 0.0)]])
-    cells = Cells.around(local, np.zeros(len(local), int), np.ones(1), 0.1)
+    cells = Cells.around(local, np.zeros(len(local), int), np.ones(1), 0.1, snapped=True)
     assert cells.sizes.tolist() == [[3, 3]]
     middle = 4
     assert cells.rim[middle]

@@ -12,7 +12,7 @@ from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
 from surfel_mapper.models.multi_model import Gaussians, MultiModel
 from test.models.live_scenes import of_points
-from test.models.scenes import A, gaussians_alone, room, VIEW
+from test.models.scenes import A, room, VIEW
 
 SIZE_M = 0.1
 MOST = 343
@@ -72,8 +72,8 @@ def test_samples_of_a_live_map_are_bounded_after_many_scans():
 
 def test_a_thinned_cloud_has_a_sample_for_each_point():
     points, _ = room(320, 240, noise_per_range_sq=1e-3)
-    for model in (fit(points, ModelsConfig(voxel_size_m=A), VIEW), gaussians_alone(points, A)):
-        found = model.gaussians
+    for kinds in ('all', 'gaussians'):
+        found = fit(points, ModelsConfig(voxel_size_m=A, kinds=kinds), VIEW).gaussians
         np.testing.assert_array_equal(found.sample_counts(A), found.num_points)
 
 

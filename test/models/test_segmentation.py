@@ -73,8 +73,9 @@ def test_outlier_share_is_allowed_but_not_in_strict_mode():
         np.repeat(sheet(0.2, 0.2, 0.1), 300, axis=0),
     ],
 )
-def test_degenerate_clouds_give_a_result_that_holds_every_point_once(cloud):
-    model = fit(cloud, ModelsConfig(voxel_size_m=A))
+@pytest.mark.parametrize('profile', ['robust', 'paper'])
+def test_degenerate_clouds_give_a_result_that_holds_every_point_once(cloud, profile):
+    model = fit(cloud, ModelsConfig(voxel_size_m=A, profile=profile))
     total = sum(p.num_points for p in model.patches) + model.gaussians.num_points.sum()
     assert total == model.num_thinned
     finite = np.isfinite(cloud).all(axis=1)
@@ -110,6 +111,13 @@ def test_result_is_reproducible_and_independent_of_point_order():
 def test_full_sheets_of_any_direction_are_flat(normal):
     clusters, _ = clustered(sheet(2.0, 1.5, A / 6, normal, OFF_GRID))
     assert flat_share(clusters) >= 0.97
+
+
+def test_paper_profile_rejects_an_axis_aligned_floor():
+    """The least density of 2 is just above that of an axis-aligned sheet, a point a voxel."""
+    floor, diagonal = sheet(2.0, 1.5, A / 6), sheet(2.0, 1.5, A / 6, (1, 1, 1), OFF_GRID)
+    assert flat_share(clustered(floor, profile='paper')[0]) < 0.6
+    assert flat_share(clustered(diagonal, profile='paper')[0]) > 0.95
 
 
 def test_noisy_room_is_mostly_flat_if_the_noise_is_known():

@@ -231,7 +231,7 @@ def bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, valu
 
     points     (N, 3) float64, m
     viewpoint  (3,) float64, m
-    rules      (a, r_min, most_em, least, outliers, n0, n2): see is_flat_cluster
+    rules      (a, r_min, most_em, least, outliers, n0, n2, oriented): see is_flat_cluster
     moved      (N, 3) float64, out: the points by cluster
     order      (N,) int64, out: the row that each point had
     rows       (N, 2) int64, out: first row of each cluster and the one after its last, unordered
@@ -308,15 +308,14 @@ def is_flat_cluster(x, y, z, mean, value, frame, viewpoint, rules):
     Return whether a cluster is thin, dense and without outliers, so a piece of a plane.
 
     rules  a         voxel size, m
-           r_min     least density, by the voxels that a plane of this direction crosses: 2 is a
-                     full sheet
+           r_min     least density: 2 is a full sheet
            most_em, least
            outliers  share of points allowed beyond three sigma
            n0, n2    sigma of the sensor is n0 + n2 range^2, m
-
-    A cluster narrower than a plane is thick counts as a line.
+           oriented  whether density is normalised by the voxels that a plane of this direction
+                     crosses, and a cluster narrower than a plane is thick counts as a line
     """
-    a, r_min, _, _, outliers, n0, n2 = rules
+    a, r_min, _, _, outliers, n0, n2, oriented = rules
     number = len(x)
     e0, e1, e2 = value[0], value[1], value[2]
     range_sq = 0.0
@@ -324,11 +323,13 @@ def is_flat_cluster(x, y, z, mean, value, frame, viewpoint, rules):
         range_sq += (mean[j] - viewpoint[j]) ** 2
     noise = NOISE_SPREAD * (n0 + n2 * range_sq)
     thick_sq = a * a + 36.0 * noise * noise
-    if number < 4 or e1 <= 1e-12 * e2 or 36.0 * e1 < thick_sq:
+    if number < 4 or e1 <= 1e-12 * e2 or (oriented and 36.0 * e1 < thick_sq):
         return False
     if not 36.0 * e0 < thick_sq:
         return False
-    crossed = (abs(frame[2, 0]) + abs(frame[2, 1]) + abs(frame[2, 2])) / MEAN_CROSSED
+    crossed = 1.0
+    if oriented:
+        crossed = (abs(frame[2, 0]) + abs(frame[2, 1]) + abs(frame[2, 2])) / MEAN_CROSSED
     if not number * a * a > math.pi * r_min * r_min * math.sqrt(e1 * e2) * crossed:
         return False
     return num_outliers(x, y, z, mean, value, frame) <= outliers * number
