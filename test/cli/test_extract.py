@@ -80,22 +80,6 @@ def test_a_file_that_is_no_cloud_is_refused_by_name(tmp_path, capsys, name):
     assert name in capsys.readouterr().err
 
 
-def test_an_unknown_ending_is_refused_with_the_known_ones(tmp_path, capsys):
-    (tmp_path / 'notes.md').touch()
-    assert main(['extract', str(tmp_path / 'notes.md'), '--output', str(tmp_path / 'out')]) == 1
-    said = capsys.readouterr().err
-    assert (
-        'a cloud ending in .ply, .pcd, .bin, .las, .laz, or a map ending in .npz, .parquet' in said
-    )
-
-
-def test_a_voxel_size_of_zero_is_refused(tmp_path, capsys):
-    write_cloud(tmp_path / 'a.ply', sheet(1.0, 1.0, 0.1).astype(np.float32))
-    arguments = [str(tmp_path / 'a.ply'), '--output', str(tmp_path / 'out')]
-    assert main(['extract', *arguments, '--voxel-size', '0']) == 1
-    assert 'voxel_size_m' in capsys.readouterr().err
-
-
 @pytest.mark.parametrize('size', [['--voxel-size', '0.1'], ['--set', 'models.voxel_size_m=0.1']])
 def test_settings_are_options(tmp_path, capsys, size):
     cloud, out = tmp_path / 'a.ply', tmp_path / 'out'
