@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """T20: a saved and loaded TSDF is the same; damaged files and other settings are refused."""
 
-from contextlib import contextmanager
 from dataclasses import asdict, replace
-import resource
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ import pytest
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import FileFormatError, MapLimitError
 from surfel_mapper.files.state import load_state, save_state
-from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf, save_tsdf_parts
+from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from test.tsdf.scenes import image_of, SMALL
@@ -154,28 +152,3 @@ def test_files_of_another_kind_and_truncated_ones_are_refused(tmp_path):
     (tmp_path / 'd').write_bytes(whole[:5000] + b'x' + whole[5001:])
     with pytest.raises(FileFormatError):
         load_tsdf(tmp_path / 'd', FULL)
-
-
-@contextmanager
-def limited_files(size):
-    """Make files end at a size in bytes, as on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-@pytest.mark.parametrize('num_blocks', [1, 9], ids=['at the end', 'between blocks'])
-def test_a_full_disk_is_reported_with_the_path(tmp_path, num_blocks):
-    """The 4 KiB of a block remain in the buffer until the next one, or the end."""
-    blocks = filled(PLAIN).blocks
-    part = blocks.copied(blocks.rows()[:num_blocks])
-    path = tmp_path / 'map.npz'
-    with (
-        limited_files(1000),
-        pytest.raises(FileFormatError, match=rf'^{path}: cannot be written: File too large$'),
-    ):
-        save_tsdf_parts(path, PLAIN, lambda: [part])
-    assert list(tmp_path.iterdir()) == []
