@@ -12,7 +12,7 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import tsdf_archive
 from surfel_mapper.files.mesh_ply import write_mesh_parts
 from surfel_mapper.files.tsdf_archive import BlockArchive
-from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf, save_tsdf_parts
+from surfel_mapper.files.tsdf_state import save_tsdf, save_tsdf_parts
 from surfel_mapper.layers.distance_field import whole_surface
 from surfel_mapper.layers.distance_field.layer import cleared
 from surfel_mapper.layers.distance_field.whole_surface import merged_parts, surface_parts
@@ -176,27 +176,3 @@ def test_saved_archive_is_the_file_of_all_blocks_in_memory(tmp_path, stay):
     save_tsdf_parts(tmp_path / 'disk.npz', blocks.config, parts)
     assert (tmp_path / 'disk.npz').read_bytes() == (tmp_path / 'memory.npz').read_bytes()
     assert len(np.load(tmp_path / 'disk.npz')['index']) > 200
-
-
-def test_empty_archive_is_saved_as_an_empty_field(tmp_path):
-    empty = BlockMap(config())
-    parts = partial(merged_parts, empty, BlockArchive(tmp_path / 'a'))
-    save_tsdf_parts(tmp_path / 'empty.npz', empty.config, parts)
-    assert load_tsdf(tmp_path / 'empty.npz', empty.config).num_blocks == 0
-
-
-def test_archive_that_cannot_be_saved_leaves_the_old_file(tmp_path):
-    blocks = hilly(config())
-    archive = archived(tmp_path, blocks)
-    (tmp_path / 'map.npz').write_bytes(b'old')
-    files = sorted((tmp_path / 'archive').rglob('*.npz'))
-    files[0].write_bytes(b'rubbish')
-    parts = partial(merged_parts, blocks, archive)
-    with pytest.raises(FileFormatError, match=r'\.npz'):
-        save_tsdf_parts(tmp_path / 'map.npz', blocks.config, parts)
-    with pytest.raises(FileFormatError, match='nowhere'):
-        save_tsdf_parts(
-            tmp_path / 'nowhere' / 'map.npz', blocks.config, lambda: [hilly(config()).copied([0])]
-        )
-    assert (tmp_path / 'map.npz').read_bytes() == b'old'
-    assert sorted(path.name for path in tmp_path.iterdir()) == ['archive', 'map.npz']

@@ -8,7 +8,6 @@ import pytest
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, rotation_angle
 from surfel_mapper.simulation import Drive, Lidar, Simulation, World
-from surfel_mapper.simulation.circuit import Route
 from surfel_mapper.simulation.drive import START_NS
 
 LEVEL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -40,22 +39,6 @@ def test_the_vehicle_points_along_its_path():
         assert linear[0] > 4.9
         # rocking and bumps tilt it by less than 3 deg against its way
         assert np.hypot(linear[1], linear[2]) < 5.0 * np.sin(np.deg2rad(3.0))
-
-
-@pytest.mark.parametrize('turn_deg', [0.0, 39.0])  # the arcs end 0 and 2e-15 m apart
-def test_the_vehicle_turns_steadily_where_two_arcs_touch(turn_deg):
-    turn_rad = np.deg2rad(turn_deg)
-    turn = np.array([[np.cos(turn_rad), np.sin(turn_rad)], [-np.sin(turn_rad), np.cos(turn_rad)]])
-    corners = np.array([(0.0, 0.0), (20.0, 0.0), (20.0, 14.0), (40.0, 14.0)]) @ turn
-    route = Route(corners)
-    along_m = np.arange(0.0, route.length_m, 0.01)
-
-    poses = np.array([route.T_start_at(each) for each in along_m])
-
-    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0]) - turn_rad
-    middle = np.linalg.norm(poses[:, :2, 3] - np.array([20.0, 7.0]) @ turn, axis=1).argmin()
-    assert np.rad2deg(yaw[middle]) == pytest.approx(90.0, abs=2.0)
-    assert np.rad2deg(np.abs(np.diff(yaw)).max()) < 0.2  # at least 3.5 m of radius
 
 
 def test_the_twist_is_the_motion_in_the_vehicles_frame():

@@ -57,21 +57,6 @@ def test_no_surface_is_of_no_primitive():
     assert np.isnan(world.reflectivity(none)).all()
 
 
-@pytest.mark.parametrize(
-    ('origins', 'directions', 'says'),
-    [
-        ([0.0, 0.0], [[1.0, 0.0, 0.0]], 'origins: shape'),
-        ([[0.0, 0.0, 0.0]] * 2, [[1.0, 0.0, 0.0]] * 3, '2 rows for 3'),
-        ([0.0, 0.0, 0.0], [[2.0, 0.0, 0.0]], 'unit vectors'),
-        ([0.0, 0.0, 0.0], [[np.nan, 0.0, 0.0]], 'unit vectors'),
-        ([0.0, np.nan, 0.0], [[1.0, 0.0, 0.0]], 'origins: not all finite'),
-    ],
-)
-def test_invalid_rays_are_refused(origins, directions, says):
-    with pytest.raises(ValueError, match=says):
-        World([BOX]).raycast(origins, directions)
-
-
 def test_a_street_is_the_same_for_the_same_seed_and_another_for_another():
     street = World.street(seed=3, length_m=40.0)
     assert street.primitives == World.street(seed=3, length_m=40.0).primitives
@@ -164,16 +149,3 @@ def test_a_missing_file_is_refused_by_name(tmp_path):
 def test_streets_on_one_another_are_refused(corners):
     with pytest.raises(ConfigError, match=r'share .* m of street'):
         World.circuit(corners)
-
-
-def test_streets_may_cross_meet_and_be_driven_again():
-    corners = ((0.0, 0.0), (60.0, 0.0), (60.0, 50.0), (0.0, 50.0), (0.0, 0.0), (60.0, 0.0))
-    assert len(World.circuit(corners).primitives) > 10
-    crossing = ((0.0, 0.0), (90.0, 0.0), (45.0, 60.0), (45.0, -60.0))
-    assert len(World.circuit(crossing).primitives) > 10
-
-
-@pytest.mark.parametrize('kind', [np.array, lambda corners: [list(corner) for corner in corners]])
-def test_corners_may_be_an_array_or_lists(kind):
-    corners = ((0.0, 0.0), (60.0, 0.0), (60.0, 50.0))
-    assert World.circuit(kind(corners)).primitives == World.circuit(corners).primitives

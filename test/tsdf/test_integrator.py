@@ -10,7 +10,7 @@ from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import ConfigError, MapLimitError, PoseError
 from surfel_mapper.tsdf.measurements import warn_of_skew
 from surfel_mapper.tsdf.sensors import LidarModel
-from test.tsdf.scenes import fused, image_of, integrator, SMALL, voxels, zero_crossings
+from test.tsdf.scenes import fused, image_of, integrator, SMALL, zero_crossings
 
 SIZES = dict(voxel_size_m=0.1, truncation_m=0.3)
 LIDAR = LidarModel(rows=32, columns=256, vertical_fov_deg=60.0, max_range_m=10.0)
@@ -38,21 +38,6 @@ def test_a_scan_again_changes_nothing_but_the_weight_up_to_its_cap(monkeypatch):
         for block, (D, W) in field(one).items():
             np.testing.assert_allclose(D, first[block][0], atol=1e-6)
             np.testing.assert_allclose(W, np.minimum(count * first[block][1], cap), rtol=1e-5)
-
-
-def test_at_the_cap_a_step_decays_by_the_gain_of_one_measurement():
-    one = integrator(**SIZES, weight_mode='constant', max_weight=4.0, weight_dropoff=False)
-    for _ in range(10):
-        one.integrate(wall(SMALL, 2.0), np.eye(4))
-    before = field(one)
-    gain = 1.0 / (4.0 + 1.0)
-    for count in range(1, 5):
-        one.integrate(wall(SMALL, 2.1), np.eye(4))
-        for block, (D, W) in before.items():
-            inside = (W == 4.0) & (abs(D) < 0.15)
-            after = field(one)[block][0][inside]
-            expected = D[inside] + 0.1 * (1.0 - (1.0 - gain) ** count)
-            np.testing.assert_allclose(after, expected, atol=2e-5)
 
 
 def test_the_order_of_measurements_does_not_matter():
@@ -105,39 +90,6 @@ def test_stamps_are_the_first_and_the_last():
     pairs = {tuple(pair) for pair in stamps.transpose(0, 2, 1)[seen]}
     assert pairs == {(10, 30), (20, 20)}
     assert not stamps.transpose(0, 2, 1)[~seen].any()
-
-
-def test_the_extra_band_closes_what_lies_behind_for_all_or_for_some_labels():
-    labels = np.where(np.arange(80) < 40, 1, 2) * np.ones((60, 1), int)
-    image = wall(SMALL, 2.0, label=labels)
-    deep = {}
-    for name, settings in {
-        'none': {},
-        'all': {'extra_distance_m': 0.5},
-        'some': {'extra_distance_m': 0.5, 'extra_labels': [1.0]},
-    }.items():
-        points, D, _ = voxels(fused(image, **SIZES, **settings))
-        behind = (np.linalg.norm(points, axis=1) > 2.35) & (D < -0.2999)
-        aside = points[:, 0] / points[:, 2]
-        deep[name] = (behind & (aside < -0.05)).sum(), (behind & (aside > 0.05)).sum()
-    assert deep['none'] == (0, 0)
-    assert deep['all'][0] == deep['some'][0] > 100
-    assert deep['all'][1] > 100
-    assert deep['some'][1] == 0
-
-
-def test_colours_of_the_extra_band_can_be_left_out():
-    image = wall(SMALL, 2.0, color=np.full((60, 80, 3), 200, np.uint8))
-    counts = [
-        (
-            fused(
-                image, **SIZES, color=True, extra_distance_m=0.5, skip_extra_channels=skip
-            ).color[:, 3]
-            > 0
-        ).sum()
-        for skip in (False, True)
-    ]
-    assert counts[0] > counts[1] > 0
 
 
 def test_a_tiny_budget_is_kept_and_counted():

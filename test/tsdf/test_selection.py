@@ -115,28 +115,6 @@ def test_through_a_dense_image_rays_are_thinned_but_no_voxel_of_the_surface_is_l
     assert counts['band'] == counts['frustum'] > 4000
 
 
-def test_carving_reaches_all_but_corners_of_blocks_along_the_rays():
-    sensor = LidarModel(rows=64, columns=1024, vertical_fov_deg=45.0, max_range_m=20.0)
-    rng = np.random.default_rng(8)
-    range_m = np.repeat(np.repeat(rng.uniform(2.0, 19.0, (8, 32)), 8, 0), 32, 1)
-    image, T = image_of(sensor, range_m), random_pose(rng)
-    config = TsdfConfig(voxel_size_m=0.1, truncation_m=0.3)
-    chosen = BlockSelection(config).blocks(image, T).index
-    keys = {*map(tuple, chosen)}
-    rays = sensor.directions.astype(float) @ T[:3, :3].T
-    size, deep, missed = config.block_size_m, 0, 0
-    for along in np.linspace(0.0, 1.0, 60):
-        at = (0.5 + along * (range_m - 0.5))[..., None] * rays + T[:3, 3]
-        block, place = np.divmod(at.reshape(-1, 3), size)
-        # Deeper inside than the corners that may be missed.
-        inside = (abs(place - size / 2) < size / 4).all(axis=1)
-        found = {*map(tuple, block[inside].astype(int))}
-        deep += len(found)
-        missed += len(found - keys)
-    assert deep > 10_000
-    assert missed == 0
-
-
 def test_without_a_measurement_there_is_no_block():
     for allocation in ('band', 'frustum'):
         image = image_of(SENSORS['lidar'], np.full((16, 90), np.nan))
