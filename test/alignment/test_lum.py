@@ -222,3 +222,12 @@ def test_covariances_of_unconnected_poses_are_unknown():
     assert np.isfinite(covariances[:2]).all()
     with pytest.raises(AlignmentError, match='0 vertices'):
         LUM().pose_covariances()
+
+
+def test_without_a_usable_edge_it_does_not_converge():
+    lum = LUM(max_iterations=3)
+    for _ in range(2):
+        lum.add_point_cloud(np.eye(3))
+    lum.set_correspondences(1, 0, np.empty((0, 2), np.int32))
+
+    assert not lum.compute().converged
