@@ -332,20 +332,21 @@ def test_a_trajectory_is_a_sequence_of_matrices():
     assert np.asarray(POSES, np.float32)[2, 1, 3] == 4.0
 
 
-def test_millimetres_are_warned_about_once(caplog):
+@pytest.mark.parametrize('per_metre', [1000.0, 100.0])
+def test_other_units_are_warned_about_once(caplog, per_metre):
     rng = np.random.default_rng(5)
-    room = rng.uniform(-4000.0, 4000.0, (3000, 3))
+    room = per_metre * rng.uniform(-4.0, 4.0, (3000, 3))
     surfel_map = SurfelMap(0.5)
     for _ in range(2):
         surfel_map.add(room)
-    assert caplog.text.count('are they millimetres?') == 1
+    assert caplog.text.count('are they millimetres or centimetres?') == 1
 
     caplog.clear()
     mapper = Mapper(Config.from_mapping({'pose.source': 'identity', 'input.max_range_m': 0.0}))
     for stamp_ns in (1, 2):
         mapper.add_scan(Scan(points=room, stamp_ns=stamp_ns, frame_id='lidar'))
         list(mapper.insert_ready())
-    assert caplog.text.count('are they millimetres?') == 1
+    assert caplog.text.count('are they millimetres or centimetres?') == 1
 
 
 def test_metres_far_from_the_origin_are_not_warned_about(caplog):
