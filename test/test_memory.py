@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory kept: large blocks are used again, and lasting objects are not visited by collections."""
 
-import gc
 import os
 import platform
 import subprocess
 import sys
 
 import pytest
-
-from surfel_mapper.memory import lasting_objects
 
 FAULTS = """
 import resource, sys
@@ -64,30 +61,3 @@ def test_blocks_are_used_again_once_memory_is_kept():
 def test_memory_freed_by_one_thread_is_used_by_another_once_it_is_shared():
     shared, apart = (faults_of(THREADS, how) for how in ('shared', 'apart'))
     assert shared < 0.1 * apart
-
-
-def test_objects_of_the_block_are_not_visited_by_later_collections():
-    threshold = gc.get_threshold()
-    try:
-        with lasting_objects():
-            assert gc.get_threshold()[0] > threshold[0]
-            lasting = [[] for _ in range(10)]
-        later = [[]]
-        visited = {id(each) for each in gc.get_objects()}
-
-        assert id(lasting) not in visited
-        assert id(lasting[0]) not in visited
-        assert id(later) in visited
-        assert gc.get_threshold() == threshold
-    finally:
-        gc.unfreeze()
-
-
-def test_an_error_in_the_block_restores_the_collector():
-    threshold = gc.get_threshold()
-    try:
-        with pytest.raises(KeyError), lasting_objects():
-            raise KeyError
-        assert gc.get_threshold() == threshold
-    finally:
-        gc.unfreeze()

@@ -18,7 +18,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from surfel_mapper.errors import PoseError, PoseNotYetError, PosesLateError
-from surfel_mapper.geometry import compose, inverse, pose_matrix
+from surfel_mapper.geometry import compose, pose_matrix
 from surfel_mapper.poses import buffer as buffer_module
 from surfel_mapper.poses import TransformBuffer
 
@@ -69,28 +69,6 @@ def test_a_lookup_at_a_stored_stamp_returns_the_stored_bits():
 
     for k, pose in enumerate(poses):
         assert buffer.lookup('odom', 'base', EPOCH + 37 * k).tobytes() == pose.tobytes()
-
-
-def test_static_edges_are_composed_from_the_source_upwards():
-    buffer = drive()
-    buffer.add_static('lidar', 'optical', some_pose(2))
-
-    T_base_optical = compose(some_pose(1), some_pose(2))
-    expected = compose(moved(20.0), T_base_optical)
-    assert buffer.lookup('odom', 'optical', EPOCH + 2 * S).tobytes() == expected.tobytes()
-    assert buffer.lookup('base', 'optical', 0).tobytes() == T_base_optical.tobytes()
-
-
-def test_a_lookup_downwards_is_the_inverse_of_the_one_upwards():
-    buffer = drive()
-
-    upwards = buffer.lookup('odom', 'lidar', EPOCH + S // 3)
-
-    assert buffer.lookup('lidar', 'odom', EPOCH + S // 3).tobytes() == inverse(upwards).tobytes()
-
-
-def test_between_two_stamps_the_pose_lies_between():
-    assert drive().lookup('odom', 'base', EPOCH + S // 4)[0, 3] == 2.5
 
 
 @given(st.data())
@@ -149,13 +127,6 @@ def test_the_same_stamp_again_replaces():
     assert buffer.lookup('odom', 'base', EPOCH + 3 * S)[0, 3] == 30.0
 
 
-def test_a_static_transform_again_replaces():
-    buffer = drive()
-    buffer.add_static('base', 'lidar', moved(7.0))
-
-    np.testing.assert_array_equal(buffer.lookup('base', 'lidar', EPOCH), moved(7.0))
-
-
 def test_a_stamp_back_by_no_more_than_the_limit_is_inserted():
     buffer = drive(reset_after_s=2.5)
     buffer.add('odom', 'base', EPOCH + 3 * S - 2_500_000_000, moved(77.0))
@@ -206,16 +177,6 @@ def test_clearing_forgets_dynamic_edges_and_keeps_static_ones():
     not_yet(buffer, 'odom', 'lidar', EPOCH)
     buffer.add('map', 'base', 5, moved(1.0))
     assert buffer.lookup('map', 'base', 5)[0, 3] == 1.0
-
-
-def test_the_newest_stamp_is_that_of_any_dynamic_edge():
-    buffer = TransformBuffer()
-    assert buffer.newest_ns is None
-    buffer.add_static('base', 'lidar', moved(0.0))
-    assert buffer.newest_ns is None
-    buffer.add('odom', 'base', 7, moved(0.0))
-    buffer.add('map', 'odom', 5, moved(0.0))
-    assert buffer.newest_ns == 7
 
 
 # What is not there

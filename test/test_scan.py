@@ -77,19 +77,6 @@ def test_scans_made_of_a_lazy_one_have_its_points():
     np.testing.assert_array_equal(copied.points, POINTS)
 
 
-def test_times_are_added_without_decoding_the_points():
-    decode = Decoding()
-    lazy = scan(LazyPoints(4, decode))
-    timed = lazy.with_times(PointTimes(np.arange(4), 0, 3))
-    assert timed.times.last_ns == 3
-    assert decode.number == 0
-    copied = pickle.loads(pickle.dumps(timed))
-    np.testing.assert_array_equal(copied.points, POINTS)
-    assert timed.points is lazy.points is POINTS
-    assert decode.number == 1
-    assert scan().with_times(timed.times).times is timed.times
-
-
 def test_coordinates_are_read_where_the_message_has_them():
     decode = Decoding()
     xyz = tuple(POINTS.T)
@@ -108,16 +95,6 @@ def test_columns_of_lazy_points_have_a_row_for_each():
 def test_a_scan_has_no_other_attributes(made):
     with pytest.raises(AttributeError, match="'Scan' object has no attribute 'point'"):
         made.point  # noqa: B018
-
-
-def test_an_error_in_decoding_is_raised_to_the_reader():
-    def decode():
-        raise MemoryError('of the points')
-
-    lazy = scan(LazyPoints(4, decode))
-    for _ in range(2):
-        with pytest.raises(MemoryError, match='of the points'):
-            lazy.points  # noqa: B018
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ import pytest
 from surfel_mapper import threads as threads_module
 from surfel_mapper.threads import (
     BACKGROUND_NICE,
-    pool,
     real_time_threads,
     share,
     split,
@@ -57,23 +56,6 @@ def test_every_row_is_in_one_part():
         assert rows == list(range(num_rows))
 
 
-@pytest.mark.parametrize('error', [OSError, KeyboardInterrupt])
-def test_slices_that_others_have_begun_are_done_before_an_error_is_raised(error):
-    both_have_begun, may_end, ended = threading.Barrier(2), threading.Event(), threading.Event()
-
-    def work(rows):
-        both_have_begun.wait(10.0)
-        if threading.current_thread() is threading.main_thread():
-            threading.Timer(0.05, may_end.set).start()
-            raise error
-        may_end.wait(10.0)
-        ended.set()
-
-    with pytest.raises(error):
-        share(work, 2, 2)
-    assert ended.is_set()
-
-
 def test_an_error_of_a_helper_is_raised():
     has_begun = threading.Event()
 
@@ -86,15 +68,6 @@ def test_an_error_of_a_helper_is_raised():
 
     with pytest.raises(OSError, match='of a helper'):
         share(work, 100, 2)
-
-
-@pytest.mark.skipif(not hasattr(os, 'fork'), reason='processes are not forked')
-def test_a_forked_process_has_threads_of_its_own():
-    assert pool(2).submit(int).result() == 0
-    child = os.fork()
-    if not child:
-        os._exit(pool(2).submit(int, '7').result())
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='threads have no priority of their own')

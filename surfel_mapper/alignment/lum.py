@@ -74,7 +74,7 @@ class LumResult:
     Attributes
     ----------
     converged : bool
-        Whether the last step was below the threshold.
+        Whether the last step was below the threshold; False if all edges were ignored.
     iterations : int
         Number of steps.
     residuals : mapping of (source, target) to float, m
@@ -344,7 +344,7 @@ class LUM:
         counts[list(terms.dropped)] = False
         part = components(self.num_vertices, ends[counts])
         return LumResult(
-            converged=converged,
+            converged=converged and bool(counts.any()),
             iterations=iterations,
             residuals=dict(zip(names, rms.tolist(), strict=True)),
             dropped={names[e]: terms.dropped[e] for e in sorted(terms.dropped)},

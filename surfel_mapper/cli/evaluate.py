@@ -14,7 +14,7 @@ import logging
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import positive_float, positive_int
+from surfel_mapper.cli._arguments import add_bin_columns, positive_float, positive_int
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._verbosity import add_verbosity
 from surfel_mapper.errors import FileFormatError
@@ -47,8 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar='TRUTH',
-        help='a simulated bag, its world.json, a .ply or .pcd of points, or another map; '
-        'for a trajectory another one, or a simulated bag',
+        help='a simulated bag, its world.json, points or a mesh (.ply, .obj, .stl, .glb) in a '
+        'file, or another map; for a trajectory another one, or a simulated bag',
     )
     add(
         '--max-distance',
@@ -81,6 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help='move the map onto the truth first, if frames differ (trajectories always move)',
     )
+    add_bin_columns(parser)
     add('--json', action='store_true', help='print as JSON')
     add_verbosity(parser)
 
@@ -107,15 +108,18 @@ def maps(args: argparse.Namespace) -> dict[str, Any]:
         moved_discs,
     )
     from surfel_mapper.evaluation.map_files import load_discs
+    from surfel_mapper.evaluation.mesh_truth import load_mesh
     from surfel_mapper.evaluation.truth import is_world, load_truth
 
-    surfels = load_discs(args.map, args.min_points)
+    surfels = load_discs(args.map, args.min_points, args.bin_columns)
     truth: Truth
     digests: dict[str, Any] = {}
     if is_world(args.truth):
         truth = load_truth(args.truth)
+    elif (mesh := load_mesh(args.truth)) is not None:
+        truth = mesh
     else:
-        reference = load_discs(args.truth, args.min_points)
+        reference = load_discs(args.truth, args.min_points, args.bin_columns)
         truth = CloudTruth(reference)
         digests = compared_digests(surfels, reference)
     size_m = surfels.voxel_size_m or DEFAULT_M
@@ -197,6 +201,11 @@ def trajectories(args: argparse.Namespace) -> dict[str, Any]:
 def trajectory_lines(result: dict[str, Any]) -> list[str]:
     """Return the errors of a trajectory as lines of text."""
     lines = [f'poses {result["num_poses"]}']
+    if result['on_a_line']:
+        lines.append(
+            'straight drive: its positions do not determine the rotation about it, on which the '
+            'absolute rotation errors depend'
+        )
     for kind in ('absolute', 'relative'):
         moved, turned = result[kind]['translation_m'], result[kind]['rotation_deg']
         lines.append(f'{kind} {in_words(moved, "mm", 1e3)}')

@@ -3,8 +3,8 @@
 """
 Maps in files of any format as discs: position and normal of each surfel.
 
-Reads files and directories of a replay or a merge, and points as PLY or PCD. Exact formats give
-the digest too, so that two maps can be compared to the bit.
+Reads files and directories of a replay or a merge, and points in any format of scans. Exact
+formats give the digest too, so that two maps can be compared to the bit.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files import map_state, parquet, pcd, ply
+from surfel_mapper.files import map_state, parquet
 from surfel_mapper.files.latest_map import DRAWABLE, map_in, TILES
 from surfel_mapper.files.parquet_tiles import read_tiles
+from surfel_mapper.files.scan_files import scan_reader, SUFFIXES
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 Floats = npt.NDArray[np.float64]
@@ -56,7 +57,7 @@ class Discs:
         return len(self.position)
 
 
-def load_discs(path: str | Path, min_points: int) -> Discs:
+def load_discs(path: str | Path, min_points: int, bin_columns: int | None = None) -> Discs:
     """
     Return the surfels of a map in a file, or of the map written last in a directory.
 
@@ -64,9 +65,11 @@ def load_discs(path: str | Path, min_points: int) -> Discs:
     ----------
     path : str or Path
         Output directory of a replay or a merge, a dataset of tiles, or a file: .parquet, .npz,
-        .ply or .pcd.
+        or points in a format of scan_files.py.
     min_points : int
         Points that a voxel needs to count as a surfel, if the file has all voxels.
+    bin_columns : int, optional
+        Number of columns of a .bin; without, that which fits its values.
 
     Raises
     ------
@@ -80,20 +83,17 @@ def load_discs(path: str | Path, min_points: int) -> Discs:
             f'{path}: no map in this directory; expected map/tile_i=*/tile_j=*/ or one of '
             f'{", ".join(form for form in DRAWABLE if form != TILES)}'
         )
-    return of_map(read_tiles(file), min_points) if file.is_dir() else load_file(file, min_points)
-
-
-def load_file(path: Path, min_points: int) -> Discs:
-    """Return the surfels in a file."""
-    if path.suffix == '.parquet':
-        return of_map(parquet.read_map(path), min_points)
-    if path.suffix == '.npz':
-        return of_map(map_state.load_map(path)[0], min_points)
-    if path.suffix == '.ply':
-        return of_columns(path, ply.read_points(path))
-    if path.suffix == '.pcd':
-        return of_columns(path, pcd.read_points(path))
-    raise FileFormatError(f'{path}: expected a directory, .parquet, .npz, .ply or .pcd')
+    if file.is_dir():
+        return of_map(read_tiles(file), min_points)
+    if file.suffix == '.parquet':
+        return of_map(parquet.read_map(file), min_points)
+    if file.suffix == '.npz':
+        return of_map(map_state.load_map(file)[0], min_points)
+    if file.suffix.lower() not in SUFFIXES:
+        raise FileFormatError(
+            f'{path}: expected a directory, .parquet, .npz, or points: {", ".join(SUFFIXES)}'
+        )
+    return of_columns(*scan_reader([file], bin_columns)(file))
 
 
 def of_map(surfel_map: SurfelMap, min_points: int) -> Discs:
@@ -103,10 +103,8 @@ def of_map(surfel_map: SurfelMap, min_points: int) -> Discs:
     return Discs(position, surfels.normal, surfel_map.voxel_size_m, surfel_map.digest())
 
 
-def of_columns(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Discs:
+def of_columns(points: npt.NDArray[Any], columns: Mapping[str, npt.NDArray[Any]]) -> Discs:
     """Return the points of a cloud, with normals scaled to unit length; none if all are zero."""
-    if not {'x', 'y', 'z'} <= set(columns):
-        raise FileFormatError(f'{path}: no x, y, z among {", ".join(columns)}')
     names = next((names for names in NORMALS if set(names) <= set(columns)), None)
     normal = None
     if names is not None:
@@ -115,6 +113,6 @@ def of_columns(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Discs:
             normal /= np.sqrt((normal * normal).sum(axis=1, keepdims=True))
         if not np.isfinite(normal).all(axis=1).any():  # PCL's PointNormal, never filled
             normal = None
-    position = np.stack([columns[name].astype(np.float64) for name in 'xyz'], axis=1)
+    position = np.ascontiguousarray(points, np.float64)
     finite = np.isfinite(position).all(axis=1)
     return Discs(position[finite], None if normal is None else normal[finite])

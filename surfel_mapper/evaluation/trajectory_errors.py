@@ -25,6 +25,9 @@ Floats = npt.NDArray[np.float64]
 DRIFT_SHARES = (0.125, 0.25, 0.5)
 """Lengths of the segments over which drift is measured, as shares of the path."""
 
+STRAIGHT = 1e-3
+"""Width of a straight drive as a share of its length, whatever its errors."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseErrors:
@@ -79,9 +82,10 @@ def compare(
     Returns
     -------
     dict
-        num_poses; absolute (after the best rigid motion) and relative (from pose to pose), each
-        with rmse, mean, median and max of translation_m and rotation_deg; drift_m_per_100m and
-        drift_deg_per_100m.
+        num_poses; on_a_line, whether positions are as near to a line as their errors and so do not
+        determine the motion; absolute (after the best rigid motion) and relative (from pose to
+        pose), each with rmse, mean, median and max of translation_m and rotation_deg;
+        drift_m_per_100m and drift_deg_per_100m.
 
     Raises
     ------
@@ -97,13 +101,25 @@ def compare(
         )
     estimated, true = np.asarray(T_map_estimated)[rows], np.asarray(T_map_true)[true_rows]
     drift_m, drift_deg = drift(estimated, true)
+    absolute = absolute_errors(estimated, true)
+    error_m = float(np.sqrt(np.mean(absolute.translation_m**2)))
+    along_m, across_m = min(map(widths_m, (estimated, true)), key=lambda width: width[1])
     return {
         'num_poses': len(rows),
-        'absolute': absolute_errors(estimated, true).summary(),
+        'on_a_line': across_m <= max(error_m, STRAIGHT * along_m),
+        'absolute': absolute.summary(),
         'relative': relative_errors(estimated, true).summary(),
         'drift_m_per_100m': drift_m,
         'drift_deg_per_100m': drift_deg,
     }
+
+
+def widths_m(T_map_pose: Floats) -> tuple[float, float]:
+    """Return the root mean square distances of positions along their longest axis, and across."""
+    position = T_map_pose[:, :3, 3]
+    values = np.linalg.svd(position - position.mean(axis=0), compute_uv=False)
+    along, across = (*values, 0.0, 0.0)[:2]
+    return float(along) / len(position) ** 0.5, float(across) / len(position) ** 0.5
 
 
 def absolute_errors(

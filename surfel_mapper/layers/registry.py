@@ -62,9 +62,9 @@ def register(
 
     """
     layer = RegisteredLayer(name, location, switch, formats or {})
-    found = _REGISTERED.setdefault(name, layer)
-    if found.location != location:
-        raise ConfigError(f'layer {name!r} of {location}: {found.location} has this name already')
+    first = _REGISTERED.setdefault(name, layer)
+    if first.location != location:
+        raise ConfigError(f'layer {name!r} of {location}: {first.location} has this name already')
 
 
 def unregister(name: str) -> None:
@@ -116,14 +116,14 @@ def load(registered: RegisteredLayer) -> type[Layer]:
     from surfel_mapper.layers.layer import Layer
 
     module, _, name = registered.location.partition(':')
-    found = getattr(import_module(module), name, None)
-    if not (isinstance(found, type) and issubclass(found, Layer)):
+    cls = getattr(import_module(module), name, None)
+    if not (isinstance(cls, type) and issubclass(cls, Layer)):
         raise ConfigError(f'layer {registered.name!r}: {registered.location} is no Layer')
-    if found.name != registered.name:
+    if cls.name != registered.name:
         raise ConfigError(
-            f'layer {registered.name!r}: {registered.location} has the name {found.name!r}'
+            f'layer {registered.name!r}: {registered.location} has the name {cls.name!r}'
         )
-    return found
+    return cls
 
 
 register('dynamic', 'surfel_mapper.layers.dynamic_objects:DynamicObjectsLayer', 'dynamic.clear')

@@ -136,10 +136,10 @@ class SensorModels:
         """
         if self._centered is None or self._centered[0] is not scan:
             T_scan_sensor = self.pose_in(scan)
-            found = scan if T_scan_sensor is None else seen_from(T_scan_sensor, scan)
-            self._centered = scan, found, T_scan_sensor  # all layers get one, checked once
-        _, found, T_scan_sensor = self._centered
-        return found, T_map_scan if T_scan_sensor is None else T_map_scan @ T_scan_sensor
+            centered = scan if T_scan_sensor is None else seen_from(T_scan_sensor, scan)
+            self._centered = scan, centered, T_scan_sensor  # all layers get one, checked once
+        _, centered, T_scan_sensor = self._centered
+        return centered, T_map_scan if T_scan_sensor is None else T_map_scan @ T_scan_sensor
 
     def of(self, scan: Scan) -> CameraModel | LidarModel | None:
         """

@@ -194,24 +194,36 @@ def unpack_keys(key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
     return index
 
 
-MILLIMETRES = (
-    'these points lie kilometres apart, almost each in a voxel of its own: are they millimetres? '
-    'Metres are expected; multiply them by 0.001'
+OTHER_UNIT = (
+    'these points lie hundreds of metres apart, almost each in a voxel of its own: are they '
+    'millimetres or centimetres? Metres are expected; multiply them by 0.001 or 0.01'
 )
-"""The warning about a scan that looks like millimetres."""
+"""The warning about points that look like another unit than metres."""
 
-MANY, ALONE, FAR_M = 100, 0.9, 1000.0
-"""A scan looks like millimetres if it has at least this number of points, as many voxels as this
-share of them, and a median distance from its middle of more than this, m, beyond any lidar."""
+MANY, ALONE, CELL_M, FAR_M = 100, 0.9, 0.5, 150.0
+"""
+Points look like another unit if there are at least this number of them, as many cells as this
+share of them, of this edge, m, and a median distance from their middle of more than this, m: a
+lidar that reaches 200 m measures most points within 50 m, a room in centimetres has some 400.
+"""
 
 
-def looks_like_millimetres(moments: ScanMoments) -> bool:
-    """Return whether the points of a scan are so far apart that their unit may be wrong."""
+def looks_like_other_unit(moments: ScanMoments) -> bool:
+    """Return whether the points of a scan are so far apart that they may be no metres."""
     if not moments.num_voxels >= max(MANY, ALONE * moments.num_points):
         return False
-    index = moments.voxel_index.astype(np.float64)
-    apart = np.linalg.norm(index - np.median(index, axis=0), axis=1)
-    return bool(np.median(apart) * moments.voxel_size_m > FAR_M)
+    position = moments.voxel_index.astype(np.float64) * moments.voxel_size_m
+    return are_far_apart(position, moments.num_points)
+
+
+def are_far_apart(position: npt.NDArray[Any], num_points: int) -> bool:
+    """Return whether positions (K, 3) of points are so far apart that these may be no metres."""
+    if not len(position) >= max(MANY, ALONE * num_points):
+        return False
+    apart_m = np.linalg.norm(position - np.median(position, axis=0), axis=1)
+    if not np.median(apart_m) > FAR_M:
+        return False
+    return len(np.unique(np.floor(position / CELL_M), axis=0)) >= ALONE * num_points
 
 
 def shifted_moments(moments: ScanMoments, voxels: npt.NDArray[np.int64]) -> ScanMoments:

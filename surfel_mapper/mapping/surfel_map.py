@@ -31,8 +31,8 @@ from surfel_mapper.mapping.coarsening import coarse_moments
 from surfel_mapper.mapping.kernels.surfels import derive_covariances
 from surfel_mapper.mapping.moment_map import MAX_LEVEL, MomentMap
 from surfel_mapper.mapping.moments import (
-    looks_like_millimetres,
-    MILLIMETRES,
+    looks_like_other_unit,
+    OTHER_UNIT,
     ScanMoments,
 )
 from surfel_mapper.mapping.reducer import Reducer
@@ -144,9 +144,9 @@ class SurfelMap(MomentMap):
             if origin is None and T_map_sensor.shape == (4, 4):
                 origin = T_map_sensor[:3, 3]
         moments = self.reduce(points, T_map_sensor, origin=origin, columns=columns)
-        if not self._warned_of_units and looks_like_millimetres(moments):
+        if not self._warned_of_units and looks_like_other_unit(moments):
             self._warned_of_units = True
-            _log.warning(MILLIMETRES)
+            _log.warning(OTHER_UNIT)
         beyond = moments.left_out.get('beyond_map', 0)
         if beyond:
             limit = layout.INDEX_OFFSET * self.voxel_size_m

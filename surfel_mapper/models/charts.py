@@ -61,15 +61,15 @@ def chart_components(
     mean_normals(rows, starts, flat, graph.normal, means)
     rules = (math.cos(math.radians(angles_deg[0])), STACKED_VOXELS * graph.map.voxel_size_m)
     find_doubtful(rows, starts, means, graph.normal, graph.position, rules, doubtful)
-    found: list[Rows] = []
+    charts: list[Rows] = []
     for k in range(len(means)):
         members = rows[starts[k] : starts[k + 1]]
         if doubtful[k]:
             ordered = members[np.argsort(graph.key[members])]
-            found += bisected(graph, ordered, rules[0], least)
+            charts += bisected(graph, ordered, rules[0], least)
         else:
-            found.append(members)
-    return without_small_curved(graph, found, angles_deg[1])
+            charts.append(members)
+    return without_small_curved(graph, charts, angles_deg[1])
 
 
 def without_small_curved(
@@ -89,11 +89,11 @@ def bisected(graph: SurfelGraph, members: Rows, limit: float, least: int) -> lis
     """Return the charts of one component whose rows are sorted by key."""
     size_m = graph.map.voxel_size_m
 
-    def side(part: Rows) -> npt.NDArray[np.bool_] | None:
-        return chart_side(graph.normal[part], graph.position[part], limit, size_m)
+    def side(rows: Rows) -> npt.NDArray[np.bool_] | None:
+        return chart_side(graph.normal[rows], graph.position[rows], limit, size_m)
 
     def components(half: Rows) -> list[Rows]:
-        return [part for part in connected_parts(graph, half) if len(part) >= least]
+        return [chart for chart in connected_parts(graph, half) if len(chart) >= least]
 
     return height_fields([members], side, components)
 
@@ -137,8 +137,8 @@ def stacked_side(points: Array, normal: Array, size_m: float) -> npt.NDArray[np.
     x = np.cross(normal, np.eye(3)[least])
     x /= np.linalg.norm(x)
     # voxel indices have 21 bits, so column numbers are unique
-    row, place = points @ x / size_m, points @ np.cross(normal, x) / size_m
-    column = np.floor(row) * 2.0**26 + np.floor(place)
+    row, across = points @ x / size_m, points @ np.cross(normal, x) / size_m
+    column = np.floor(row) * 2.0**26 + np.floor(across)
     order = np.argsort(column, kind='stable')
     first = np.flatnonzero(np.diff(column[order], prepend=np.nan) != 0.0)
     ordered = heights[order]
@@ -151,7 +151,7 @@ def stacked_side(points: Array, normal: Array, size_m: float) -> npt.NDArray[np.
 def connected_parts(graph: SurfelGraph, rows: Rows) -> list[Rows]:
     """Return the connected components of rows, each in the order of the rows."""
     parent = np.empty(len(rows), np.int64)
-    connected_components(rows, graph.links, graph.neighbours, graph.places, parent)
+    connected_components(rows, graph.links, graph.neighbours, graph.index_of, parent)
     if not parent.any():  # the usual case: one component
         return [rows]
     order = np.argsort(parent, kind='stable')

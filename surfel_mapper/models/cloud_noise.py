@@ -54,8 +54,8 @@ def estimate_noise(
     """
     Return the noise of the points as n0, m, and n2, 1/m: sigma is n0 + n2 range^2.
 
-    Single voxels clip noise of more than a tenth of a voxel, blocks of three that of more than a
-    third (see CLIPPING), but these contain edges and corners, which are no noise.
+    Single voxels clip noise of more than a tenth of a voxel. Blocks of three clip noise of more
+    than a third (see CLIPPING), but they contain edges and corners, which are no noise.
     """
     rows = np.flatnonzero(core)
     seeds = rows[:: max(len(rows) // BLOCKS, 1)]
@@ -63,17 +63,17 @@ def estimate_noise(
     for alone in (True, False):
         blocks = seeds[:, None] if alone else neighbourhoods(voxels, seeds)
         sigma = block_noise(voxels, blocks, view)
-        known = sigma >= 0.0
-        enough = known.sum() >= max(LEAST_ALONE * len(seeds), 1.0)
-        if alone and enough and np.median(sigma[known]) < CLIPPED_VOXELS * size_m:
+        valid = sigma >= 0.0
+        enough = valid.sum() >= max(LEAST_ALONE * len(seeds), 1.0)
+        if alone and enough and np.median(sigma[valid]) < CLIPPED_VOXELS * size_m:
             break
-    range_sq, sigma = range_sq[known], sigma[known]
+    range_sq, sigma = range_sq[valid], sigma[valid]
     if not len(sigma):
         return 0.0, 0.0
     bins = NOISE_BINS if len(sigma) >= 10 * NOISE_BINS else 1
-    parts = np.array_split(np.argsort(range_sq, kind='stable'), bins)
-    x = np.array([np.median(range_sq[part]) for part in parts])
-    y = np.array([np.quantile(sigma[part], NOISE_QUANTILE) for part in parts])
+    groups = np.array_split(np.argsort(range_sq, kind='stable'), bins)
+    x = np.array([np.median(range_sq[group]) for group in groups])
+    y = np.array([np.quantile(sigma[group], NOISE_QUANTILE) for group in groups])
     y *= 1.0 + CLIPPING * (y / size_m) ** 2
     return line_above_zero(x, y)
 
@@ -83,8 +83,8 @@ def neighbourhoods(voxels: VoxelPoints, seeds: Indices) -> Indices:
     first, near = voxels.adjacent
     numbers = first[seeds + 1] - first[seeds]
     column = np.arange(int(numbers.max(initial=0)) + 1)
-    place = np.minimum(first[seeds][:, None] + column, max(len(near) - 1, 0))
-    blocks = np.where(column < numbers[:, None], near[place], -1).astype(np.int64)
+    index = np.minimum(first[seeds][:, None] + column, max(len(near) - 1, 0))
+    blocks = np.where(column < numbers[:, None], near[index], -1).astype(np.int64)
     blocks[np.arange(len(seeds)), numbers] = seeds
     return blocks
 
@@ -137,11 +137,11 @@ def sampled(voxels: VoxelPoints, blocks: Indices, most: int) -> tuple[Array, Arr
     ends = counts.cumsum(axis=1)
     total = ends[:, -1:]
     stride = 1 + (total - 1) // most
-    place = np.minimum(np.arange(most) * stride, np.maximum(total - 1, 0))
-    column = (place[:, :, None] >= ends[:, None, :]).sum(axis=2)
+    rank = np.minimum(np.arange(most) * stride, np.maximum(total - 1, 0))
+    column = (rank[:, :, None] >= ends[:, None, :]).sum(axis=2)
     row = np.arange(len(blocks))[:, None]
     column = np.minimum(column, blocks.shape[1] - 1)
-    rows = starts[blocks[row, column]] + place - (ends - counts)[row, column]
+    rows = starts[blocks[row, column]] + rank - (ends - counts)[row, column]
     weight = (np.arange(most) * stride < total).astype(np.float64)
     return voxels.points[rows].astype(np.float64), weight
 
@@ -160,8 +160,8 @@ def trimmed_sigma(points: Array, weight: Array) -> Array:
     """
     x, y, z = np.moveaxis(points, 2, 0)
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2)
-    held = weight.sum(axis=1).astype(np.int64)
-    middle = np.stack([(held - 1) // 2, held // 2], axis=1)
+    counts = weight.sum(axis=1).astype(np.int64)
+    middle = np.stack([(counts - 1) // 2, counts // 2], axis=1)
     used = weight
     for turn in range(TRIMMING_ROUNDS + 1):
         weighted = basis * used[:, :, None]
@@ -178,8 +178,8 @@ def trimmed_sigma(points: Array, weight: Array) -> Array:
         inside = weight * (away <= 3.0 * MEDIAN_TO_SIGMA * median[:, None])
         enough = inside.sum(axis=1) >= LEAST_BLOCK
         used = np.where(enough[:, None], inside, used)
-    found: Array = np.sqrt((used * away**2).sum(axis=1) / (number - 6.0))
-    return found
+    sigma: Array = np.sqrt((used * away**2).sum(axis=1) / (number - 6.0))
+    return sigma
 
 
 def line_above_zero(x: Array, y: Array) -> tuple[float, float]:
@@ -192,9 +192,9 @@ def line_above_zero(x: Array, y: Array) -> tuple[float, float]:
     design = np.stack([np.ones_like(x), x], axis=1) * weight[:, None]
     best, least = (0.0, 0.0), math.inf
     for used in ([0], [0, 1], [1]):
-        part = np.zeros(2)
-        part[used] = np.linalg.lstsq(design[:, used], y * weight, rcond=None)[0]
-        error = float(((design @ part - y * weight) ** 2).sum())
-        if (part >= 0.0).all() and error < least - 1e-12:
-            best, least = (float(part[0]), float(part[1])), error
+        terms = np.zeros(2)
+        terms[used] = np.linalg.lstsq(design[:, used], y * weight, rcond=None)[0]
+        error = float(((design @ terms - y * weight) ** 2).sum())
+        if (terms >= 0.0).all() and error < least - 1e-12:
+            best, least = (float(terms[0]), float(terms[1])), error
     return best

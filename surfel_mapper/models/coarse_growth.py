@@ -98,16 +98,16 @@ def grow_coarse(
 
     """
     coarse = thin(points, size_m).by_voxel()
-    before = owner[coarse.rows]
-    after, (normals, curved) = extended(coarse, before, shape, size_m, rules, facets)
-    pieces = pieces_of(coarse, owner_table(coarse, after), len(normals))
+    old_owner = owner[coarse.rows]
+    new_owner, (normals, curved) = extended(coarse, old_owner, shape, size_m, rules, facets)
+    pieces = pieces_of(coarse, owner_table(coarse, new_owner), len(normals))
     view = beyond(pieces, normals) if rules.view is None else rules.view
     index, normals, bent = join_patches(pieces, view, rules.noise, rules.finest_m)
     # coarse voxels resolve less: a curved patch stays so, unless a larger plane takes it
-    held = np.bincount(after[after >= 0], minlength=len(curved))
-    total = np.bincount(index, held, len(normals))
-    curved = bent | (2.0 * np.bincount(index, held * curved, len(normals)) > total)
-    owner[coarse.rows] = np.where(after < 0, before, np.append(index, 0)[after])
+    counts = np.bincount(new_owner[new_owner >= 0], minlength=len(curved))
+    total = np.bincount(index, counts, len(normals))
+    curved = bent | (2.0 * np.bincount(index, counts * curved, len(normals)) > total)
+    owner[coarse.rows] = np.where(new_owner < 0, old_owner, np.append(index, 0)[new_owner])
     return normals, curved
 
 
@@ -126,9 +126,9 @@ def extend_coarse(
     large patches of all kinds touch, so that joins are wrong as often as not.
     """
     coarse = thin(points, size_m).by_voxel()
-    before = owner[coarse.rows]
-    after, shape = extended(coarse, before, shape, size_m, rules, facets)
-    owner[coarse.rows] = np.where(after < 0, before, after)
+    old_owner = owner[coarse.rows]
+    new_owner, shape = extended(coarse, old_owner, shape, size_m, rules, facets)
+    owner[coarse.rows] = np.where(new_owner < 0, old_owner, new_owner)
     return shape
 
 
@@ -141,15 +141,15 @@ def extended(
     facets: ModelsConfig | None,
 ) -> tuple[Owners, Shape]:
     """Return the patches of points by voxel, -1 for none, after growth; see grow_coarse."""
-    (normals, curved), after = shape, np.maximum(owner, -1)
+    (normals, curved), new_owner = shape, np.maximum(owner, -1)
     if size_m > rules.finest_m:
-        extend_planes(coarse, after, curved, (size_m, rules.tolerance_m))
+        extend_planes(coarse, new_owner, curved, (size_m, rules.tolerance_m))
     if facets is not None:
-        sizes = size_m, facet_tolerance(coarse, after, size_m, rules)
-        found = add_facets(coarse, after, len(normals), sizes, facets)
-        normals = np.concatenate([normals, found])
-        curved = np.append(curved, np.zeros(len(found), np.bool_))
-    return after, (normals, curved)
+        sizes = size_m, facet_tolerance(coarse, new_owner, size_m, rules)
+        facet_normals = add_facets(coarse, new_owner, len(normals), sizes, facets)
+        normals = np.concatenate([normals, facet_normals])
+        curved = np.append(curved, np.zeros(len(facet_normals), np.bool_))
+    return new_owner, (normals, curved)
 
 
 def facet_tolerance(

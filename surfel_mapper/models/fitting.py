@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+import logging
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import AXIS_BITS, KEY_BITS
 from surfel_mapper.kernels.selection import copy_ranges, number_ranges
+from surfel_mapper.mapping.moments import are_far_apart, OTHER_UNIT
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.cloud_noise import estimate_noise
 from surfel_mapper.models.coarse_growth import (
@@ -54,6 +56,8 @@ from surfel_mapper.models.segmentation import (
     thickness,
 )
 from surfel_mapper.models.thinning import thin, Thinned
+
+_log = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -112,6 +116,8 @@ def fit(
         raise ModelError(f'viewpoint: {viewpoint!r}, expected three finite numbers')
     laps = [clock()]
     thinned = thin(points.reshape(-1, 3), config.voxel_size_m)
+    if are_far_apart(thinned.means, len(thinned.rows)):
+        _log.warning(OTHER_UNIT)
     laps.append(clock())
     grows = not is_paper(config) and config.kinds == 'all' and len(thinned.means) > 0
     model = (fit_points if grows else fit_means)(thinned, config, view, laps)

@@ -43,13 +43,13 @@ def means_and_scatters(
     """
     sums = np.empty((len(starts) - 1, 10))
     group_moments(points, weights, starts, sums)
-    held = sums[:, 0] > 0.0
-    away = sums[:, 1:4] / np.where(held, sums[:, 0], 1.0)[:, None]
+    has_weight = sums[:, 0] > 0.0
+    away = sums[:, 1:4] / np.where(has_weight, sums[:, 0], 1.0)[:, None]
     scatters = sums[:, 4:][:, PACKED] - sums[:, 1:4, None] * away[:, None, :]
     diagonal = np.arange(3)
     scatters[:, diagonal, diagonal] = np.maximum(scatters[:, diagonal, diagonal], 0.0)
     means = np.zeros_like(away)
-    means[held] = points[starts[:-1][held]] + away[held]
+    means[has_weight] = points[starts[:-1][has_weight]] + away[has_weight]
     return sums[:, 0], means, scatters
 
 

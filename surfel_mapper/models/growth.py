@@ -221,8 +221,8 @@ def renamed(starts: Indices, group: Owners, index: Owners, owner: Owners) -> Own
     starts: first owner of each voxel, (V + 1,)
     """
     free = -1 - np.repeat(group, np.diff(starts))
-    found: Owners = np.where(owner >= 0, np.append(index, 0)[owner], free).astype(np.int32)
-    return found
+    names: Owners = np.where(owner >= 0, np.append(index, 0)[owner], free).astype(np.int32)
+    return names
 
 
 def grown(
@@ -258,9 +258,9 @@ def sorted_table(
 ) -> tuple[Indices, npt.NDArray[np.int32], Array, Array]:
     """Return starts (number + 1,), voxels, means and counts by owner, from owner least on."""
     owners, means, counts, first = table
-    held = int((owners >= least).sum())
+    size = int((owners >= least).sum())
     starts = np.empty(number + 1, np.int64)
-    out = starts, np.empty(held, np.int32), np.empty((held, 3)), np.empty(held)
+    out = starts, np.empty(size, np.int32), np.empty((size, 3)), np.empty(size)
     sort_owners(first, owners, means, counts, least, out)
     return out
 
@@ -319,10 +319,10 @@ def extend_planes(
     order = order[~curved[patch[order]]]
     label[voxel[order]] = patch[order]
     free = free_surfels(voxels, owner, *sizes)
-    found = np.empty_like(owner)
-    extend_patches(voxels, label, (planes[label], tolerance), free, found)
-    rows = np.flatnonzero((owner < 0) & (found >= 0))
-    on = found[rows]
+    grown = np.empty_like(owner)
+    extend_patches(voxels, label, (planes[label], tolerance), free, grown)
+    rows = np.flatnonzero((owner < 0) & (grown >= 0))
+    on = grown[rows]
     away = np.einsum('ij,ij->i', voxels.points[rows], planes[on, :3]) + planes[on, 3]
     near = np.abs(away) < tolerance[on]
     owner[rows[near]] = on[near]
@@ -397,8 +397,8 @@ def tolerances(
     order = np.argsort(who, kind='stable')
     ends = np.searchsorted(who[order], np.arange(1, number))
     sigma = [
-        1.4826 * float(np.median(part)) if len(part) else 0.0
-        for part in np.split(distance[order], ends)
+        1.4826 * float(np.median(group)) if len(group) else 0.0
+        for group in np.split(distance[order], ends)
     ][:number]
     own = TOLERANCE_SIGMAS * np.array(sigma) + TOLERANCE_VOXELS * size_m
     most = np.maximum(MOST_TOLERANCE_VOXELS * size_m, TOLERANCE_SIGMAS * noise)

@@ -60,10 +60,10 @@ def match(old_ids: Ids, labels: Ids, starts: Ids, next_id: int) -> IdMatches:
     """
     num = len(starts) - 1
     of_voxel = np.repeat(np.arange(num), np.diff(starts))
-    place = np.searchsorted(old_ids, labels)
-    known = place < len(old_ids)
-    known[known] = old_ids[place[known]] == labels[known]
-    pairs, shared = np.unique(place[known] * max(num, 1) + of_voxel[known], return_counts=True)
+    index = np.searchsorted(old_ids, labels)
+    is_old = index < len(old_ids)
+    is_old[is_old] = old_ids[index[is_old]] == labels[is_old]
+    pairs, shared = np.unique(index[is_old] * max(num, 1) + of_voxel[is_old], return_counts=True)
     best = np.lexsort((pairs, -shared))
     ids, heirs, origins = [-1] * num, dict.fromkeys(old_ids.tolist(), -1), [-1] * num
     ranked = [divmod(pair, max(num, 1)) for pair in pairs[best].tolist()]

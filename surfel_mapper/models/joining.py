@@ -148,20 +148,20 @@ def described(
 
     state: means, weights and starts of the pieces
     """
-    held = regions.rows > 0  # patches without points are in no region
-    names = np.flatnonzero(held & (regions.root == np.arange(len(held))))
-    normals, found = np.empty((len(names), 3)), np.empty((len(names), 4))
+    has_points = regions.rows > 0  # patches without points are in no region
+    names = np.flatnonzero(has_points & (regions.root == np.arange(len(has_points))))
+    normals, figures = np.empty((len(names), 3)), np.empty((len(names), 4))
     floor = (FLOOR_VOXELS * size_m) ** 2
     limits = CURVED_GAIN, math.radians(LEAST_TURN_DEG), LEAST_BEND_VOXELS * size_m
-    places = *state, chunk_boxes(state[0]), floor
-    describe_regions(names, places, regions, limits, normals, found)
+    context = *state, chunk_boxes(state[0]), floor
+    describe_regions(names, context, regions, limits, normals, figures)
     index = np.searchsorted(names, regions.root).astype(np.int32)
-    gains, turns, bends = (found[:, :3] > limits).T
+    gains, turns, bends = (figures[:, :3] > limits).T
     curved = gains & turns & bends
     points, every = regions.patch_points, len(names) + 1
     squares = np.bincount(index, points * regions.patch_sigma**2, every)[:-1]
     own = np.sqrt(squares / np.bincount(index, points, every)[:-1])
-    is_worse = found[:, 3] > np.maximum(MOST_WORSE * own, UNRESOLVED_VOXELS * size_m)
+    is_worse = figures[:, 3] > np.maximum(MOST_WORSE * own, UNRESOLVED_VOXELS * size_m)
     is_worse &= ~curved & (np.bincount(index, minlength=every)[:-1] > 1)
     return index, normals, curved, is_worse
 
@@ -183,7 +183,7 @@ def single_regions(
     floor = (FLOOR_VOXELS * size_m) ** 2
     return Regions(
         root=np.arange(number),
-        after=np.full(number, -1),
+        next_patch=np.full(number, -1),
         last=np.arange(number),
         patches=np.ones(number, np.int64),
         rows=counts,
@@ -210,16 +210,16 @@ def layers(pairs: Indices, pieces: Pieces, regions: Regions) -> Indices:
     a, b, touch = pairs.T
     points = regions.patch_points
     is_layer = (touch >= LAYER_SHARE * np.diff(pieces.starts)[a]) & (points[a] < points[b])
-    found = pairs[is_layer, :2]
-    return found[np.argsort(-points[found[:, 1]], kind='stable')]
+    chosen = pairs[is_layer, :2]
+    return chosen[np.argsort(-points[chosen[:, 1]], kind='stable')]
 
 
 def touching_regions(pairs: Indices, root: Indices) -> tuple[Indices, tuple[Indices, Indices]]:
     """Return pairs (E, 2) of touching regions, and as first (K + 1,) and others (2 E,)."""
     number = len(root)
     ends = np.sort(root[pairs[:, :2]], axis=1)
-    code, place = np.unique(ends[:, 0] * number + ends[:, 1], return_inverse=True)
-    voxels = np.bincount(place.reshape(-1), pairs[:, 2], len(code))
+    code, edge = np.unique(ends[:, 0] * number + ends[:, 1], return_inverse=True)
+    voxels = np.bincount(edge.reshape(-1), pairs[:, 2], len(code))
     edges = np.stack(np.divmod(code, max(number, 1)), axis=1)
     edges = edges[(voxels >= 2 * LEAST_TOUCH) & (edges[:, 0] != edges[:, 1])]
     both = np.concatenate([edges, edges[:, ::-1]])

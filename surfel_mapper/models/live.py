@@ -175,7 +175,7 @@ class LiveModels:
             bend /= size_m
             points = np.stack([x, y, bend * x * x], -1).reshape(-1, 3)
             far = 10.0 * points[::10] + 50.0 * size_m  # sparse: patches grow in coarse voxels
-            moments = [surfel_map.add(part) for part in (points, points[:20] + 0.1 * size_m, far)]
+            moments = [surfel_map.add(xyz) for xyz in (points, points[:20] + 0.1 * size_m, far)]
             models.update()
             Shapes().of(models.model, models.versions)
             ellipsoid_corners(models.model.gaussians)
@@ -218,7 +218,7 @@ class LiveModels:
         single = (graph.kind == FLAT) & (graph.component < 0)
         apart = rows[: rows_of_groups(graph.component, flags, single, rows)].copy()
         parent = np.empty(len(apart), np.int64)
-        connected_components(apart, graph.links, graph.neighbours, graph.places, parent)
+        connected_components(apart, graph.links, graph.neighbours, graph.index_of, parent)
         name_components(apart, parent, graph.key, graph.component)
         number = np.full(size, -1, np.int32)
         number[apart] = graph.component[apart]
@@ -235,7 +235,7 @@ class LiveModels:
         """Return the patch of each row, -1 for none: charts with what they grow over, joined."""
         graph = self._graph
         owner = np.full(len(graph.key), -1, np.int32)
-        charts = [chart for parts in self._charts.values() for chart in parts]
+        charts = [chart for group in self._charts.values() for chart in group]
         if charts:
             owner[np.concatenate(charts)] = np.repeat(np.arange(len(charts)), [*map(len, charts)])
         hosted = np.flatnonzero(graph.host >= 0)
@@ -246,7 +246,7 @@ class LiveModels:
         """Return rows with a group sorted by it, and the start of each group."""
         rows = np.flatnonzero(group >= 0).astype(np.int32)
         ordered, starts = np.empty_like(rows), np.empty(len(rows) + 1, np.int64)
-        num = sort_by_group(rows, group, self._graph.places, ordered, starts)
+        num = sort_by_group(rows, group, self._graph.index_of, ordered, starts)
         return ordered, starts[: num + 1]
 
     def _matched(self, members: Rows, ends: Indices) -> tuple[Indices, IdMatches]:
@@ -255,15 +255,15 @@ class LiveModels:
         common_labels(labels, ends, ids)
         sizes = np.diff(ends)
         for k, number in enumerate(ids.tolist()):
-            known = self._patches.get(number)
-            if known is None or len(known.rows) != sizes[k]:
+            tracked = self._patches.get(number)
+            if tracked is None or len(tracked.rows) != sizes[k]:
                 ids[k] = -1
-        other = ids < 0
+        changed = ids < 0
         old = np.array(sorted(self._patches.keys() - set(ids.tolist())), np.int64)
-        starts = np.concatenate([[0], np.cumsum(sizes[other])])
-        others = labels[np.repeat(other, sizes)].astype(np.int64)
-        matched = match(old, others, starts, self._next_id)
-        ids[other] = matched.ids
+        starts = np.concatenate([[0], np.cumsum(sizes[changed])])
+        old_labels = labels[np.repeat(changed, sizes)].astype(np.int64)
+        matched = match(old, old_labels, starts, self._next_id)
+        ids[changed] = matched.ids
         return ids, matched
 
     def _relabel(
@@ -271,28 +271,28 @@ class LiveModels:
     ) -> tuple[list[int], list[int], list[int]]:
         """Label all voxels; return Gaussians created, changed and removed."""
         graph = self._graph
-        before, was_gaussian, kind = graph.label.copy(), graph.is_gaussian, graph.own_kind
+        old_label, was_gaussian, kind = graph.label.copy(), graph.is_gaussian, graph.own_kind
         graph.label[:] = -1
         graph.label[members] = np.repeat(ids, np.diff(ends))
         now_gaussian = (graph.label < 0) & (kind != YOUNG) & (kind != NONE)
         new = np.flatnonzero(now_gaussian & ~was_gaussian)
-        before[new] = self._next_id + np.arange(len(new))
+        old_label[new] = self._next_id + np.arange(len(new))
         self._next_id += len(new)
         rows = np.flatnonzero(now_gaussian)
-        graph.label[rows] = before[rows]
-        changed = before[now_gaussian & was_gaussian & graph.is_material]
-        died = before[was_gaussian & ~now_gaussian]
+        graph.label[rows] = old_label[rows]
+        changed = old_label[now_gaussian & was_gaussian & graph.is_material]
+        died = old_label[was_gaussian & ~now_gaussian]
         graph.is_gaussian = now_gaussian
-        return before[new].tolist(), changed.tolist(), died.tolist()
+        return old_label[new].tolist(), changed.tolist(), died.tolist()
 
     def _refit(self, members: Rows, ends: Indices, ids: Indices, matched: IdMatches) -> list[int]:
         """Refit patches with material changes; return the ids of those that existed."""
-        others = set(matched.ids)
+        assigned = set(matched.ids)
         is_material = np.logical_or.reduceat(self._graph.is_material[members], ends[:-1])
         chosen = {
             number: members[ends[k] : ends[k + 1]].copy()  # a view would keep all members
             for k, (number, matters) in enumerate(zip(ids.tolist(), is_material, strict=True))
-            if matters or number in others
+            if matters or number in assigned
         }
         existed = [number for number in chosen if number in self._patches]
         groups = self._fitter.describe(list(chosen.values()))
@@ -310,9 +310,9 @@ class LiveModels:
     def _fit(self, ids: list[int], groups: Described, beyond: dict[int, Rows]) -> None:
         """Fit patches anew."""
         none: Rows = np.empty(0, np.int32)
-        before = [self._patches.get(number) for number in ids]
-        parts = [beyond.get(number, none) for number in ids]
-        for tracked in self._fitter.fit(ids, groups, before, parts) if ids else ():
+        previous = [self._patches.get(number) for number in ids]
+        extra = [beyond.get(number, none) for number in ids]
+        for tracked in self._fitter.fit(ids, groups, previous, extra) if ids else ():
             self._patches[tracked.patch.id] = tracked
 
     def _count(self, created: list[int], changed: list[int], removed: list[int]) -> None:

@@ -284,9 +284,9 @@ class MultiModel:
         step_m = self.voxel_size_m if step_m is None else as_real('step_m', step_m)
         if not 0.0 < step_m < math.inf:
             raise ValueError(f'step_m: {step_m:g}, expected a positive distance, m')
-        parts = [patch.samples(step_m) for patch in self.patches]
+        samples = [patch.samples(step_m) for patch in self.patches]
         counts = self.gaussians.sample_counts(self.voxel_size_m)
-        return np.concatenate([*parts, self.gaussians.samples(seed, counts)])
+        return np.concatenate([*samples, self.gaussians.samples(seed, counts)])
 
     def evaluate(self, reference: npt.NDArray[Any], seed: int = 0) -> Evaluation:
         """

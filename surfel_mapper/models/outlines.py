@@ -68,18 +68,18 @@ def triangles(patch: Plane) -> tuple[Array, npt.NDArray[np.int64]]:
     return patch.lifted(patch.grid.origin + side_m * np.argwhere(lattice)), faces
 
 
-def covered_squares(grid: Grid, parts: int) -> tuple[npt.NDArray[np.bool_], float]:
+def covered_squares(grid: Grid, divisions: int) -> tuple[npt.NDArray[np.bool_], float]:
     """
     Return which squares of divided cells are covered, and their edge, m.
 
     If no square is, they are halved: a small patch may be in the corners of its cells only. Cuts
     leave a 255th of a cell, so this ends.
     """
-    mask = grid.mask(parts)
+    mask = grid.mask(divisions)
     while not mask.any() and grid.filled.any():
-        parts *= 2
-        mask = grid.mask(parts)
-    return mask, grid.pitch_m / parts
+        divisions *= 2
+        mask = grid.mask(divisions)
+    return mask, grid.pitch_m / divisions
 
 
 def rings(mask: npt.NDArray[np.bool_]) -> list[Array]:
@@ -126,17 +126,17 @@ def triangulated(rings: Sequence[Array]) -> Array:
     """
     starts, stops = sloped_sides(rings)
     heights = np.stack([starts[:, 1], stops[:, 1]])
-    levels, place = np.unique(heights, return_inverse=True)
-    lowest, highest = np.sort(place.reshape(2, -1), axis=0)
-    left, right, low, high = trapezoids((starts, stops), levels, lowest, highest)
+    levels, index = np.unique(heights, return_inverse=True)
+    lowest, highest = np.sort(index.reshape(2, -1), axis=0)
+    first, second, low, high = trapezoids((starts, stops), levels, lowest, highest)
 
     def corner(side: Indices, level: Indices) -> Array:
         return np.stack([sides_x(starts, stops, side, levels[level]), levels[level]], axis=1)
 
-    a, b = corner(left, low), corner(right, low)
-    c, d = corner(right, high), corner(left, high)
-    found = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    return found[areas(found) > 0.0]
+    a, b = corner(first, low), corner(second, low)
+    c, d = corner(second, high), corner(first, high)
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return triangles[areas(triangles) > 0.0]
 
 
 def sloped_sides(rings: Sequence[Array]) -> tuple[Array, Array]:
@@ -180,14 +180,14 @@ def trapezoids(
     slab = np.arange(len(side)) + np.repeat(highest - np.cumsum(spans), spans)
     x = sides_x(*sides, side, 0.5 * (levels[slab] + levels[slab + 1]))
     order = np.lexsort((side, x, slab))
-    left, right, slab = side[order[::2]], side[order[1::2]], slab[order[::2]]
-    order = np.lexsort((slab, right, left))
-    left, right, slab = left[order], right[order], slab[order]
+    a, b, slab = side[order[::2]], side[order[1::2]], slab[order[::2]]
+    order = np.lexsort((slab, b, a))
+    a, b, slab = a[order], b[order], slab[order]
     is_new = np.ones(len(slab), np.bool_)
-    is_new[1:] = (left[1:] != left[:-1]) | (right[1:] != right[:-1]) | (slab[1:] != slab[:-1] + 1)
+    is_new[1:] = (a[1:] != a[:-1]) | (b[1:] != b[:-1]) | (slab[1:] != slab[:-1] + 1)
     is_last = np.ones(len(slab), np.bool_)
     is_last[:-1] = is_new[1:]
-    return left[is_new], right[is_new], slab[is_new], slab[is_last] + 1
+    return a[is_new], b[is_new], slab[is_new], slab[is_last] + 1
 
 
 def areas(triangles: Array) -> Array:
@@ -214,14 +214,14 @@ def bridged(rings: Sequence[Array]) -> Array:
     starts = np.cumsum([0, *map(len, ordered)])
     corners = np.concatenate(ordered)
     bridges = nearest_corners(corners, starts)
-    after = np.arange(1, len(corners) + 1)
-    after[starts[1:] - 1] = starts[:-1]
-    before, ways = np.argsort(after).tolist(), after.tolist()
+    following = np.arange(1, len(corners) + 1)
+    following[starts[1:] - 1] = starts[:-1]
+    preceding, ways = np.argsort(following).tolist(), following.tolist()
     for host, entry in bridges:  # to the entry, around its ring, and back by copies of both
-        ways[before[entry]] = len(ways)
+        ways[preceding[entry]] = len(ways)
         ways += [len(ways) + 1, ways[host]]
         ways[host] = entry
-    copies = [place for host, entry in bridges for place in (entry, host)]
+    copies = [corner for host, entry in bridges for corner in (entry, host)]
     order = [0]
     while len(order) < len(ways):
         order.append(ways[order[-1]])
@@ -246,13 +246,13 @@ def nearest_corners(corners: Array, starts: npt.NDArray[np.int64]) -> list[tuple
     """
     from scipy.spatial import cKDTree  # 0.4 s that mapping without models saves
 
-    found: list[tuple[int, int]] = []
-    known, number = 1, len(starts) - 1
-    while known < number:
-        some = starts[known : known + max(known // 4, 1) + 1]
+    bridges: list[tuple[int, int]] = []
+    num_joined, number = 1, len(starts) - 1
+    while num_joined < number:
+        some = starts[num_joined : num_joined + max(num_joined // 4, 1) + 1]
         apart, host = cKDTree(corners[: some[0]]).query(corners[some[0] : some[-1]])
         for first, end in pairwise((some - some[0]).tolist()):
-            place = first + int(apart[first:end].argmin())
-            found.append((int(host[place]), int(some[0]) + place))
-        known += len(some) - 1
-    return found
+            corner = first + int(apart[first:end].argmin())
+            bridges.append((int(host[corner]), int(some[0]) + corner))
+        num_joined += len(some) - 1
+    return bridges

@@ -112,8 +112,8 @@ def shape_of(patch: Plane) -> PatchShape:
     if isinstance(patch, Surface):
         vertices, faces = triangles(patch)
     else:
-        places, faces = indexed(triangulated(local_rings))
-        vertices = patch.lifted(places)
+        xy, faces = indexed(triangulated(local_rings))
+        vertices = patch.lifted(xy)
     rings = [patch.lifted(rim) for rim in local_rings]
     local = np.concatenate([patch.to_local(vertices), *map(patch.to_local, rings)])
     low, high = local.min(axis=0), local.max(axis=0)

@@ -138,7 +138,7 @@ class SurfelGraph:
         self.kind = self.own_kind = self.level = np.empty(0, np.uint8)
         self.links = np.empty(0, np.uint64)
         self.neighbours = np.empty((0, len(self._neighbour_steps)), np.int32)
-        self.host, self.component, self.label, self.places = (none,) * 4
+        self.host, self.component, self.label, self.index_of = (none,) * 4
         self.is_gaussian = self.is_material = np.empty(0, np.bool_)
         self._marks = self._is_here = np.empty(0, np.bool_)
         self._reported_position, self._reported_normal = np.empty((2, 0, 3))
@@ -151,15 +151,15 @@ class SurfelGraph:
         self._version, self._is_stale = self.map.version, False
         self._make_room(int(changed.max(initial=-1)) + 1)
         new, old = self.map.keys_of(changed), self.key[changed]
-        left, here = changed[(old >= 0) & (old != new)], changed[new >= 0]
-        gone = forgotten.joined(self._gone(left))
+        vacated, filled = changed[(old >= 0) & (old != new)], changed[new >= 0]
+        gone = forgotten.joined(self._gone(vacated))
         relinked = [gone.component]
-        near = self.neighbours[left]
+        near = self.neighbours[vacated]
         marked = np.empty(len(self.key), np.int32)
-        num = unlink(left, self.neighbours, self.links, self._marks, marked)
-        self._blank(left)
-        came = here[self.key[here] < 0]
-        self.key[here] = new[new >= 0]
+        num = unlink(vacated, self.neighbours, self.links, self._marks, marked)
+        self._blank(vacated)
+        came = filled[self.key[filled] < 0]
+        self.key[filled] = new[new >= 0]
         gone.return_to(came, self.key, self.label, self.is_gaussian)
         keys = (self.key[came][:, None] + self._neighbour_steps).ravel()
         link_neighbours(
@@ -167,32 +167,32 @@ class SurfelGraph:
             self.map.find(keys).reshape(len(came), len(self._neighbour_steps)),
             self.neighbours,
         )
-        changed, here = here, self._around(here, near, 1)
-        here, was = self._measure(changed, here)
-        is_flat = self.kind[here] == FLAT
-        relinked.append(self.component[here[(was == FLAT) != is_flat]])
-        touched = self.component[here]
-        self.component[here[~is_flat]] = -1
-        relinked.append(self._relinked(here, marked, num))
-        self._find_hosts(here, near)
+        changed, filled = filled, self._around(filled, near, 1)
+        filled, was = self._measure(changed, filled)
+        is_flat = self.kind[filled] == FLAT
+        relinked.append(self.component[filled[(was == FLAT) != is_flat]])
+        touched = self.component[filled]
+        self.component[filled[~is_flat]] = -1
+        relinked.append(self._relinked(filled, marked, num))
+        self._find_hosts(filled, near)
         return GraphChange(
             num_voxels=len(changed) + len(gone.key),
-            rows=here,
+            rows=filled,
             relinked=unique_components(relinked),
             touched=unique_components([touched]),
             gone=gone.remaining,
         )
 
-    def _relinked(self, here: Rows, marked: Rows, num: int) -> Rows:
+    def _relinked(self, changed: Rows, marked: Rows, num: int) -> Rows:
         """
         Link changed voxels; return the components of all voxels whose links changed.
 
         The first ``num`` rows of ``marked`` are those that ``unlink`` has marked already.
         """
-        self._is_here[here] = True
+        self._is_here[changed] = True
         state = (self.kind, self.position, self.normal, self.own_kind)
         num = update_links(
-            here,
+            changed,
             self._is_here,
             self.neighbours,
             state,
@@ -202,23 +202,23 @@ class SurfelGraph:
             marked,
             num,
         )
-        self._is_here[here] = self._marks[marked[:num]] = False
+        self._is_here[changed] = self._marks[marked[:num]] = False
         return self.component[marked[:num]]
 
     def surfels(self) -> Surfels:
         """Return all voxels as surfels, in the order of their rows."""
-        held = np.flatnonzero(self.key >= 0)
-        eigenvalues = self.eigenvalues[held]
+        rows = np.flatnonzero(self.key >= 0)
+        eigenvalues = self.eigenvalues[rows]
         e0, e1, e2 = eigenvalues.T
         total = np.where(e2 > 0.0, e0 + e1 + e2, np.nan)
         return Surfels(
-            position=self.position[held],
-            normal=self.own_normal[held],
+            position=self.position[rows],
+            normal=self.own_normal[rows],
             planarity=2.0 * (e1 - e0) / total,
             curvature=e0 / total,
             eigenvalues=eigenvalues,
-            num_points=self.count[held],
-            voxel_index=unpack_keys(self.key[held]),
+            num_points=self.count[rows],
+            voxel_index=unpack_keys(self.key[rows]),
         )
 
     def _forgotten(self) -> RemovedVoxels:
@@ -243,7 +243,7 @@ class SurfelGraph:
         more = max(num_rows, 2 * len(self.key)) - len(self.key)
         if num_rows <= len(self.key):
             return
-        empty = dict.fromkeys(('key', 'host', 'component', 'label', 'places', 'neighbours'), -1)
+        empty = dict.fromkeys(('key', 'host', 'component', 'label', 'index_of', 'neighbours'), -1)
         for name, values in vars(self).items():
             if isinstance(values, np.ndarray) and name != '_neighbour_steps':
                 added = np.full((more, *values.shape[1:]), empty.get(name, 0), values.dtype)
@@ -260,10 +260,10 @@ class SurfelGraph:
         """Return rows, those of neighbours of emptied voxels, and all within some steps."""
         if 4 * len(rows) > np.count_nonzero(self.key >= 0):  # cheaper than to walk
             return np.flatnonzero(self.key >= 0).astype(np.int32)
-        found = np.empty(len(self.key), np.int32)
+        reached = np.empty(len(self.key), np.int32)
         start = np.concatenate([rows, emptied.ravel()])
-        num = spread(start, self.neighbours, steps, self._is_here, found)
-        around = found[:num]
+        num = spread(start, self.neighbours, steps, self._is_here, reached)
+        around = reached[:num]
         return around[self.key[around] >= 0]
 
     def _measure(self, rows: Rows, around: Rows) -> tuple[Rows, npt.NDArray[np.uint8]]:
@@ -273,7 +273,7 @@ class SurfelGraph:
         Returns the given rows and those around whose class or normal changed, with the previous
         classes of both.
         """
-        before, normals = self.kind[around], self.normal[around]
+        old_kind, normals = self.kind[around], self.normal[around]
         surfels = self.map.surfels_of(rows)
         self.count[rows], self.position[rows] = surfels.num_points, surfels.position
         self.own_normal[rows], self.eigenvalues[rows] = surfels.normal, surfels.eigenvalues
@@ -301,7 +301,7 @@ class SurfelGraph:
         reported = (self._reported_count, self._reported_position, self._reported_normal)
         mark_material(
             around,
-            before,
+            old_kind,
             self.count,
             self.position,
             self.normal,
@@ -311,10 +311,10 @@ class SurfelGraph:
             self.is_material,
         )
         self._is_here[rows] = True
-        moved = self._is_here[around] | (before != self.kind[around])
+        moved = self._is_here[around] | (old_kind != self.kind[around])
         moved |= (normals != self.normal[around]).any(axis=1)
         self._is_here[rows] = False
-        return around[moved], before[moved]
+        return around[moved], old_kind[moved]
 
     def is_thin(self, rows: npt.NDArray[Any], normals: Array) -> npt.NDArray[np.bool_]:
         """Return which voxels (K,) are thin enough along directions (K, 3) to lie on a plane."""
@@ -324,11 +324,11 @@ class SurfelGraph:
         thin: npt.NDArray[np.bool_] = along < self._host_rules[1]
         return thin
 
-    def _find_hosts(self, here: Rows, emptied: Rows) -> None:
+    def _find_hosts(self, changed: Rows, emptied: Rows) -> None:
         """Recompute the hosts of voxels around changes."""
-        around = self._around(here, emptied, ROUNDS)
+        around = self._around(changed, emptied, ROUNDS)
         rows = around[(self.kind[around] != FLAT) & (self.kind[around] != NONE)]
-        flat = here[self.kind[here] == FLAT]
+        flat = changed[self.kind[changed] == FLAT]
         self.host[flat], self.level[flat] = -1, 0
         state = (self.kind, self.position, self.normal)
         rules = self._host_rules
@@ -379,11 +379,11 @@ class RemovedVoxels:
     is_gaussian: npt.NDArray[np.bool_]
     component: Rows
 
-    def joined(self, other: RemovedVoxels) -> RemovedVoxels:
+    def joined(self, removed: RemovedVoxels) -> RemovedVoxels:
         """Return these and others."""
         names = ('key', 'label', 'is_gaussian', 'component')
         return RemovedVoxels(
-            *(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names)
+            *(np.concatenate([getattr(self, n), getattr(removed, n)]) for n in names)
         )
 
     def return_to(
@@ -409,8 +409,8 @@ class RemovedVoxels:
         if not len(self.key) or not len(came):
             return
         order = np.argsort(self.key)
-        place = np.minimum(np.searchsorted(self.key[order], keys[came]), len(order) - 1)
-        back = order[place]
+        index = np.minimum(np.searchsorted(self.key[order], keys[came]), len(order) - 1)
+        back = order[index]
         same = self.key[back] == keys[came]
         labels[came[same]] = self.label[back[same]]
         is_gaussian[came[same]] = self.is_gaussian[back[same]]

@@ -93,10 +93,10 @@ class SurfelJoining:
         """
         key = self._graph.key
         was = self._moved(key)
-        piece, before = np.empty_like(owner), self._piece
+        piece, old_piece = np.empty_like(owner), self._piece
         find_pieces(owner, self._block, key, piece)
         is_touched = np.zeros(len(self._blocks) + 1, np.bool_)  # the last: rows without a voxel
-        for rows in (changed, piece != before):
+        for rows in (changed, piece != old_piece):
             is_touched[self._block[rows]] = True
         is_touched[was] = True
         is_touched[-1] = False
@@ -109,8 +109,8 @@ class SurfelJoining:
             region[rows] = self._joined(rows.astype(np.int64), piece[rows])
         self._piece = piece
         first = np.flatnonzero(piece == np.arange(len(piece)))
-        found = patches(owner, first, region)
-        return self._separated(found, owner, first, is_touched)
+        merged = patches(owner, first, region)
+        return self._separated(merged, owner, first, is_touched)
 
     def _moved(self, key: Indices) -> Rows:
         """Find the blocks of new voxels; return the previous ones of rows with other voxels."""
@@ -125,9 +125,9 @@ class SurfelJoining:
         was: Rows = np.unique(self._block[moved])
         self._key[moved] = key[moved]
         block = np.where(key[moved] >= 0, (key[moved] + HALF) & BLOCK, -1)
-        names, which = np.unique(block, return_inverse=True)
+        names, inverse = np.unique(block, return_inverse=True)
         numbers = [-1 if n < 0 else self._blocks.setdefault(n, len(self._blocks)) for n in names]
-        self._block[moved] = np.array(numbers, np.int32)[which]
+        self._block[moved] = np.array(numbers, np.int32)[inverse]
         return was
 
     def _separated(
@@ -138,20 +138,20 @@ class SurfelJoining:
         low, high = np.full(number, len(self._blocks)), np.full(number, -1)
         np.minimum.at(low, patch[first], block)
         np.maximum.at(high, patch[first], block)
-        known, self._overlaps = self._overlaps, {}
-        found = patch.copy()
+        overlaps, self._overlaps = self._overlaps, {}
+        separated = patch.copy()
         for name in np.flatnonzero(low < high):
             pieces = first[patch[first] == name]
             code = pieces.tobytes()
-            if is_touched[self._block[pieces]].any() or code not in known:
-                known[code] = self._overlaps_itself(np.flatnonzero(patch == name))
-            self._overlaps[code] = known[code]
-            if known[code]:
+            if is_touched[self._block[pieces]].any() or code not in overlaps:
+                overlaps[code] = self._overlaps_itself(np.flatnonzero(patch == name))
+            self._overlaps[code] = overlaps[code]
+            if overlaps[code]:
                 mine = np.flatnonzero(patch == name)
-                charts, which = np.unique(owner[mine], return_inverse=True)
-                found[mine] = np.where(owner[mine] < 0, -1, number + which)
+                charts, inverse = np.unique(owner[mine], return_inverse=True)
+                separated[mine] = np.where(owner[mine] < 0, -1, number + inverse)
                 number += len(charts)  # fewer than its voxels: names stay below R
-        return found
+        return separated
 
     def _overlaps_itself(self, rows: Indices) -> bool:
         """Return whether voxels are no height field."""
@@ -171,13 +171,13 @@ class SurfelJoining:
     def _joined(self, rows: Indices, piece: Rows) -> Rows:
         """Return the region (n,) of each row of a block, in the order of their keys, or -1."""
         graph, size_m = self._graph, self._graph.map.voxel_size_m
-        graph.places[rows] = np.arange(len(rows))
-        place = np.where(piece >= 0, graph.places[piece], -1)
-        graph.places[rows] = -1
-        names = np.flatnonzero(place == np.arange(len(rows)))
+        graph.index_of[rows] = np.arange(len(rows))
+        index = np.where(piece >= 0, graph.index_of[piece], -1)
+        graph.index_of[rows] = -1
+        names = np.flatnonzero(index == np.arange(len(rows)))
         if not len(names):
             return np.full(len(rows), -1, np.int32)
-        patch = np.where(place >= 0, np.searchsorted(names, place), -1).astype(np.int32)
+        patch = np.where(index >= 0, np.searchsorted(names, index), -1).astype(np.int32)
         was_free = patch < 0
         order = np.argsort(patch, kind='stable')[was_free.sum() :]
         starts = np.searchsorted(patch[order], np.arange(len(names) + 1))
@@ -198,9 +198,9 @@ class SurfelJoining:
         patch[came[~graph.is_thin(rows[came], normals[patch[came]])]] = -1
         least = np.full(len(normals), len(rows))
         np.minimum.at(least, patch[names], names)
-        found: Rows = np.full(len(rows), -1, np.int32)
-        found[patch >= 0] = rows[least[patch[patch >= 0]]]
-        return found
+        regions: Rows = np.full(len(rows), -1, np.int32)
+        regions[patch >= 0] = rows[least[patch[patch >= 0]]]
+        return regions
 
 
 def patches(owner: Rows, first: Indices, region: Rows) -> Rows:
@@ -220,13 +220,13 @@ def patches(owner: Rows, first: Indices, region: Rows) -> Rows:
     from scipy.sparse import coo_array  # 0.2 s that maps without models save
     from scipy.sparse.csgraph import connected_components
 
-    names, place = np.unique(region[first], return_inverse=True)
+    names, index = np.unique(region[first], return_inverse=True)
     number = int(owner.max(initial=-1)) + 1
     size = number + len(names)
-    ends = owner[first], number + place
+    ends = owner[first], number + index
     links = coo_array((np.ones(len(first), np.bool_), ends), (size, size))
-    _, part = connected_components(links, directed=False)
+    _, component = connected_components(links, directed=False)
     table = np.full(len(owner) + 1, -1, np.int32)  # the last: no region
-    table[names] = part[number:]
-    found: Rows = table[region]
-    return found
+    table[names] = component[number:]
+    patch: Rows = table[region]
+    return patch

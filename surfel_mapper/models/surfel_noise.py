@@ -46,7 +46,7 @@ def estimate_noise(surfel_map: SurfelMap) -> float:
     an estimate.
     """
     moments = surfel_map.moments().select(slice(MOST_VOXELS))
-    found = 0.0
+    noise_m = 0.0
     for level in range(LEVELS):
         size_m = surfel_map.voxel_size_m * 2**level
         # 8^level voxels in one have to stay within its limit of points, which 4^level divides
@@ -57,7 +57,7 @@ def estimate_noise(surfel_map: SurfelMap) -> float:
         if len(sigma) < LEAST_VOXELS:
             continue
         low = float(np.quantile(sigma, NOISE_QUANTILE))
-        found = SPREAD * low * (1.0 + CLIPPING * (low / size_m) ** 2)
+        noise_m = SPREAD * low * (1.0 + CLIPPING * (low / size_m) ** 2)
         if low < CLIPPED_VOXELS * size_m:
             break
-    return min(found, MOST_M)
+    return min(noise_m, MOST_M)

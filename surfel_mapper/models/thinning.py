@@ -63,9 +63,9 @@ class Thinned:
 
     def point_labels(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """Return labels of all points from those of the means; -1 if not finite."""
-        found = np.full(self.num_points, -1, np.int32)
-        found[self.rows] = np.repeat(labels, np.diff(self.starts))
-        return found
+        of_points = np.full(self.num_points, -1, np.int32)
+        of_points[self.rows] = np.repeat(labels, np.diff(self.starts))
+        return of_points
 
 
 def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:

@@ -35,8 +35,8 @@ from surfel_mapper.layers import InsertedScan, Surroundings
 from surfel_mapper.layers.sensor_models import SensorModels
 from surfel_mapper.mapping.channels import missing_columns
 from surfel_mapper.mapping.moments import (
-    looks_like_millimetres,
-    MILLIMETRES,
+    looks_like_other_unit,
+    OTHER_UNIT,
     pack_keys,
     ScanMoments,
 )
@@ -351,9 +351,9 @@ class ScanPipeline:
         if not len(windowed.moments):
             cause = 'map_limit' if 'beyond_map' in left_out else 'no_valid_points'
             raise ScanRefusedError(cause, f'left out: {left_out}')
-        if not self._warned_of_units and looks_like_millimetres(windowed.moments):
+        if not self._warned_of_units and looks_like_other_unit(windowed.moments):
             self._warned_of_units = True
-            _log.warning('scan in frame %s: %s', prepared.scan.frame_id, MILLIMETRES)
+            _log.warning('scan in frame %s: %s', prepared.scan.frame_id, OTHER_UNIT)
         return windowed
 
     def _inserted(self, prepared: Prepared, windowed: WindowedScan) -> InsertedScan:

@@ -150,17 +150,17 @@ def candidates(
             'elevation, expected those of a lidar with two beams or more'
         )
     ranges: dict[str, Any] = {'min_range_m': min_range_m, 'max_range_m': max_range_m}
-    found = []
+    models = []
     tables = []
     if not rows and angles.ring is not None:
         tables.append(beam_elevations(elevations, angles.ring))
     if not rows:
         far = angles.range_m >= np.median(angles.range_m)
-        tables += [clustered_elevations(part) for part in (elevations, elevations[far])]
+        tables += [clustered_elevations(values) for values in (elevations, elevations[far])]
     for beams in tables:
         if 1 < len(beams) <= MAX_ROWS:
             steps = columns or azimuth_steps(angles, nearest_beam(elevations, beams))
-            found.append(
+            models.append(
                 LidarModel(
                     rows=len(beams),
                     columns=steps,
@@ -173,7 +173,7 @@ def candidates(
     low, high = float(elevations.min()), float(elevations.max())
     even: Float64 = np.asarray(np.linspace(high, low, rows), np.float64)
     steps = columns or azimuth_steps(angles, nearest_beam(elevations, even))
-    found.append(
+    models.append(
         LidarModel(
             rows=rows,
             columns=steps,
@@ -183,7 +183,7 @@ def candidates(
             **ranges,
         )
     )
-    return found
+    return models
 
 
 def best_fit(
@@ -210,39 +210,39 @@ def best_fit(
         If the elevations of the points do not span two beams.
 
     """
-    found = candidates(points, ring, **properties)
-    shares = [fit_share(model, points, voxel_size_m) for model in found]
+    models = candidates(points, ring, **properties)
+    shares = [fit_share(model, points, voxel_size_m) for model in models]
     best = int(np.argmax(shares))
-    return (found[best] if shares[best] >= LEAST_FIT else None), shares[best]
+    return (models[best] if shares[best] >= LEAST_FIT else None), shares[best]
 
 
 def beam_elevations(elevations: Float64, ring: npt.NDArray[Any]) -> Float64:
     """Return the median elevation of each ring, descending, deg; nearly equal ones once."""
     order = np.argsort(ring, kind='stable')
     _, first = np.unique(ring[order], return_index=True)
-    medians = [float(np.median(part)) for part in np.split(elevations[order], first[1:])]
-    found = np.sort(medians)[::-1]
-    return found[np.diff(found, prepend=np.inf) < -SMALLEST_STEP_DEG]
+    medians = [float(np.median(group)) for group in np.split(elevations[order], first[1:])]
+    ordered = np.sort(medians)[::-1]
+    return ordered[np.diff(ordered, prepend=np.inf) < -SMALLEST_STEP_DEG]
 
 
 def clustered_elevations(elevations: Float64) -> Float64:
     """
     Return the medians of the clusters of elevations, descending, deg.
 
-    The clusters of far points are sharper: the beams of a lidar start some centimetres beside its
-    centre. Those of all points include the beams that only see the near ground.
+    The clusters of far points are sharper, because the beams of a lidar start some centimetres off
+    its centre. The clusters of all points include the beams that only see the near ground.
     """
     ordered = np.sort(elevations)
-    parts = np.split(ordered, np.flatnonzero(np.diff(ordered) > CLUSTER_GAP_DEG) + 1)
+    groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > CLUSTER_GAP_DEG) + 1)
     least = max(0.001 * len(ordered), 3.0)
-    return np.array([float(np.median(part)) for part in parts if len(part) >= least])[::-1]
+    return np.array([float(np.median(group)) for group in groups if len(group) >= least])[::-1]
 
 
 def nearest_beam(elevations: Float64, beams: Float64) -> npt.NDArray[np.int64]:
     """Return the number of the nearest of descending beams for each elevation, (K,)."""
     ascending = beams[::-1]
-    after = np.searchsorted(0.5 * (ascending[1:] + ascending[:-1]), elevations)
-    return len(beams) - 1 - after
+    rank = np.searchsorted(0.5 * (ascending[1:] + ascending[:-1]), elevations)
+    return len(beams) - 1 - rank
 
 
 def azimuth_steps(angles: Angles, beam: npt.NDArray[np.int64]) -> int:

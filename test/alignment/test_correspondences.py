@@ -66,19 +66,6 @@ def test_pairs_are_those_that_comparing_all_finds(max_distance_m, max_angle_deg,
     np.testing.assert_array_equal(found, brute_force(source, target, T, limits))
 
 
-@pytest.mark.parametrize('empty', ['source', 'target', 'both'])
-@pytest.mark.parametrize('reciprocal', [False, True])
-def test_empty_samples_have_no_pairs(empty, reciprocal):
-    nothing = Samples(np.empty((0, 3)))
-    some = Samples(np.zeros((3, 3)))
-    source = some if empty == 'target' else nothing
-    target = some if empty == 'source' else nothing
-
-    found = match(source, target, np.eye(4), Limits(max_distance_m=1.0, reciprocal=reciprocal))
-
-    assert found.shape == (0, 2)
-
-
 def test_weights_are_one_over_the_variance_along_the_normal():
     source = Samples([[0.3, 0.4, 0.0]], [[0.0, 0.0, 1.0]], [0.002], [0.5])
     target = Samples([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [0.001], [0.01])
@@ -88,21 +75,6 @@ def test_weights_are_one_over_the_variance_along_the_normal():
     variance = 0.002 + 0.001 + 0.01 * (0.3**2 + 0.4**2)
     np.testing.assert_allclose(found[0, 2, 2], 1.0 / variance, rtol=1e-3)
     assert found[0, 0, 0] < 1e-3 * found[0, 2, 2]
-
-
-def test_a_gap_of_the_scale_counts_a_quarter():
-    source = Samples(
-        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]],
-        np.tile([0.0, 0.0, 1.0], (2, 1)),
-        [1e-3, 1e-3],
-        [0.0, 0.0],
-    )
-    target = Samples([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [1e-3], [0.0])
-    pairs = np.array([[0, 0], [1, 0]], np.int32)
-
-    found = surface_weights(source, target, pairs, np.eye(4), 0.1)
-
-    np.testing.assert_allclose(found[1], 0.25 * found[0])
 
 
 def test_surfels_of_a_map_become_samples_where_they_are_flat():

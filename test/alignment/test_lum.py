@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from hypothesis import given
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -30,22 +28,6 @@ def test_lum_converges_from_the_origin_for_any_rotations(angle_rad, seed):
     assert result.converged
     for v in range(12):
         np.testing.assert_allclose(lum.transformation(v), T[v], atol=0.02)
-
-
-def test_accuracy_does_not_fall_one_kilometre_from_the_origin():
-    errors = []
-    for offset in (0.0, 1000.0):
-        rng = np.random.default_rng(5)
-        T = random_transforms(rng, 5, 0.1)
-        lum = make(rng, T, chain(5, [(4, 0)]), offset=offset, max_iterations=20)
-        lum.compute()
-        seen = [np.linalg.inv(T[v]) @ [offset, offset, offset, 1.0] for v in range(5)]
-        errors.append(
-            max(np.abs((lum.transformation(v) - T[v]) @ seen[v]).max() for v in range(5))
-        )
-
-    assert errors[1] < 0.01
-    assert errors[1] < 3.0 * errors[0]
 
 
 def test_result_is_the_least_squares_of_the_gaps_over_their_variance():
@@ -85,25 +67,6 @@ def test_exact_pairs_count_in_full_beside_noisy_ones():
     np.testing.assert_allclose(relative, np.linalg.inv(T[1]) @ T[2], atol=1e-6)
 
 
-def test_both_directions_count_alike():
-    poses = []
-    for reverse in (False, True):
-        rng = np.random.default_rng(8)
-        edges = chain(4, [(3, 0)])
-        lum = make(rng, random_transforms(rng, 4, 0.4), edges, max_iterations=20)
-        if reverse:
-            turned = LUM(max_iterations=20)
-            for v in range(4):
-                turned.add_point_cloud(lum.point_cloud(v))
-            for s, t in edges:
-                turned.set_correspondences(t, s, lum.correspondences(s, t)[:, ::-1])
-            lum = turned
-        lum.compute()
-        poses.append([lum.pose(v) for v in range(4)])
-
-    np.testing.assert_allclose(poses[0], poses[1], atol=1e-9)
-
-
 @pytest.mark.parametrize('seed', range(48))
 @pytest.mark.parametrize(
     ('num', 'loops'), [(2, []), (3, []), (5, [(4, 0)]), (8, [(7, 0), (5, 1)])]
@@ -136,20 +99,6 @@ def test_scans_that_face_each_other_are_turned(axis):
     assert result.converged
     assert not result.open_motions
     np.testing.assert_allclose(lum.transformation(1), T[1], atol=0.02)
-
-
-def test_equal_weights_give_the_result_without_weights():
-    rng = np.random.default_rng(9)
-    T = random_transforms(rng, 2, 1.0)
-    lum = make(rng, T, [(1, 0)], sigma=0.1, max_iterations=50)
-    lum.compute()
-    expected, pairs = lum.transformation(1), lum.correspondences(1, 0)
-    lum.set_pose(1, np.zeros(6))
-    lum.set_correspondences(1, 0, pairs, np.tile(7.0 * np.eye(3), (len(pairs), 1, 1)))
-
-    lum.compute()
-
-    np.testing.assert_allclose(lum.transformation(1), expected, atol=1e-5)
 
 
 def test_planes_hold_each_other_across_alone():
@@ -209,71 +158,6 @@ def test_points_with_nan_are_ignored():
     assert np.isnan(lum.transformed_cloud(1)[::4]).all()
 
 
-def test_steps_end_at_the_threshold():
-    rng = np.random.default_rng(13)
-    T = random_transforms(rng, 6, 0.4)
-    few, many = (
-        make(
-            np.random.default_rng(1),
-            T,
-            chain(6),
-            max_iterations=50,
-            convergence_threshold=threshold,
-        )
-        for threshold in (1e-2, 1e-9)
-    )
-
-    assert few.compute().iterations < many.compute().iterations < 50
-
-
-def test_clouds_and_poses_are_given_back():
-    lum = LUM()
-    points = np.arange(12, dtype=np.float32).reshape(4, 3)
-
-    assert lum.add_point_cloud(points) == 0
-    assert lum.add_point_cloud(points + 1.0, [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]) == 1
-    points[:] = -1.0  # the input is copied
-
-    assert lum.num_vertices == 2
-    np.testing.assert_array_equal(lum.point_cloud(0)[0], [0.0, 1.0, 2.0])
-    np.testing.assert_array_equal(lum.pose(0), np.zeros(6))
-    np.testing.assert_array_equal(lum.pose(1), [1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
-    expected = Rotation.from_euler('xyz', [0.1, 0.2, 0.3]).as_matrix()
-    np.testing.assert_allclose(lum.transformation(1)[:3, :3], expected, atol=1e-15)
-    moved = lum.point_cloud(1) @ expected.T + [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(lum.transformed_cloud(1), moved)
-    np.testing.assert_allclose(lum.concatenated_cloud(), [*lum.point_cloud(0), *moved])
-    assert LUM().concatenated_cloud().shape == (0, 3)
-
-
-def test_several_graphs_take_turns_in_one_object():
-    rng = np.random.default_rng(14)
-    first = make(rng, random_transforms(rng, 3, 0.3), chain(3))
-    lum = LUM(max_iterations=20)
-    empty = lum.graph
-
-    lum.graph = first.graph
-    lum.compute()
-
-    assert lum.num_vertices == first.num_vertices == 3
-    assert np.abs(first.pose(2)).max() > 0.0
-    lum.graph = empty
-    assert lum.num_vertices == 0
-
-
-def test_other_points_keep_their_pairs():
-    rng = np.random.default_rng(15)
-    T = random_transforms(rng, 2, 0.3)
-    lum = make(rng, T, [(0, 1)], max_iterations=20)
-    lum.compute()
-
-    lum.set_point_cloud(1, lum.point_cloud(1) + np.array([1.0, 0.0, 0.0]))
-    lum.compute()
-
-    expected = T[1] @ [-1.0, 0.0, 0.0, 1.0]
-    np.testing.assert_allclose(lum.pose(1)[:3], expected[:3], atol=0.02)
-
-
 def test_a_long_chain_with_loops_is_solved():
     rng = np.random.default_rng(17)
     T = random_transforms(rng, 200, 0.2)
@@ -283,20 +167,6 @@ def test_a_long_chain_with_loops_is_solved():
     assert lum.compute().converged
     relative = np.linalg.inv(lum.transformation(198)) @ lum.transformation(199)
     np.testing.assert_allclose(relative, np.linalg.inv(T[198]) @ T[199], atol=0.03)
-
-
-ANGLES = st.floats(-20.0, 20.0)
-
-
-@given(st.tuples(ANGLES, ANGLES, ANGLES))
-def test_angles_nearest_to_the_reference_are_chosen(angles):
-    pose = np.array([[1.0, 2.0, 3.0, *angles]])
-    if abs(np.cos(angles[1])) < 1e-4:
-        return  # roll and yaw are one there
-
-    found = poses_of(transforms(pose), near=pose)
-
-    np.testing.assert_allclose(found, pose, atol=1e-9)
 
 
 def test_at_a_pitch_of_a_quarter_turn_the_rotation_is_kept():
@@ -352,3 +222,12 @@ def test_covariances_of_unconnected_poses_are_unknown():
     assert np.isfinite(covariances[:2]).all()
     with pytest.raises(AlignmentError, match='0 vertices'):
         LUM().pose_covariances()
+
+
+def test_without_a_usable_edge_it_does_not_converge():
+    lum = LUM(max_iterations=3)
+    for _ in range(2):
+        lum.add_point_cloud(np.eye(3))
+    lum.set_correspondences(1, 0, np.empty((0, 2), np.int32))
+
+    assert not lum.compute().converged

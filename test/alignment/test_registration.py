@@ -10,14 +10,12 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.alignment.registration import moved, Registration, solve
+from surfel_mapper.alignment.registration import moved, Registration
 from surfel_mapper.alignment.surfel_planes import SurfelPlanes
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import (
     compose,
     inverse,
-    pose_matrix,
-    q_xyzw,
     rotation_angle,
     se3_exp,
 )
@@ -204,15 +202,6 @@ def test_equal_scans_get_bit_identical_poses_and_do_not_change_the_map():
     assert surfel_map.digest() == digest
 
 
-def test_cells_are_means_of_points_within_the_limits_of_range():
-    points = np.array([[1.1, 0.1, 0.1], [1.2, 0.15, 0.2], [3.1, 0.0, 0.1], [0.2, 0.0, 0.1]])
-
-    cells = registration(cell_m=0.25).cells(points, min_range_m=0.5, max_range_m=3.0)
-
-    # the lattice of a cell of 0.25 m is 4 micrometres wide
-    np.testing.assert_allclose(cells, [[1.15, 0.125, 0.15]], atol=4e-6)
-
-
 def test_too_many_cells_are_subsampled_evenly():
     points = np.column_stack([np.arange(1000.0), np.zeros(1000), np.zeros(1000)]) + 0.1
 
@@ -220,16 +209,6 @@ def test_too_many_cells_are_subsampled_evenly():
 
     assert len(cells) == 250
     assert np.diff(np.sort(cells[:, 0])).max() == pytest.approx(4.0, abs=1e-4)
-
-
-def test_the_size_of_cells_can_change_while_running():
-    aligner = registration(cell_m=0.25)
-    points = np.array([[0.1, 0.1, 0.1], [0.6, 0.1, 0.1]])
-    assert len(aligner.cells(points)) == 2
-
-    aligner.config = RegistrationConfig(cell_m=1.0)
-
-    assert len(aligner.cells(points)) == 1
 
 
 def fits_of(points, place):
@@ -261,23 +240,6 @@ def test_the_weight_of_a_surfel_falls_away_from_its_mean():
     assert far[1] < 0.8 * near[1]
 
 
-@pytest.mark.parametrize('points', [np.full((4, 3), 0.3), np.full((9, 3), 0.3)])
-def test_a_surfel_of_few_points_or_of_one_place_is_ignored(points):
-    assert fits_of(points, [0.5, 0.5, 0.5]) == (0.0, 0.0)
-
-
-def test_the_step_solves_the_equations_where_all_is_known():
-    rng = np.random.default_rng(6)
-    rows = rng.normal(size=(40, 6)) * [1.0, 1.0, 1.0, 8.0, 8.0, 8.0]
-    hessian, gradient = rows.T @ rows, rng.normal(size=6)
-
-    step, degenerate, radius_m = solve(hessian, gradient, 1e-3)
-
-    np.testing.assert_allclose(step, -np.linalg.solve(hessian, gradient), rtol=1e-9)
-    assert len(degenerate) == 0
-    assert radius_m == pytest.approx(8.0, rel=0.2)
-
-
 def test_a_map_too_sparse_for_its_voxels_is_met_in_larger_ones():
     # 3 points in a voxel of 0.5 m, less than make a surfel, and 12 in one of 1 m
     sparse = SurfelMap(VOXEL_M)
@@ -289,17 +251,6 @@ def test_a_map_too_sparse_for_its_voxels_is_met_in_larger_ones():
 
     assert aligner.fits(found)
     assert off(found.T_map_sensor)[0] < 0.05
-
-
-@pytest.mark.parametrize('angle', [0.0, 1e-12, 1e-9, 1e-5, 0.3, 3.0, np.pi])
-def test_a_pose_is_turned_in_place_and_moved(angle):
-    rng = np.random.default_rng(3)
-    axis = rng.normal(size=3)
-    step = np.concatenate([rng.normal(size=3), angle * axis / np.linalg.norm(axis)])
-    pose = se3_exp(rng.normal(size=6))
-    turned = compose(se3_exp(np.concatenate([np.zeros(3), step[3:]])), pose)
-    expected = pose_matrix(pose[:3, 3] + step[:3], q_xyzw(turned))
-    np.testing.assert_allclose(moved(pose, step), expected, atol=1e-14)
 
 
 def test_a_thousand_steps_keep_a_rotation_orthonormal():

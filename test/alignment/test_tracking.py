@@ -54,79 +54,11 @@ def test_the_prediction_assumes_constant_velocity():
     np.testing.assert_allclose(tracker.predict(SECOND // 2), pose_at(0.5), atol=1e-12)
 
 
-def test_deviations_set_the_search_distance():
-    tracker = tracker_at(np.eye(4))
-    tracker.advance(np.eye(4), 0)
-    turned = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.1]))
-
-    tracker.advance(turned, SECOND, reach_m=20.0)
-
-    assert tracker.deviation_m == pytest.approx(2.0 * 20.0 * math.sin(0.05))
-
-
-def test_the_expected_deviation_is_at_least_that_of_noise():
-    tracker = tracker_at(TRUE)
-    for k in range(3):
-        tracker.advance(TRUE, k * SECOND)
-
-    assert tracker.deviation_m == pytest.approx(3.0 * NOISE_M)
-
-
 def test_a_scan_that_fits_and_has_not_settled_is_refused_for_that():
     tracker = tracker_at(pose_at(0.2), max_iterations=1, coarse_levels=0)
 
     with pytest.raises(AlignmentError, match=r'fit it, but its pose has not settled'):
         tracker.track(cells_at(tracker, pose_at(0.3)), SECOND, map_of(ROOM), np.eye(4))
-
-
-def test_a_sensor_is_followed_through_a_room():
-    tracker = tracker_at(TRUE)
-    for k in range(1, 8):
-        truth = pose_at(0.2 * k)
-        found = tracker.track(cells_at(tracker, truth), k * SECOND // 5, map_of(ROOM), np.eye(4))
-
-        assert found.fit > 0.8
-        np.testing.assert_allclose(tracker.pose, truth, atol=2e-3)
-    assert tracker.deviation_m < 0.2
-
-
-def test_poses_may_be_of_another_frame_than_the_map():
-    T_map_fixed = se3_exp(np.array([30.0, -4.0, 2.0, 0.0, 0.0, 1.0]))
-    tracker = tracker_at(compose(inverse(T_map_fixed), TRUE))
-
-    found = tracker.track(cells_at(tracker, pose_at(0.1)), SECOND, map_of(ROOM), T_map_fixed)
-
-    np.testing.assert_allclose(found.T_map_sensor, pose_at(0.1), atol=2e-3)
-    expected = compose(inverse(T_map_fixed), found.T_map_sensor)
-    np.testing.assert_array_equal(tracker.pose, expected)
-
-
-def test_a_scan_of_another_place_is_refused_and_the_pose_kept():
-    tracker = tracker_at(TRUE)
-    tracker.advance(TRUE, 0)
-    tracker.advance(pose_at(0.2), SECOND // 5)
-    rng = np.random.default_rng(8)
-    elsewhere = rng.uniform(-15.0, 15.0, (3000, 3))
-
-    expected = r'% of its 3000 cells meet a surfel and \d+% of these fit it, expected 3%'
-    with pytest.raises(AlignmentError, match=expected):
-        tracker.track(elsewhere, SECOND, map_of(ROOM), np.eye(4))
-
-    np.testing.assert_array_equal(tracker.pose, pose_at(0.2))
-    np.testing.assert_allclose(tracker.twist, 0.5 * TWIST, atol=1e-12)  # the velocity is halved
-    assert tracker.deviation_m == RegistrationConfig().max_deviation_m
-
-
-def test_after_a_scan_that_was_refused_the_next_one_is_found():
-    tracker = tracker_at(TRUE)
-    tracker.advance(TRUE, 0)
-    rng = np.random.default_rng(8)
-    with pytest.raises(AlignmentError):
-        tracker.track(rng.uniform(-15.0, 15.0, (3000, 3)), SECOND, map_of(ROOM), np.eye(4))
-
-    tracker.track(cells_at(tracker, pose_at(0.3)), 2 * SECOND, map_of(ROOM), np.eye(4))
-
-    np.testing.assert_allclose(tracker.pose, pose_at(0.3), atol=2e-3)
 
 
 def test_after_a_restart_the_motion_is_unknown():
@@ -138,14 +70,6 @@ def test_after_a_restart_the_motion_is_unknown():
 
     assert tracker.is_new
     np.testing.assert_array_equal(tracker.predict(9 * SECOND), pose_at(3.0))
-
-
-def test_a_motion_that_is_known_already_holds_from_the_first_scan_on():
-    tracker = tracker_at(TRUE)
-
-    tracker.begin(SECOND, TWIST)
-
-    np.testing.assert_allclose(tracker.predict(2 * SECOND), pose_at(1.0), atol=1e-12)
 
 
 def square_room(num, seed):

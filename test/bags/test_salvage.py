@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A cut mcap file is read up to the cut; other cut bags name the command that mends them."""
 
-import logging
 from pathlib import Path
 import re
 import shutil
@@ -14,7 +13,6 @@ from mcap.writer import CompressionType, IndexType
 import numpy as np
 import pytest
 
-from surfel_mapper.bags.compression import import_zstd
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.errors import BagError
@@ -252,37 +250,6 @@ def test_the_last_of_several_files_may_be_unreadable(tmp_path, caplog):
     assert 'drive_2.mcap: cannot be read' in caplog.text
 
 
-def loose_files(directory, *parts):
-    """Write messages into drive_1.mcap, drive_2.mcap and so on, without metadata.yaml."""
-    directory.mkdir()
-    for number, part in enumerate(parts, 1):
-        write_mcap(directory / f'drive_{number}.mcap', part)
-    return directory
-
-
-@pytest.mark.parametrize('keep', [1.0, 0.5, 0.0])
-@pytest.mark.parametrize('damage', [b'', b'damaged'])
-def test_a_file_is_read_once_if_the_recorder_was_killed_while_it_packed_it(
-    tmp_path, caplog, keep, damage
-):
-    path = loose_files(tmp_path / 'drive', drive()[:9], drive()[9:])
-    packed = import_zstd().compress((path / 'drive_2.mcap').read_bytes())
-    packed = damage + packed[: int(keep * len(packed))]
-    (path / 'drive_2.mcap.zstd').write_bytes(packed)
-
-    assert_is_the_drive(read(path))
-    assert caplog.records == []
-
-
-def test_the_last_of_several_files_may_be_packed_and_damaged(tmp_path, caplog):
-    path = loose_files(tmp_path / 'drive', drive())
-    (path / 'drive_2.mcap.zstd').write_bytes(b'damaged')
-
-    assert_is_the_drive(read(path))
-    assert 'file skipped, it cannot be read: ' in caplog.text
-    assert 'drive_2.mcap.zstd: cannot be unpacked' in caplog.text
-
-
 def test_the_first_of_several_files_must_be_readable(tmp_path):
     path = write_rosbag2(tmp_path / 'drive', drive())
     (path / 'metadata.yaml').unlink()
@@ -290,32 +257,6 @@ def test_the_first_of_several_files_must_be_readable(tmp_path):
 
     with pytest.raises(BagError, match=r'a\.mcap: cannot be read'):
         BagReader(path)
-
-
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3', 'ros1'])
-def test_overwritten_bytes_in_a_truncated_file_give_messages_or_a_bag_error(tmp_path, storage):
-    entries = drive(ROS1 if storage == 'ros1' else ROS2, num_scans=2)
-    if storage == 'ros1':
-        file = write_ros1(tmp_path / 'drive.bag', entries)
-    elif storage == 'mcap':
-        file = write_mcap(tmp_path / 'drive.mcap', entries)
-    else:
-        file = file_of(write_rosbag2(tmp_path / 'drive', entries, storage))
-    content = file.read_bytes()
-    rng = np.random.default_rng(11)
-    logging.disable(logging.WARNING)
-    try:
-        for _ in range(100):
-            spoiled = bytearray(content[: int(rng.integers(len(content)))])
-            start = int(rng.integers(max(len(spoiled) - 16, 1)))
-            spoiled[start : start + 16] = rng.bytes(16)
-            file.write_bytes(spoiled)
-            try:
-                assert len(read_raws(file)[0]) <= len(entries)
-            except BagError:
-                continue
-    finally:
-        logging.disable(logging.NOTSET)
 
 
 def test_a_part_of_a_bag_by_record_time_is_read_alike_with_and_without_index(tmp_path):

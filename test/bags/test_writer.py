@@ -2,14 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags are written atomically, replace only bags, and read back the same."""
 
-import errno
 import os
-from pathlib import Path
-import sqlite3
 
 import numpy as np
 import pytest
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.bags.writer import BagWriter
@@ -105,45 +101,6 @@ def test_a_bag_is_replaced_only_on_request_and_only_at_the_end(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ['bag']
 
 
-def text_over(path):
-    """Replace a bag by one with a text."""
-    with BagWriter(path, overwrite=True) as bag:
-        bag.write('/text', 'std_msgs/msg/String', 1, b'\x00\x01\x00\x00\x01\x00\x00\x00\x00')
-
-
-def assert_is_the_old_bag(path):
-    with BagReader(path) as old:
-        assert [message.topic for message in old.messages()] == ['/tf_static', '/odom', '/points']
-    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
-
-
-@pytest.mark.parametrize('error', [OSError(errno.EIO, 'Input/output error'), KeyboardInterrupt()])
-def test_the_old_bag_stays_if_the_new_one_does_not_reach_the_disk(tmp_path, monkeypatch, error):
-    def fail(descriptor):
-        raise error
-
-    write_some(tmp_path / 'bag')
-    monkeypatch.setattr(os, 'fsync', fail)
-    with pytest.raises((BagError, KeyboardInterrupt)):
-        text_over(tmp_path / 'bag')
-    assert_is_the_old_bag(tmp_path / 'bag')
-
-
-def test_the_old_bag_comes_back_if_the_new_one_does_not_get_its_name(tmp_path, monkeypatch):
-    rename = Path.rename
-
-    def interrupted(path, target):
-        if Path(target) == tmp_path / 'bag' and path.name == 'bag':
-            raise KeyboardInterrupt
-        return rename(path, target)
-
-    write_some(tmp_path / 'bag')
-    monkeypatch.setattr(Path, 'rename', interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        text_over(tmp_path / 'bag')
-    assert_is_the_old_bag(tmp_path / 'bag')
-
-
 @pytest.mark.parametrize('overwrite', [False, True])
 def test_an_empty_directory_becomes_the_bag(tmp_path, overwrite):
     (tmp_path / 'bag').mkdir()
@@ -164,15 +121,6 @@ def test_paths_that_are_not_bags_are_never_overwritten(tmp_path):
             BagWriter(path, overwrite=True)
     assert (home / 'thesis.tex').read_text() == 'years of work'
     assert link.is_symlink()
-
-
-def test_a_bag_that_appears_while_writing_is_kept(tmp_path):
-    path = tmp_path / 'bag'
-    with pytest.raises(BagError, match='has files in it'), BagWriter(path):
-        write_some(path)
-    with BagReader(path) as reader:
-        assert len(list(reader.topics)) == 3
-    assert [entry.name for entry in tmp_path.iterdir()] == ['bag']
 
 
 def test_an_unknown_storage_is_refused(tmp_path):
@@ -200,14 +148,3 @@ def test_a_bag_with_other_files_is_not_overwritten(tmp_path):
     (path / 'more.mcap').mkdir()
     with pytest.raises(BagError, match=r'more\.mcap in it is no file of a bag'):
         BagWriter(path, overwrite=True)
-
-
-def test_an_error_of_sqlite_names_the_bag_and_leaves_no_files(tmp_path, monkeypatch):
-    def fail(*_):
-        raise sqlite3.OperationalError('database or disk is full')
-
-    monkeypatch.setattr(Sqlite3Writer, 'write', fail)
-    monkeypatch.setattr(Sqlite3Writer, 'abort', fail)
-    with pytest.raises(BagError, match='bag: cannot be written: database or disk is full'):
-        write_some(tmp_path / 'bag', storage='sqlite3')
-    assert list(tmp_path.iterdir()) == []

@@ -7,20 +7,16 @@ from __future__ import annotations
 import json
 import logging
 import os
-from pathlib import Path
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
-from surfel_mapper import replay
 from surfel_mapper.cli.main import main, VERBS
-from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import ply
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.offline.replay import ReplayOptions
 from test import extras
 from test.bags.recorded import drive, write_rosbag2
 
@@ -133,16 +129,6 @@ def test_a_filtered_cloud_is_not_replaced_unasked(inputs, tmp_path, capsys):
     assert file.read_bytes().startswith(b'ply')
 
 
-def test_a_call_from_python_replaces_nothing_unasked(inputs, tmp_path):
-    (tmp_path / 'map.ply').write_text('mine')
-
-    with pytest.raises(FileFormatError, match=r'has files in it.*overwrite=True'):
-        replay(inputs / 'drive', output=tmp_path)
-    assert contents(tmp_path) == {'map.ply': b'mine'}
-    replay(inputs / 'drive', output=tmp_path, options=ReplayOptions(overwrite=True))
-    assert (tmp_path / 'map.ply').read_bytes().startswith(b'ply')
-
-
 @pytest.mark.parametrize(
     ('verb', 'formats'), [('replay', 'ply, pcd'), ('extract', 'json, parquet')]
 )
@@ -209,15 +195,3 @@ def test_the_result_is_opened_in_the_browser(inputs, tmp_path, verb, name):
     assert opened.read_text().strip() == (output / name).as_uri()
     assert (output / name).stat().st_size > 0
     assert json.loads(done.stdout)
-
-
-@pytest.mark.parametrize('environment', [{}, {'BROWSER': '/no/such/browser %s'}])
-def test_a_machine_without_a_browser_maps_all_the_same(inputs, tmp_path, environment):
-    output = tmp_path / 'out'
-    words = [*command('merge', inputs), '--open', '-o', str(output)]
-
-    done = run(words, PATH=str(Path(sys.executable).parent), **environment)
-
-    assert done.returncode == 0
-    assert f'{output / "map.png"} cannot be opened here: no ' in done.stderr
-    assert len(done.stderr.splitlines()) == 1

@@ -64,15 +64,6 @@ def test_the_help_of_a_verb_shows_an_example(verb, capsys):
     assert example.startswith(f'surfel-mapper {verb} ')
 
 
-@pytest.mark.parametrize('arguments', [('fly\x1b[2J',), ('replay', 'a', '--a\nb\x1b[2J')])
-def test_wrong_usage_with_control_characters_is_one_line(arguments, capsys):
-    """A shell expands patterns to the names of files, which come from outside."""
-    assert usage_code(*arguments) == 2
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert '\\x1b[2J' in said
-    assert 'error: ' in said
-
-
 @pytest.mark.parametrize('arguments', [(), ('fly',), ('replay',), ('replay', 'a', '--fly')])
 def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
     assert usage_code(*arguments) == 2
@@ -172,38 +163,3 @@ def test_a_closed_pipe_is_no_error(tmp_path):
         os.close(write_end)
 
     assert (done.returncode, done.stderr) == (0, '')
-
-
-@pytest.mark.parametrize(
-    ('verb', 'closed'),
-    [
-        ('replay', '>&-'),
-        ('replay', '<&- >&- 2>&-'),
-        ('simulate', '2>&-'),
-        ('simulate', '>&- 2>&-'),
-    ],
-)
-def test_closed_streams_change_no_result(tmp_path, verb, closed):
-    code = 'import sys; from surfel_mapper.cli.main import main; sys.exit(main())'
-    output = tmp_path / 'out'
-    if verb == 'replay':
-        bag = write_rosbag2(tmp_path / 'bag', drive())
-        arguments = ['replay', str(bag), '--output', str(output)]
-    else:
-        arguments = ['simulate', 'street', '--scans', '1', '--beams', '8', '--columns', '64']
-        arguments += ['--output', str(output)]
-    command = ['sh', '-c', f'"$@" {closed}', 'sh', sys.executable, '-c', code, *arguments]
-
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-
-    assert (done.returncode, done.stderr) == (0, '')
-    assert (output / ('summary.json' if verb == 'replay' else 'metadata.yaml')).exists()
-
-
-def test_an_error_does_not_go_to_stdout_if_stderr_is_closed(tmp_path):
-    code = 'import sys; from surfel_mapper.cli.main import main; sys.exit(main())'
-    command = ['sh', '-c', '"$@" 2>&-', 'sh', sys.executable, '-c', code, 'info', str(tmp_path)]
-
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-
-    assert (done.returncode, done.stdout) == (1, '')

@@ -2,24 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Progress is a bar on a terminal, else lines; after Ctrl-C the scans so far are written."""
 
-import fcntl
 import json
-import os
-import pty
 import re
 import signal
-import struct
 import subprocess
 import sys
-import termios
-import threading
 import time
 
 import numpy as np
 import pytest
 
 from surfel_mapper.cli import _progress as progress_module
-from surfel_mapper.cli._progress import interrupted_by_sigterm, progress, stopped_by_interrupt
+from surfel_mapper.cli._progress import progress, stopped_by_interrupt
 from surfel_mapper.cli.main import main
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.viz import picture
@@ -42,13 +36,6 @@ sys.exit(main.main())
 """
 """As the installed script; with ``python -m`` an interrupt within an import ends Python (3.11) by
 SIGINT, also if it was caught."""
-WITH_LATE_SIGTERM = """
-import signal, sys
-from surfel_mapper.cli import main
-code = main.main()
-signal.raise_signal(signal.SIGTERM)
-sys.exit(code)
-"""
 
 
 def test_lines_state_progress_rate_and_time_left(monkeypatch, capsys):
@@ -95,45 +82,6 @@ def test_sigterm_sent_twice_ends_early_and_ctrl_c_then_interrupts():
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_the_second_sigterm_does_not_interrupt_the_removal_of_files():
-    before, removed = signal.getsignal(signal.SIGTERM), []
-
-    @interrupted_by_sigterm()
-    def work():
-        try:
-            signal.raise_signal(signal.SIGTERM)
-        finally:
-            signal.raise_signal(signal.SIGTERM)
-            removed.append(True)
-
-    with pytest.raises(KeyboardInterrupt):
-        work()
-
-    assert removed
-    assert signal.getsignal(signal.SIGTERM) is before
-
-
-class Finalized:
-    """SIGTERM arrives in its finalizer, where Python would swallow an exception."""
-
-    def __del__(self):
-        signal.raise_signal(signal.SIGTERM)
-
-
-def test_sigterm_in_a_finalizer_interrupts_after_it():
-    before = signal.getsignal(signal.SIGALRM)
-
-    @interrupted_by_sigterm()
-    def work():
-        Finalized()
-        time.sleep(WAIT_S)
-
-    with pytest.raises(KeyboardInterrupt):
-        work()
-
-    assert signal.getsignal(signal.SIGALRM) is before
-
-
 @pytest.mark.drawn
 def test_ctrl_c_while_files_are_written_leaves_all_of_them(tmp_path, monkeypatch, capsys):
     draw, pressed = picture.draw_map, []
@@ -158,20 +106,6 @@ def test_ctrl_c_while_files_are_written_leaves_all_of_them(tmp_path, monkeypatch
         'summary.json',
         'trajectory.tum',
     }
-
-
-def test_in_another_thread_nothing_is_caught():
-    found = []
-
-    def run():
-        with stopped_by_interrupt() as stopped:
-            found.append(stopped())
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join()
-
-    assert found == [False]
 
 
 @pytest.fixture(scope='module')
@@ -235,54 +169,6 @@ def test_sigterm_of_another_verb_leaves_no_hidden_directory(tmp_path, with_timeo
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_late_second_sigterm_leaves_the_exit_code_as_it_is(tmp_path):
-    program = [sys.executable, '-c', WITH_LATE_SIGTERM]
-
-    code, said, _ = interrupted_simulation(program, tmp_path / 'street')
-
-    assert code == 130
-    assert said.endswith(b'surfel-mapper simulate: interrupted\n')
-
-
 def is_underway(shown):
     """Return whether the progress shown counts some scans."""
     return re.search(rb'\b[1-9]\d*(/| of )%d' % MANY, shown) is not None
-
-
-def test_ctrl_c_ends_the_bar_of_a_terminal_and_the_map_is_written(command, tmp_path):
-    output = tmp_path / 'out'
-    ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 100, 0, 0))
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=theirs)
-    os.close(theirs)
-
-    shown, is_told = b'', False
-    while True:
-        try:
-            part = os.read(ours, 4096)
-        except OSError:  # so ends a terminal on Linux
-            break
-        if not part:
-            break
-        shown += part
-        if not is_told and is_underway(shown):
-            process.send_signal(signal.SIGINT)
-            is_told = True
-    os.close(ours)
-    printed, _ = process.communicate(timeout=WAIT_S)
-
-    assert process.returncode == 130, shown
-    assert b'%|' in shown
-    assert b'scan/s' in shown
-    summary = json.loads(printed)
-    assert summary['interrupted']
-    assert 0 < summary['scans']['mapped'] < MANY
-    assert load_map(output)[0].digest() == summary['digest']
-    assert {path.name for path in output.iterdir()} == {
-        'map.npz',
-        'normals',
-        'map.png',
-        'report.html',
-        'summary.json',
-        'trajectory.tum',
-    }

@@ -90,22 +90,3 @@ def test_one_scan_cannot_be_aligned(bag, settings, tmp_path, capsys):
     assert main(['replay', str(bag), *arguments]) == 1
 
     assert '1 scans in the map' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    'options',
-    [
-        (),
-        ('--align',),
-        ('--poses-from', 'registration'),
-        ('--formats', 'ply,pcd,npz,bag'),
-        ('--window',),
-    ],
-)
-def test_no_time_of_a_replay_is_in_two_stages(bag, settings, tmp_path, options):
-    summary = replayed(bag, settings, tmp_path, *options)[0]
-    stages = {name: s for name, s in summary['stage_s'].items() if name != 'total'}
-    assert min(stages.values()) >= 0.0
-    assert sum(stages.values()) <= summary['replay_s']
-    closes_loops = '--align' in options or 'registration' in options
-    assert ('loops' in stages) == ('loops' in summary) == closes_loops

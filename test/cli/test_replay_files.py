@@ -3,8 +3,6 @@
 """Other readers read the files of a replay; bad input and full disks leave no partial files."""
 
 import json
-import shutil
-import sqlite3
 
 from mcap.writer import CompressionType
 import numpy as np
@@ -106,18 +104,6 @@ def test_the_poses_are_where_the_sensor_was(output):
     np.testing.assert_array_equal(found.xyz, expected)
 
 
-@pytest.mark.drawn
-def test_a_second_replay_replaces_all(bag, output, tmp_path):
-    shutil.copytree(output, tmp_path / 'again')
-    arguments = ['--formats', ALL, '--output', str(tmp_path / 'again'), '--duration', '0.3']
-
-    assert main(['replay', str(bag), *arguments, '--overwrite']) == 0
-
-    before, after = contents(output), contents(tmp_path / 'again')
-    assert before.keys() == after.keys()
-    assert all(before[name] != after[name] for name in before)
-
-
 @pytest.mark.parametrize(
     ('arguments', 'code', 'says'),
     [
@@ -214,19 +200,6 @@ def test_a_bag_with_a_damaged_chunk_is_read_without_it_and_the_damage_told(
     assert f'{path}: 1 damaged chunks are skipped, the first at byte ' in survey['cut'][0]
     assert survey['cut'][0] in caplog.text
     assert printed.out.splitlines()[1].startswith('scans 5 ')
-
-
-def test_messages_of_a_topic_with_control_characters_are_skipped_and_counted(tmp_path, capsys):
-    path = write_rosbag2(tmp_path / 'drive', drive(), 'sqlite3')
-    with sqlite3.connect(path / 'drive.db3') as database:
-        database.execute("UPDATE topics SET name = '/o' || char(7) || 'om' WHERE name = '/odom'")
-
-    assert main(['info', str(path / 'drive.db3')]) == 0
-
-    printed = capsys.readouterr().out
-    assert f'damaged: {path}/drive.db3: {NUM_SCANS} messages are skipped, as ' in printed
-    assert "no legal name: '/o\\x07om'" in printed
-    assert '/odom' not in printed
 
 
 def test_a_cut_bag_is_mapped_as_far_as_it_goes_and_strict_says_so(tmp_path, capsys, caplog):

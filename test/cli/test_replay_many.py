@@ -8,14 +8,12 @@ import signal
 import pytest
 
 from surfel_mapper.cli.main import main
-from surfel_mapper.cluster import map_reduce, shards
+from surfel_mapper.cluster import map_reduce
 from surfel_mapper.cluster.shards import map_shard
-from surfel_mapper.cluster.workers import Workers
 from surfel_mapper.files.parquet import read_map
 from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test import extras
-from test.bags.recorded import cut
 from test.cli.small_disk import run_on_small_disk
 from test.cluster.bags import written
 
@@ -85,24 +83,6 @@ def test_ctrl_c_leaves_the_map_of_the_shards_that_are_done(
     assert summary['interrupted']
     assert summary['digest'] == summary_of(alone[0])['digest']
     assert summary['digest'] == SurfelMap.load(tmp_path / 'map.npz').digest()
-
-
-def test_ctrl_c_before_the_first_shard_is_done_leaves_the_earlier_map(
-    bags, tmp_path, monkeypatch, capsys
-):
-    assert main(['replay', *bags, '--output', str(tmp_path), *TF]) == 0
-    before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
-
-    def pressing(engine, function, items, stopped):
-        signal.raise_signal(signal.SIGINT)
-        yield len(items) - 1, function(items[-1])
-
-    monkeypatch.setattr(Workers, 'run', pressing)
-    monkeypatch.setattr(shards, 'LONGEST_S', 3.0)
-    assert main(['replay', *bags, '--output', str(tmp_path), '--overwrite', *TF]) == 130
-
-    assert 'interrupted' in capsys.readouterr().err
-    assert before == {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
 
 
 def test_workers_make_the_map_of_one_process(bags, alone, tmp_path, capsys, caplog):
@@ -189,43 +169,11 @@ def test_options_that_need_one_process_are_refused(bags, tmp_path, capsys, optio
     assert f'{option[0]}: not with several bags' in capsys.readouterr().err
 
 
-def test_a_damaged_bag_among_several_is_named(bags, tmp_path, capsys):
-    bag, _ = written(tmp_path, 'plain')
-    cut(bag / 'plain.mcap', 0.0)
-
-    assert main(['replay', bags[0], str(bag), '--output', str(tmp_path / 'out'), *TF]) == 1
-
-    assert 'plain.mcap' in capsys.readouterr().err
-    assert not (tmp_path / 'out' / 'map.npz').exists()
-
-
-def test_a_bag_that_ends_too_early_is_mapped_as_far_as_it_goes(bags, tmp_path, capsys):
-    bag, _ = written(tmp_path, 'plain')
-    cut(bag / 'plain.mcap', 0.7)
-    arguments = ['replay', str(bag), str(bag), '--output', str(tmp_path / 'out'), *TF]
-
-    assert main(arguments) == 0
-    assert main([*arguments, '--strict', '--overwrite']) == 3
-
-    summary = summary_of(tmp_path / 'out')
-    assert 20 < summary['scans']['mapped'] < 2 * 60
-    assert 'cut off' in summary['cut'][0]
-
-
 @pytest.mark.parametrize('number', ['0', '-1', 'two', '1.5'])
 def test_an_invalid_number_of_workers_is_refused(bags, number):
     with pytest.raises(SystemExit) as exit_info:
         main(['replay', bags[0], '--workers', number])
     assert exit_info.value.code == 2
-
-
-def test_a_scheduler_that_does_not_answer_is_refused(bags, tmp_path, capsys, monkeypatch):
-    from surfel_mapper.cluster import workers
-
-    monkeypatch.setattr(workers, 'CONNECT_S', 1)
-    arguments = ['replay', bags[0], '--scheduler', 'tcp://127.0.0.1:1', '--output', str(tmp_path)]
-    assert main([*arguments, *TF]) == 1
-    assert 'no Dask scheduler answers' in capsys.readouterr().err
 
 
 ON_A_SMALL_DISK = """

@@ -66,31 +66,6 @@ def test_the_last_of_two_options_for_a_setting_counts(bag, tmp_path):
     assert settings_of(tmp_path, bag, *first)['map.voxel_size_m'] == 0.4
 
 
-@pytest.mark.parametrize(
-    ('name', 'text'),
-    [
-        ('map.voxl_size_m', '0.2'),
-        ('map.voxel_size_m', '0'),
-        ('map.voxel_size_m', 'large'),
-        ('map.mode', 'livee'),
-        ('window.keep_points', '1'),
-        ('frames.base_to_sensor', '[a]'),
-        ('map.min_points', ''),
-    ],
-)
-def test_a_refusal_has_the_words_of_one_in_a_file(bag, tmp_path, capsys, name, text):
-    config = tmp_path / 'my.yaml'
-    config.write_text(f'{name}: {text}\n')
-    replay = ['replay', str(bag), '--output', str(tmp_path / 'out')]
-
-    in_file = refusal(capsys, *replay, '--config', str(config))
-
-    assert refusal(capsys, *replay, '--set', f'{name}={text}') == in_file.replace(
-        f'{config}: ', ''
-    )
-    assert f'surfel-mapper replay: {name}: ' in in_file.replace(f'{config}: ', '')
-
-
 @pytest.mark.parametrize('verb', ['replay', 'filter', 'view'])
 def test_an_unknown_name_is_refused_with_the_nearest(bag, tmp_path, capsys, verb):
     extras.load('rerun')
@@ -102,11 +77,6 @@ def test_an_unknown_name_is_refused_with_the_nearest(bag, tmp_path, capsys, verb
     }
     said = refusal(capsys, verb, *words[verb], '--set', 'frames.bse=robot')
     assert said == f'surfel-mapper {verb}: frames.bse: no such setting; did you mean frames.base?'
-
-
-def test_a_voxel_size_is_refused_in_the_words_of_its_setting(bag, tmp_path, capsys):
-    said = refusal(capsys, 'replay', str(bag), '-o', str(tmp_path / 'out'), '--voxel-size', '-1')
-    assert said.endswith('map.voxel_size_m: -1, expected a value in [0.001, 1000]')
 
 
 @pytest.mark.parametrize('text', ['map.min_points', '=3', 'map.min_points=[1', 'a={b: 1, b: 2}'])

@@ -2,13 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """``surfel-mapper simulate``: its bag, its report, its defaults and refusals."""
 
-import argparse
 import json
 
 import pytest
 
 from surfel_mapper.bags.reader import BagReader
-from surfel_mapper.cli import simulate
 from surfel_mapper.cli.main import main
 from surfel_mapper.simulation import Drive, Lidar, load_simulation, World
 
@@ -68,15 +66,6 @@ def test_every_option_reaches_the_simulation(tmp_path):
     assert simulation.drive == Drive(start=simulation.world.start, speed_m_s=3.0)
     assert (simulation.num_scans, simulation.rolling) == (2, True)
     assert simulation.world.primitives == World.street(seed=4, length_m=21.2).primitives
-
-
-def test_defaults_are_those_of_the_simulation():
-    parser = argparse.ArgumentParser()
-    simulate.add_arguments(parser)
-    simulation = simulate.simulation_of(parser.parse_args(['street', '--output', 'x']))
-    assert simulation.lidar == Lidar()
-    assert simulation.drive == Drive(start=simulation.world.start)
-    assert (simulation.num_scans, simulation.rolling) == (100, False)
 
 
 def test_an_existing_bag_is_replaced_only_with_overwrite(tmp_path, capsys):

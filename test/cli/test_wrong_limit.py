@@ -6,15 +6,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import pytest
 
 from surfel_mapper.budget import VARIABLE
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.files.parquet import read_map
-from surfel_mapper.messages.compressed_image import unpacked
-from surfel_mapper.messages.pointcloud2 import parse_cloud
 from test import extras
 from test.fuzz import corpus
 
@@ -39,15 +36,3 @@ def test_a_tile_is_not_taken_for_damaged(tmp_path, wrong):
     (tmp_path / 'a.parquet').write_bytes(corpus.parquet()[0])
     with pytest.raises(ConfigError, match='4G'):
         read_map(tmp_path / 'a.parquet')
-
-
-def test_a_cloud_is_not_taken_for_damaged(wrong):
-    with pytest.raises(ConfigError, match='4G'):
-        parse_cloud(corpus.clouds()[0][1:])
-
-
-def test_an_image_is_not_taken_for_damaged(wrong):
-    png = corpus.packed_images()[3][1:]
-    message = SimpleNamespace(header=None, format='rgb8; png compressed', data=png)
-    with pytest.raises(ConfigError, match='4G'):
-        unpacked(message, '/image', exact=True)

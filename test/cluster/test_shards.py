@@ -4,18 +4,11 @@
 
 from dataclasses import replace
 from itertools import pairwise
-import math
 
 import numpy as np
 import pytest
 
 from surfel_mapper.cluster.map_reduce import map_bags
-from surfel_mapper.cluster.shards import (
-    difference,
-    LONGEST_S,
-    shard_length_s,
-    SHORTEST_S,
-)
 from surfel_mapper.cluster.workers import never, Workers
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError, MapError
@@ -72,27 +65,6 @@ def test_a_lead_in_that_is_too_short_is_noticed_and_mended(tmp_path):
 
     assert mapped.repeated > 0
     assert mapped.mapper.map == expected.map
-
-
-@pytest.mark.parametrize(
-    ('recorded_s', 'num_workers', 'shards'),
-    [(3.0, 2, 1), (7.0, 2, 2), (40.0, 2, 2), (121.0, 2, 4), (100.0, 3, 3), (3600.0, 1, 60)],
-)
-def test_every_worker_gets_as_many_shards_as_any_other(recorded_s, num_workers, shards):
-    length_s = shard_length_s(recorded_s, num_workers)
-    assert math.ceil(recorded_s / length_s - 1e-9) == shards
-    assert SHORTEST_S <= length_s <= LONGEST_S
-
-
-def test_bags_of_nearly_equal_length_are_not_cut(tmp_path):
-    bag, config = written(tmp_path, 'plain')
-    for shard_s, number in ((RECORDED_S * 0.995, 1), (RECORDED_S / 2 * 0.995, 2), (2.0, 3)):
-        assert len(shards_of(bag, config, shard_s)) == number
-
-
-def test_the_usual_lead_in_is_long_enough(tmp_path):
-    bag, config = written(tmp_path, 'plain')
-    assert map_bags([shards_of(bag, config, 0.5)], Workers()).repeated == 0
 
 
 @pytest.mark.parametrize('every', [1, 3])
@@ -173,18 +145,6 @@ def test_shards_after_a_gap_are_left_out_when_it_is_stopped(tmp_path):
         map_bags(bags, LastFirst(), stopped=after(1))
 
 
-def test_shards_that_do_not_fit_are_left_out_when_it_is_stopped(tmp_path):
-    bag, config = written(tmp_path, 'late poses')
-    short = [replace(shard, lead_s=0.01) for shard in shards_of(bag, config, 1.0)]
-    expected = map_bags([short[:1]], Workers())
-
-    mapped = map_bags([short], Workers(), stopped=after(3))
-
-    assert mapped.interrupted
-    assert mapped.num_shards == 1
-    assert mapped.mapper.map == expected.mapper.map
-
-
 @pytest.mark.parametrize('shards_asked', [5, 6])
 def test_a_bag_in_which_time_is_set_back_is_left_out_when_it_is_stopped(tmp_path, shards_asked):
     """Its first shard was kept if the stop came before it was mapped again."""
@@ -193,23 +153,6 @@ def test_a_bag_in_which_time_is_set_back_is_left_out_when_it_is_stopped(tmp_path
     assert len(shards) == 6
     with pytest.raises(MapError, match='no scan was mapped'):
         map_bags([shards], Workers(), stopped=after(shards_asked))
-
-
-def test_a_stop_while_a_whole_bag_is_mapped_again_leaves_nothing_missing(tmp_path):
-    bag, config = written(tmp_path, 'time set back')
-    expected = in_one_go(bag, config)
-
-    mapped = map_bags([shards_of(bag, config, 1.0)], Workers(), stopped=after(7))  # 6 and it
-
-    assert not mapped.interrupted
-    assert mapped.mapper.map == expected.map
-    assert counted(mapped.counts) == counted(expected.summary())
-
-
-def test_when_it_is_stopped_at_the_end_nothing_is_missing(tmp_path):
-    bag, config = written(tmp_path, 'plain')
-    shards = shards_of(bag, config, 3.0)
-    assert not map_bags([shards], Workers(), stopped=after(2)).interrupted
 
 
 def test_several_bags_make_the_sum_of_their_maps(tmp_path):
@@ -234,12 +177,3 @@ def test_progress_adds_up_to_the_recording(tmp_path):
     told = []
     map_bags([shards_of(bag, config, 1.0)], Workers(), told.append)
     assert sum(told) == pytest.approx(RECORDED_S, abs=0.01)
-
-
-def test_counts_are_taken_from_each_other_at_every_depth():
-    now = {'a': 5, 'b': {'c': 2, 'd': 1}, 'milliseconds': {'x': {'median': 1.0}}}
-    assert difference(now, {'a': 2, 'b': {'c': 2}, 'milliseconds': {}}) == {
-        'a': 3,
-        'b': {'c': 0, 'd': 1},
-        'milliseconds': {'x': {'median': 1.0}},
-    }

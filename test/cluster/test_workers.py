@@ -7,7 +7,6 @@ from pathlib import Path
 import random
 import signal
 import socket
-import sys
 
 import pytest
 
@@ -31,16 +30,6 @@ def die(_):
 
 def refuse(_):
     raise ClusterError('not this one')
-
-
-def what_is_there():
-    """Return whether all that tasks need is loaded, Ctrl-C ignored, and what libraries read."""
-    modules = ('surfel_mapper.cluster.shards', 'surfel_mapper.mapping.kernels.reduction')
-    return (
-        all(name in sys.modules for name in modules),
-        signal.getsignal(signal.SIGINT) is signal.SIG_IGN,
-        os.environ.get('MALLOC_ARENA_MAX'),
-    )
 
 
 def kill_one(executor):
@@ -70,10 +59,6 @@ def test_every_task_is_answered_under_its_number(two_workers):
         answers = dict(executor.run(squared, range(7)))
         assert answers == {number: number * number for number in range(7)}
     assert two_workers.num_workers == 2
-
-
-def test_workers_start_with_the_modules_of_all_tasks(two_workers):
-    assert set(two_workers.client.run(what_is_there).values()) == {(True, True, '1')}
 
 
 @pytest.mark.skipif(not os.path.exists('/proc/net/tcp'), reason='sockets are not shown')
@@ -138,13 +123,6 @@ def listened(executor):
     ]
     found = (row[1].split(':') for row in rows if row[3] == '0A' and row[9] in inodes)
     return {(address, int(port, 16)) for address, port in found}
-
-
-def test_two_workers_make_the_map_of_one_process(two_workers, case):
-    shards, digest = case
-    mapped = map_bags([shards], two_workers)
-    assert mapped.mapper.map.digest() == digest
-    assert mapped.counts['scans']['mapped'] == 60
 
 
 def test_killing_a_worker_in_the_middle_changes_nothing(two_workers, case):

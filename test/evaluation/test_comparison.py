@@ -5,10 +5,13 @@
 import numpy as np
 import pytest
 
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.evaluation.comparison import CloudTruth, completeness, evaluate, spread
 from surfel_mapper.evaluation.map_files import Discs
+from surfel_mapper.evaluation.mesh_truth import load_mesh, MeshTruth
 from surfel_mapper.evaluation.truth import WorldTruth
 from surfel_mapper.simulation import Lidar, Primitive, Simulation, World
+from surfel_mapper.tsdf.mesh import Mesh
 
 SIDE = 40
 
@@ -121,3 +124,70 @@ def test_complete_is_a_map_of_what_the_drive_saw_without_its_noise(ground):
     assert compared(Discs(samples, None), truth)['completeness'] == 1.0
     ahead = samples[:, 0] > np.median(samples[:, 0])
     assert 0.2 < compared(Discs(samples[ahead], None), truth)['completeness'] < 0.8
+
+
+SIZE_M = np.array([12.0, 8.0, 3.0])
+
+
+def off_the_walls(number=2000):
+    """Return positions 2 cm inside of the walls of a room, and the walls' inward normals."""
+    rng = np.random.default_rng(3)
+    position = rng.uniform(-0.5, 0.5, (number, 3)) * (SIZE_M - 0.1)
+    axis, side = rng.integers(0, 3, number), rng.choice([-1.0, 1.0], number)
+    rows = np.arange(number)
+    position[rows, axis] = side * (0.5 * SIZE_M[axis] - 0.02)
+    normal = np.zeros((number, 3))
+    normal[rows, axis] = -side
+    return Discs(position, normal)
+
+
+def box(trimesh, path):
+    """Write a box of twelve triangles."""
+    trimesh.creation.box(SIZE_M).export(path)
+    return path
+
+
+@pytest.mark.parametrize('suffix', ['ply', 'obj', 'stl', 'glb'])
+def test_a_mesh_is_compared_with_its_faces(tmp_path, suffix):
+    trimesh = pytest.importorskip('trimesh', reason='trimesh is not installed (extra meshes)')
+    if suffix == 'glb':  # y is up
+        trimesh.creation.box(SIZE_M[[0, 2, 1]]).export(tmp_path / 'box.glb')
+    path = tmp_path / 'box.glb' if suffix == 'glb' else box(trimesh, tmp_path / f'box.{suffix}')
+
+    result = compared(off_the_walls(), load_mesh(path), radius_m=1.0)
+
+    assert result['compared'] == 2000
+    assert result['position_m']['mean'] == pytest.approx(0.02, abs=1e-6)
+    assert result['position_m']['max'] == pytest.approx(0.02, abs=1e-6)
+    assert result['normal_deg']['max'] < 1e-4
+    assert result['completeness'] > 0.97
+
+
+def test_places_of_a_mesh_are_those_of_every_triangle_alone():
+    trimesh = pytest.importorskip('trimesh', reason='trimesh is not installed (extra meshes)')
+    rng = np.random.default_rng(4)
+    vertices = rng.uniform(-2.0, 2.0, (60, 3))
+    triangles = rng.integers(0, 60, (40, 3)).astype(np.int32)
+    mesh = Mesh(vertices=vertices, triangles=triangles, colors=np.empty((0, 3), np.uint8))
+    asked = rng.uniform(-2.5, 2.5, (200, 3))
+
+    nearest = MeshTruth(mesh).nearest(asked)
+
+    alone = [
+        trimesh.triangles.closest_point(np.tile(corners, (200, 1, 1)), asked)
+        for corners in vertices[mesh.triangles]
+        if np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) > 0.0
+    ]
+    distance_m = np.linalg.norm(np.array(alone) - asked, axis=2).min(axis=0)
+    np.testing.assert_allclose(nearest.distance_m, distance_m, atol=2e-3)
+
+
+def test_points_are_no_mesh(tmp_path):
+    trimesh = pytest.importorskip('trimesh', reason='trimesh is not installed (extra meshes)')
+    for name in ('a.ply', 'a.obj'):
+        trimesh.PointCloud(np.eye(3)).export(tmp_path / name)
+        assert load_mesh(tmp_path / name) is None
+    assert load_mesh(tmp_path / 'map.npz') is None
+    (tmp_path / 'a.stl').write_bytes(bytes(90))
+    with pytest.raises(FileFormatError, match=r'a\.stl'):
+        load_mesh(tmp_path / 'a.stl')

@@ -194,3 +194,24 @@ def test_a_comparison_of_different_times_is_refused():
 def test_incomparable_trajectories_are_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    ('bend', 'noise_m', 'is_straight'),
+    [
+        (0.0, 0.0, True),
+        (0.0, 0.005, True),
+        (1.0, 0.005, False),
+        (1.0, 0.0, False),
+    ],
+)
+def test_a_straight_drive_is_said_to_leave_the_rotation_open(bend, noise_m, is_straight):
+    rng = np.random.default_rng(4)
+    along = 0.5 * np.arange(60)
+    places = np.column_stack([along, bend * np.sin(along / 5.0), np.zeros(60)])
+    noise = rng.normal(0.0, 1.0, (2, 60, 3)) * noise_m
+    true, estimated = np.tile(np.eye(4), (2, 60, 1, 1))
+    true[:, :3, 3], estimated[:, :3, 3] = places + noise[0], places + noise[1]
+    stamps = np.arange(60)
+
+    assert compare(stamps, estimated, stamps, true)['on_a_line'] == is_straight

@@ -237,16 +237,6 @@ def test_the_animation_of_a_drive_has_a_frame_a_scan_and_moves(tmp_path, run):
     assert np.abs(frames[2] - frames[0]).mean() > 1.0
 
 
-def test_the_animation_in_the_readme_takes_fifteen_seconds():
-    with Image.open(ROOT / 'docs/images/drive.webp') as animation:
-        lengths = []
-        for number in range(animation.n_frames):
-            animation.seek(number)
-            animation.load()
-            lengths.append(animation.info['duration'])
-    assert sum(lengths) == 15_000
-
-
 def test_the_picture_of_filters_shows_fewer_points_and_ground(tmp_path, run):
     text = run('filter_picture.py', 'filters.png', folder=tmp_path)
     before, after, ground = map(

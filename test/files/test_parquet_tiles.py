@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A dataset of tiles is the map, whole or as before it was written."""
 
-import errno
-from pathlib import Path
 import shutil
 
 import numpy as np
 import pytest
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files import parquet_tiles
 from surfel_mapper.files.parquet import read_map, write_map
 from surfel_mapper.files.parquet_tiles import (
     dataset_in,
@@ -152,69 +149,3 @@ def test_a_damaged_tile_is_refused_by_name(written, tmp_path, damage):
     path.write_bytes(content[: len(content) // 2 if damage == 'cut' else 0])
     with pytest.raises(FileFormatError, match=str(path)):
         read_tiles(tmp_path / 'map')
-
-
-@pytest.fixture
-def datasets(tmp_path):
-    """Return a fresh dataset and an earlier one of the name wanted."""
-    fresh, wanted = tmp_path / 'fresh', tmp_path / 'map'
-    for directory, content in ((fresh, 'new'), (wanted, 'old')):
-        (directory / 'tile_i=0').mkdir(parents=True)
-        (directory / 'tile_i=0' / 'a').write_text(content)
-    return fresh, wanted
-
-
-def test_a_dataset_that_cannot_take_its_name_leaves_the_earlier_one(datasets, monkeypatch):
-    """It kept a hidden name."""
-    fresh, wanted = datasets
-    rename = Path.rename
-
-    def failing(path, target):
-        if path == fresh:
-            raise OSError(errno.ENOSPC, 'no space')
-        return rename(path, target)
-
-    monkeypatch.setattr(Path, 'rename', failing)
-    with pytest.raises(FileFormatError, match='no space'):
-        parquet_tiles.take_name(fresh, wanted)
-    assert (wanted / 'tile_i=0' / 'a').read_text() == 'old'
-    monkeypatch.undo()
-    parquet_tiles.take_name(fresh, wanted)
-    assert (wanted / 'tile_i=0' / 'a').read_text() == 'new'
-    assert [*wanted.parent.iterdir()] == [wanted]
-
-
-@pytest.mark.parametrize('renamed', ['map', 'fresh'])
-def test_an_interrupt_after_a_rename_leaves_one_whole_dataset(datasets, monkeypatch, renamed):
-    """After the first rename there was none of that name."""
-    fresh, wanted = datasets
-    rename, sources = Path.rename, []
-
-    def interrupted(path, target):
-        found = rename(path, target)
-        sources.append(path.name)
-        if path.name == renamed and sources.count(renamed) == 1:
-            raise KeyboardInterrupt
-        return found
-
-    monkeypatch.setattr(Path, 'rename', interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        parquet_tiles.take_name(fresh, wanted)
-    expected = {'map': 'old', 'fresh': 'new'}[renamed]
-    assert (wanted / 'tile_i=0' / 'a').read_text() == expected
-
-
-def test_a_dataset_that_has_its_name_is_no_failure(datasets, monkeypatch):
-    """An error of the last sync was reported, and the earlier dataset kept a hidden name."""
-    fresh, wanted = datasets
-    sync = parquet_tiles.sync_directory
-
-    def failing(directory):
-        if directory == wanted.parent:
-            raise OSError(errno.EMFILE, 'too many open files')
-        sync(directory)
-
-    monkeypatch.setattr(parquet_tiles, 'sync_directory', failing)
-    parquet_tiles.take_name(fresh, wanted)
-    assert (wanted / 'tile_i=0' / 'a').read_text() == 'new'
-    assert [*wanted.parent.iterdir()] == [wanted]

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import errno
-
 import numpy as np
 import pytest
 
@@ -60,29 +58,3 @@ def test_a_missing_directory_is_named(tmp_path):
         FileFormatError, match=r'nowhere: no file for the points of scans: No such'
     ):
         ScanSpool(tmp_path / 'nowhere')
-
-
-def test_a_full_disk_is_named_and_earlier_scans_stay(tmp_path, monkeypatch):
-    spool = ScanSpool(tmp_path)
-    spool.append(np.ones((5, 3)), {})
-
-    class Full:
-        def __init__(self, file):
-            self._file = file
-
-        def __getattr__(self, name):
-            return getattr(self._file, name)
-
-        def write(self, data):
-            raise OSError(errno.ENOSPC, 'No space left on device')
-
-    whole = spool._file
-    monkeypatch.setattr(spool, '_file', Full(whole))
-    with pytest.raises(FileFormatError, match=r'scan 1 cannot be written .* No space left'):
-        spool.append(np.zeros((5, 3)), {})
-
-    monkeypatch.setattr(spool, '_file', whole)
-    spool.append(np.full((2, 3), 7.0), {})
-    assert len(spool) == 2
-    np.testing.assert_array_equal(spool.points(0), np.ones((5, 3)))
-    np.testing.assert_array_equal(spool.points(1), np.full((2, 3), 7.0))

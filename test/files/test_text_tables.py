@@ -7,11 +7,10 @@ import random
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import pcd, ply, text_table
-from surfel_mapper.files.pose_rows import EXACT_SKEW, MAX_SKEW, rigid_poses
+from surfel_mapper.files.pose_rows import rigid_poses
 from surfel_mapper.files.stamps import nanoseconds, read_dates, read_times
 from surfel_mapper.files.text_table import read_lines, table_rows
 from surfel_mapper.files.trajectory import read_trajectory
@@ -156,25 +155,6 @@ def test_rows_of_a_table_name_their_lines(tmp_path):
     rows = table_rows(read_lines(path), 2)
     assert rows.numbers([1, 0]).tolist() == [[2.0, 1.0], [4.0, 3.0]]
     assert [rows.lines.where(row) for row in range(2)] == [f'{path}:2', f'{path}:4']
-
-
-@pytest.mark.parametrize('off', [1e-6, 1e-4, 9e-4])
-def test_the_nearest_rotation_is_the_polar_factor(off):
-    rng = np.random.default_rng(5)
-    exact = Rotation.random(500, random_state=5).as_matrix()
-    given = exact + rng.uniform(-off, off, exact.shape) / 2.0
-    numbers = np.concatenate([given, rng.normal(size=(500, 3, 1))], axis=2).reshape(-1, 12)
-    poses, skew = rigid_poses(numbers)
-    np.testing.assert_allclose(
-        skew, np.abs(given @ given.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)), atol=1e-15
-    )
-    left, _, right = np.linalg.svd(given)
-    expected = np.where((skew <= EXACT_SKEW)[:, None, None], given, left @ right)
-    assert (skew <= MAX_SKEW).all()
-    # LAPACK is 5e-15 off, these are orthonormal to 5e-16
-    np.testing.assert_allclose(poses[:, :3, :3], expected, rtol=0, atol=2e-14)
-    np.testing.assert_array_equal(poses[:, :3, 3], numbers[:, 3::4])
-    np.testing.assert_array_equal(poses[:, 3], np.tile([0.0, 0.0, 0.0, 1.0], (500, 1)))
 
 
 @pytest.mark.parametrize('odd', [np.nan, np.inf, 3.0, -1.0])

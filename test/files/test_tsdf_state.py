@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """T20: a saved and loaded TSDF is the same; damaged files and other settings are refused."""
 
-from contextlib import contextmanager
 from dataclasses import asdict, replace
-import resource
 
 import numpy as np
 import pytest
@@ -146,24 +144,3 @@ def test_files_of_another_kind_and_truncated_ones_are_refused(tmp_path):
     (tmp_path / 'd').write_bytes(whole[:5000] + b'x' + whole[5001:])
     with pytest.raises(FileFormatError):
         load_tsdf(tmp_path / 'd', FULL)
-
-
-@contextmanager
-def limited_files(size):
-    """Make files end at a size in bytes, as on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-def test_a_full_disk_is_reported_with_the_path(tmp_path):
-    path = tmp_path / 'map.npz'
-    with (
-        limited_files(1000),
-        pytest.raises(FileFormatError, match=rf'^{path}: cannot be written: File too large$'),
-    ):
-        save_tsdf(path, filled(PLAIN).blocks)
-    assert list(tmp_path.iterdir()) == []

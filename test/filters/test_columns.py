@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import FilterError
-from surfel_mapper.filters.base import generator, select, with_columns, with_points
+from surfel_mapper.filters.base import select, with_columns, with_points
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.merging import MergedColumns, PointGroups
 from surfel_mapper.scan import PointTimes
@@ -146,27 +146,3 @@ def test_no_points_leave_no_rows():
     scan = scan_of(np.zeros((0, 3)), value=np.zeros((0, 4)), times=np.zeros(0, np.int64))
     found = MergedColumns(scan.columns, PointGroups.of(np.zeros(0, np.int64), 0))
     assert (found['value'].shape, found['times'].shape) == ((0, 4), (0,))
-
-
-def test_points_can_be_selected_by_mask_or_by_rows():
-    scan = scan_of(np.arange(12.0).reshape(4, 3), row=range(4))
-    assert select(scan, np.ones(4, np.bool_)) is scan
-    by_mask = select(scan, np.array([True, False, False, True]))
-    by_rows = select(scan, np.array([3, 0]))
-    assert (by_mask.columns['row'].tolist(), by_rows.columns['row'].tolist()) == ([0, 3], [3, 0])
-    np.testing.assert_array_equal(by_rows.points, scan.points[[3, 0]])
-    assert by_mask.points.flags.f_contiguous
-    with pytest.raises(ValueError, match=r'mask of shape \(3,\), expected \(4,\)'):
-        select(scan, np.ones(3, np.bool_))
-
-
-def test_random_numbers_follow_seed_and_stamp_alone():
-    one, two = scan_of(np.zeros((1, 3)), stamp_ns=1), scan_of(np.ones((2, 3)), stamp_ns=1)
-    later = scan_of(np.zeros((1, 3)), stamp_ns=-1)
-    assert generator(one, 5).random() == generator(two, 5).random()
-    assert (
-        len(
-            {generator(one, 5).random(), generator(one, -1).random(), generator(later, 5).random()}
-        )
-        == 3
-    )

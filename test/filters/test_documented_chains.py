@@ -11,77 +11,9 @@ norlab_icp_mapper_ros, config/.
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from surfel_mapper.errors import ConfigError
 from surfel_mapper.filters.chain import Chain
 from test.filters.examples import scan_of
-
-ICP = """
-readingDataPointsFilters:
-  - RandomSamplingDataPointsFilter:
-      prob: 0.5
-referenceDataPointsFilters:
-  - SamplingSurfaceNormalDataPointsFilter:
-      knn: 10
-matcher:
-  KDTreeMatcher:
-    knn: 1
-outlierFilters:
-  - TrimmedDistOutlierFilter:
-      ratio: 0.9
-errorMinimizer:
-  PointToPlaneErrorMinimizer
-inspector:
-  VTKFileInspector:
-     baseFileName : vissteps
-     dumpDataLinks : 1
-logger:
-  FileLogger
-"""
-
-
-MAPPER = """
-input:
-  - BoundingBoxDataPointsFilter:
-      xMin: -1.5
-      xMax: 0.5
-      yMin: -1
-      yMax: 1
-      zMin: -1
-      zMax: 0.5
-      removeInside: 1
-
-  - BoundingBoxDataPointsFilter:
-      xMin: -6
-      xMax: -1.5
-      yMin: -2.5
-      yMax: 2.5
-      zMin: -1
-      zMax: 1
-      removeInside: 1
-
-  - AddDescriptorDataPointsFilter:
-      descriptorName: probabilityDynamic
-      descriptorDimension: 1
-      descriptorValues: [0.6] # at first
-
-post:
-    - SurfaceNormalDataPointsFilter:
-        knn: 15
-
-    - CutAtDescriptorThresholdDataPointsFilter:
-        descName: probabilityDynamic
-        useLargerThan: 1
-        threshold: 0.65
-
-mapper:
-  updateCondition:
-    type: distance
-    value: 1.0
-  sensorMaxRange: 200
-"""
-
 
 MAPPER_ROS = """
 input:
@@ -153,25 +85,6 @@ def run(tmp_path, text, *keys):
         chain = Chain.load(f'{path}#{key}')
         scan, _ = chain.run(scan)
     return scan
-
-
-def test_the_filters_of_the_registration_tutorial_thin_and_add_normals(tmp_path):
-    assert abs(len(run(tmp_path, ICP, 'readingDataPointsFilters')) - 1500) < 150
-    assert 'normals' in run(tmp_path, ICP, 'referenceDataPointsFilters').columns
-
-
-def test_modules_that_are_no_filters_of_points_are_refused_by_name(tmp_path):
-    with pytest.raises(ConfigError, match='TrimmedDistOutlierFilter: no such filter'):
-        run(tmp_path, ICP, 'outlierFilters')
-    with pytest.raises(ConfigError, match=r'a mapping, .*#readingDataPointsFilters'):
-        run(tmp_path, ICP)
-
-
-def test_the_filters_of_the_mappers_examples_drop_the_robot_and_thin(tmp_path):
-    found = run(tmp_path, MAPPER, 'input', 'post')
-    x, y, z = found.points.T
-    assert not ((np.abs(y) < 1.0) & (x > -1.5) & (x < 0.5) & (z > -1.0) & (z < 0.5)).any()
-    assert set(found.columns) == {'intensity', 'probabilityDynamic', 'normals'}
 
 
 def test_the_filters_of_the_mapper_for_ros_run_one_after_another(tmp_path):

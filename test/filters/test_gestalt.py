@@ -41,14 +41,6 @@ def test_keypoints_are_points_of_the_scan_at_most_one_a_voxel():
     assert len(np.unique(voxels, axis=0)) == len(found)
 
 
-def test_a_share_of_the_voxels_gets_a_keypoint():
-    scan = scan_of(steps())
-    sizes = dict.fromkeys(('vSizeX', 'vSizeY', 'vSizeZ'), 0.3)
-    all_ = len(filter_of(NAME, **{**EVERY, 'ratio': 0.9999999}, **sizes).apply(scan))
-    some = len(filter_of(NAME, **{**EVERY, 'ratio': 0.25}, **sizes).apply(scan))
-    assert abs(some - 0.25 * all_) < 5.0 * (all_ * 0.25 * 0.75) ** 0.5
-
-
 def test_on_a_plane_or_a_floor_there_are_no_keypoints():
     rng = np.random.default_rng(2)
     wall = rng.uniform([5, -4, 0], [5, 4, 4], (2000, 3))
@@ -84,18 +76,6 @@ def test_relief_holds_mean_and_variance_of_heights_by_ring_and_sector():
     expected[:] = 0.0
     expected[:, 0] = 1.0
     np.testing.assert_array_equal(variances, expected)
-
-
-def test_columns_not_asked_for_are_not_added():
-    flags = {'keepNormals': 0, 'keepGestaltFeatures': 0, 'keepMeans': 1, 'keepCovariances': 1}
-    found = filter_of(NAME, **EVERY, **flags, keepEigenValues=1).apply(scan_of(steps())).columns
-    assert {name: column.shape[1] for name, column in found.items()} == {
-        'means': 3,
-        'covariance': 9,
-        'eigValues': 3,
-    }
-    values = np.linalg.eigvalsh(found['covariance'].reshape(-1, 3, 3))
-    np.testing.assert_allclose(found['eigValues'], values, atol=1e-12)
 
 
 def test_features_are_rows_of_32():

@@ -99,27 +99,6 @@ def test_a_chain_that_cannot_be_built_is_refused_at_once(tmp_path):
         mapper_with(tmp_path, '- shadw')
 
 
-def test_all_kernels_are_compiled_before_the_first_scan(tmp_path):
-    mapper = mapper_with(tmp_path, '- voxel_grid\n- ground\n- saliency: {num_neighbours: 6}')
-    mapper.warm_up()
-    assert mapper.counters.filters == {}
-    insert(mapper, cloud())
-    assert mapper.counters.mapped == 1
-
-
-def test_diagnostics_have_points_and_times_of_every_filter(tmp_path):
-    pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
-    from surfel_mapper.ros.diagnostics import diagnostics
-
-    mapper = mapper_with(tmp_path, '- remove_nan')
-    insert(mapper, cloud())
-    message = diagnostics('node', 0, 0, 'ok', mapper.counters.summary())
-    values = {each.key: each.value for each in message.status[0].values}
-    assert values['filters.1 remove_nan.points_in'] == '500'
-    assert values['filters.1 remove_nan.points_out'] == '500'
-    assert float(values['filters.1 remove_nan.milliseconds.median']) >= 0.0
-
-
 def test_an_update_has_the_filtered_scan_with_the_columns_added(tmp_path):
     chain = '- range_limit: {max_m: 4.0}\n- surface_normal\n'
     points = cloud()

@@ -11,7 +11,7 @@ import pytest
 
 from surfel_mapper.filters.kernels.tensor_voting import closed_form_votes, first_votes
 from surfel_mapper.filters.shapes import as_matrices, PAIRS
-from surfel_mapper.filters.tensor_voting import mean_decay, Voting
+from surfel_mapper.filters.tensor_voting import mean_decay
 from test.filters.examples import filter_of, scan_of
 
 SALIENCY, SPECTRAL = 'saliency', 'spectral_decomposition'
@@ -142,15 +142,6 @@ def test_a_point_without_votes_has_no_normal():
     assert found['surfaceness'].tolist() == [0.0, 0.0]
 
 
-def test_votes_of_unknown_neighbours_are_those_that_thinning_expects():
-    # on an even plane the eigenvalues are 1, 3/4 and 3/4 of the mean decay, on a line 1, 1, 1/2
-    for points, shares in ((PLANE, (0.75, 0.75, 1.0)), (CURVE_X, (0.5, 1.0, 1.0))):
-        votes = Voting.among(points, filter_of(SALIENCY, k=28)).balls()
-        inside = middle(points, points.mean(axis=0), 0.1)
-        found = votes.values[inside] / votes.values[inside][:, 2:]
-        np.testing.assert_allclose(found, np.tile(shares, (inside.sum(), 1)), atol=0.05)
-
-
 @pytest.mark.parametrize('dimension', [1, 2, 3])
 @pytest.mark.parametrize(('sigma', 'radius'), [(0.2, 0.4), (1.0, 0.05), (0.05, 2.0), (9.0, 1e-4)])
 def test_the_mean_decay_is_the_mean_over_the_ball(dimension, sigma, radius):
@@ -187,31 +178,7 @@ def test_density_becomes_even_and_what_is_sparse_stays():
     np.testing.assert_array_equal(found.points, scan.points[rows])
 
 
-def test_curves_keep_as_many_neighbours_within_half_the_radius():
-    line = np.random.default_rng(6).uniform([-5, 0, 0], [5, 0, 0], (20_000, 3))
-    found = filter_of(SPECTRAL, k=20).apply(scan_of(line))
-    assert 25.0 * 10.0 < len(found) < 60.0 * 10.0  # 20 within 0.2 m to each side: 50 a metre
-
-
-def test_more_rounds_thin_more_and_a_smaller_radius_less():
-    scan = scan_of(dense_and_sparse())
-    sizes = [
-        len(filter_of(SPECTRAL, k=20, **each).apply(scan))
-        for each in ({'radius': 0.2, 'itMax': 1}, {'radius': 0.2}, {'itMax': 3}, {})
-    ]
-    assert sizes[0] > sizes[1] > sizes[3]
-    assert sizes[0] > sizes[2] > sizes[3]
-
-
 def test_points_far_from_all_others_are_dropped():
     scan = scan_of(np.concatenate([PLANE[:400], [[0.0, 0.0, 30.0]]]), row=range(401))
     found = filter_of(SPECTRAL, radius=0).apply(scan)
     assert found.columns['row'].tolist() == list(range(400))
-
-
-def test_eigenvalues_descend_and_are_the_sums_of_votes():
-    found = filter_of(SPECTRAL, k=20).apply(scan_of(dense_and_sparse())).columns
-    one, two, three = (found[f'lambda{i}'] for i in (1, 2, 3))
-    assert (one >= two).all()
-    assert (two >= three).all()
-    np.testing.assert_allclose(one, found['sticks'][:, 0] + found['plates'][:, 0] + found['balls'])

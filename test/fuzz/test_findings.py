@@ -225,52 +225,6 @@ def test_moments_that_no_points_have_do_not_reach_a_map(name, value):
     surfel_map.insert(moments)
 
 
-def test_a_level_that_cannot_be_reached_is_refused_with_those_that_can():
-    surfel_map = SurfelMap(0.5)
-    surfel_map.add(np.zeros((2, 3)))
-    coarse = surfel_map.coarsen(13)
-    with pytest.raises(ValueError, match='level: 3, expected 0 to 2 for a map of level 13'):
-        coarse.coarsen(3)
-    assert coarse.coarsen(2).level == 15
-    assert coarse.coarsen(2).num_points == 2
-    with pytest.raises(ValueError, match='level: 16, expected 0 to 15'):
-        SurfelMap(0.5, level=16)
-
-
-@pytest.fixture
-def parquet_map(tmp_path):
-    extras.load('pyarrow')
-    from surfel_mapper.files.parquet import write_map
-
-    path = tmp_path / 'a.parquet'
-    write_map(path, corpus.small_map()[0])
-    return path
-
-
-def rewritten(path, change):
-    """Write a Parquet file again with a changed table."""
-    from pyarrow import parquet
-
-    table = parquet.read_table(path)
-    parquet.write_table(change(table), path, compression='zstd')
-
-
-@pytest.mark.parametrize('kind', ['float64', 'string', 'list'])
-def test_columns_of_a_wrong_type_are_refused_before_they_are_read(parquet_map, kind):
-    import pyarrow
-
-    from surfel_mapper.files.parquet import read_map
-
-    def change(table):
-        place, number = table.schema.get_field_index('sum_x'), len(table)
-        values = {'float64': [0.5], 'string': ['x' * 1_000_000], 'list': [[1]]}[kind] * number
-        return table.set_column(place, 'sum_x', pyarrow.array(values))
-
-    rewritten(parquet_map, change)
-    with pytest.raises(FileFormatError, match=r'column sum_x: .*expected int64'):
-        read_map(parquet_map)
-
-
 @pytest.mark.parametrize(('name', 'value'), [('total', 2**30), ('product', -1), ('view', 2**40)])
 def test_a_file_of_sums_that_no_points_have_is_refused(tmp_path, name, value):
     path = tmp_path / 'a.npz'

@@ -16,7 +16,6 @@ from surfel_mapper.kernels.projection import (
     arc_tangent,
     CAMERA,
     LIDAR,
-    LIDAR_TABLE,
     OUTSIDE,
     project,
     rows_of_table,
@@ -81,19 +80,6 @@ def test_a_lidar_projects_by_azimuth_and_elevation(call, is_full_turn):
     turn = abs(u - column)[both_inside]
     assert np.minimum(turn, 1024 - turn).max() < 1e-2
     np.testing.assert_allclose(v[both_inside], row[both_inside], atol=1e-3)
-
-
-@both
-@pytest.mark.parametrize('beams', [(0.4, 0.3, 0.1, 0.05, -0.2), 0.5 - np.arange(40) ** 1.1 / 60])
-def test_rows_of_uneven_beams_are_interpolated(call, beams):
-    beams, last = np.array(beams, np.float32), len(beams) - 1
-    sensor = [0.0, 2 * math.pi / 512, 0, 0, 512, len(beams), 512, 0]
-    (x, y, z), u, v = projected(call, LIDAR_TABLE, sensor, beams)
-    elevation = np.arctan2(z, np.hypot(x, y))
-    expected = np.interp(elevation, beams[::-1], np.arange(last + 1.0)[::-1])
-    inside = (elevation < beams[0]) & (elevation > beams[-1]) & (u != OUTSIDE)
-    assert inside.sum() > 50
-    np.testing.assert_allclose(v[inside], expected[inside], atol=1e-3)
 
 
 @both

@@ -73,21 +73,6 @@ def test_image_gives_the_field_of_its_points():
     assert by_image.map.digest() == by_points.map.digest()
 
 
-def test_columns_of_pixels_are_those_of_the_points():
-    scans = []
-    for has_image in (True, False):
-        mapper = mapper_with(**LABELS)
-        for image in scene_images():
-            mapper.add_image(image)
-        mapper.add_scan(scan_of(steps_mm(), has_image=has_image))
-        (update,) = mapper.insert_ready()
-        scans.append(update.scan)
-    assert list(scans[0].columns) == list(scans[1].columns) == ['rgba', 'label']
-    assert len(scans[0].columns) == 2
-    for name, column in scans[1].columns.items():
-        np.testing.assert_array_equal(scans[0].columns[name], column)
-
-
 def test_filtered_points_are_not_taken_from_the_image(tmp_path):
     chain = tmp_path / 'chain.yaml'
     box = 'xMin: 0, xMax: 9, yMin: -9, yMax: 9, zMin: 0, zMax: 9, removeInside: 1'

@@ -7,7 +7,6 @@ A lidar stands in a sphere; the mesh has to be that sphere, wherever the poses p
 """
 
 from dataclasses import replace
-import logging
 
 import numpy as np
 import pytest
@@ -123,18 +122,6 @@ def test_a_scan_that_cannot_be_fused_does_not_keep_back_the_others(ends, caplog)
     assert mapper.tsdf.summary()['scans'] == 2
     assert mapper.tsdf.summary()['waiting'] == (0 if ends else 1)
     assert len(mapper.tsdf.mesh()) > 2000
-
-
-@pytest.mark.parametrize('number', [0, 64], ids=['fitted', 'configured'])
-def test_kernels_compile_for_any_sensor(number, caplog):
-    mapper = mapper_with(
-        **{
-            'dynamic.clear': True,
-            'layers.tsdf.sensor_rows': number,
-        }
-    )
-    mapper.warm_up()
-    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
 def test_clearing_the_map_clears_the_field():

@@ -240,16 +240,6 @@ def test_a_voxel_is_empty_once_enough_scans_in_a_row_saw_through_it():
     assert [voxels_cleared_by(count, EMPTY_ROOM, voxels) for _ in range(3)] == [[], [], [INSIDE]]
 
 
-def test_a_hit_or_the_loss_of_the_voxel_begins_the_count_anew():
-    count = counting(min_scans=2)
-    assert voxels_cleared_by(count, EMPTY_ROOM, [INSIDE]) == []
-    assert voxels_cleared_by(count, EMPTY_ROOM, [INSIDE], hit=[INSIDE]) == []
-    assert voxels_cleared_by(count, EMPTY_ROOM, [INSIDE]) == []
-    assert voxels_cleared_by(count, EMPTY_ROOM, [ON_WALL]) == []
-    assert voxels_cleared_by(count, EMPTY_ROOM, [INSIDE]) == []
-    assert voxels_cleared_by(count, EMPTY_ROOM, [INSIDE]) == [INSIDE]
-
-
 def test_voxels_without_rays_stay():
     count = counting(min_scans=1)
     nothing = replace(EMPTY_ROOM, points=np.full_like(EMPTY_ROOM.points, np.nan))

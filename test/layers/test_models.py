@@ -7,10 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.config import Config
-from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import q_xyzw
-from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from test.alignment.street import drifted, street_scans
@@ -136,16 +133,3 @@ def test_without_the_setting_there_are_none(street):
     assert update.models is None
     assert 'models' not in mapper.summary()
     assert 'models' not in update.milliseconds
-
-
-def test_warming_up_changes_nothing():
-    mapper = mapper_with()
-    mapper.warm_up()
-    assert mapper.models.versions == {}
-    assert mapper.map == SurfelMap(0.5)
-
-
-@pytest.mark.parametrize(('name', 'value'), [('min_points', 2), ('extract_period_s', -1.0)])
-def test_values_out_of_bounds_are_refused_by_name(name, value):
-    with pytest.raises(ConfigError, match=f'layers.models.{name}'):
-        Config.from_mapping({f'layers.models.{name}': value})

@@ -62,15 +62,6 @@ def test_coarsening_twice_is_coarsening_at_once():
     assert fine.coarsen(2).coarsen(3).digest() == fine.coarsen(5).digest()
 
 
-def test_coarsening_goes_with_merging():
-    scans = scans_at(1e4)
-    one, other = map_of(scans[:2]), map_of(scans[2:])
-    merged_first = map_of(scans).coarsen(3)
-    coarse = one.coarsen(3)
-    coarse.merge(other.coarsen(3))
-    assert coarse.digest() == merged_first.digest()
-
-
 @pytest.mark.parametrize('level', [1, 4])
 def test_surfels_of_a_coarser_map_are_those_of_its_points(level):
     scans = scans_at(100.0)

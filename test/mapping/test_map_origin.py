@@ -9,7 +9,7 @@ import pytest
 
 from surfel_mapper import SurfelMap
 from surfel_mapper.errors import MapError, MapLimitError
-from surfel_mapper.files import parquet, pcd, ply
+from surfel_mapper.files import parquet
 from surfel_mapper.files.map_state import load_map, save_map
 from test import extras
 
@@ -77,19 +77,6 @@ def test_origins_that_are_not_whole_voxels_apart_are_refused():
     for origin in ([1.0, 2.0], [np.nan, 0.0, 0.0]):
         with pytest.raises(ValueError, match='origin_m'):
             SurfelMap(0.5, origin_m=origin)
-
-
-def test_files_have_outer_coordinates_in_doubles(tmp_path):
-    surfel_map = map_at(UTM)
-    surfels = surfel_map.surfels()
-    ply.write_surfels(tmp_path / 'map.ply', surfels, UTM)
-    pcd.write_surfels(tmp_path / 'map.pcd', surfels, UTM)
-    for columns in (ply.read_points(tmp_path / 'map.ply'), pcd.read_points(tmp_path / 'map.pcd')):
-        assert columns['x'].dtype == np.float64
-        places = np.stack([columns[axis] for axis in 'xyz'], axis=1)
-        np.testing.assert_array_equal(places, surfels.position + UTM)
-    pcd.write_surfels(tmp_path / 'near.pcd', surfels)
-    assert pcd.read_points(tmp_path / 'near.pcd')['x'].dtype == np.float32
 
 
 def test_state_and_parquet_keep_the_origin(tmp_path):

@@ -276,12 +276,6 @@ def test_points_of_other_types_are_refused(dtype):
         Reducer(0.5).reduce(np.zeros((2, 3)).astype(dtype))
 
 
-def test_no_points_give_no_moments():
-    for nothing in ([], np.empty((0, 3)), np.empty(0), [[math.nan] * 3]):
-        moments = Reducer(0.5).reduce(nothing)
-        assert (len(moments), moments.num_points) == (0, 0)
-
-
 def test_an_invalid_pose_or_origin_is_refused():
     points, reducer = np.zeros((1, 3)), Reducer(0.5)
     for pose in (np.eye(3), np.full((4, 4), np.nan), np.diag([1, 1, np.inf, 1])):

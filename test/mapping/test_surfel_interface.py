@@ -24,18 +24,6 @@ def test_a_new_surfel_holds_nothing():
     np.testing.assert_array_equal(surfel.sum_squares, np.zeros(6))
 
 
-@pytest.mark.parametrize('nothing', [Surfel(), np.empty((0, 3))], ids=['surfel', 'batch'])
-def test_adding_or_removing_nothing_changes_nothing(nothing):
-    points = np.random.default_rng(1).normal(size=(9, 3))
-    surfel, expected = Surfel.from_points(points), Surfel.from_points(points)
-
-    surfel.add(nothing)
-    surfel.remove(nothing)
-
-    assert surfel == expected
-    assert Surfel() + nothing == Surfel() - nothing == Surfel()
-
-
 def test_removing_as_many_points_as_held_or_more_empties():
     points = np.random.default_rng(1).normal(size=(9, 3))
     for removed in (points, np.concatenate([points, points]), Surfel.from_points(points)):
@@ -45,16 +33,6 @@ def test_removing_as_many_points_as_held_or_more_empties():
     surfel = Surfel()
     surfel.remove(points[0])
     assert surfel == Surfel()
-
-
-def test_clearing_empties_and_the_surfel_can_be_used_again():
-    points = np.random.default_rng(1).normal(size=(9, 3))
-    surfel = Surfel.from_points(points)
-    surfel.clear()
-    assert surfel == Surfel()
-
-    surfel.add(points)
-    assert surfel == Surfel.from_points(points)
 
 
 def test_operators_are_adding_and_removing():
@@ -95,10 +73,6 @@ def test_the_statistics_of_a_surfel_make_an_equal_one(points, scale):
     assert again == surfel
     tolerance = 2 * EPS * np.abs(points).max()  # the sum is rounded
     np.testing.assert_allclose(again.mean(), surfel.mean(), rtol=0, atol=tolerance)
-
-
-def test_statistics_of_no_points_are_those_of_the_empty_surfel():
-    assert Surfel.from_stats([1.0, 2.0, 3.0], [1.0, 0.5, 0.25, 2.0, 0.125, 3.0], 0) == Surfel()
 
 
 def test_a_position_is_one_point_and_its_scatter_counts_once_others_come():

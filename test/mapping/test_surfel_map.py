@@ -46,16 +46,6 @@ def test_removing_a_scan_leaves_no_trace():
     assert surfel_map.num_points == 5 * 400
 
 
-def test_removing_all_scans_leaves_the_empty_map():
-    surfel_map = SurfelMap(0.2)
-    moments = [surfel_map.add(points, origin) for points, origin in scans_at(0.0)]
-    for scan in moments[::-1]:
-        surfel_map.remove(scan)
-    assert surfel_map.digest() == SurfelMap(0.2).digest() == digest({}, 0.2)
-    assert (surfel_map.num_voxels, surfel_map.num_points) == (0, 0)
-    assert len(surfel_map.surfels()) == 0
-
-
 def test_the_digest_tells_maps_apart():
     points, origin = scans_at(0.0, num=1)[0]
     voxel, unit = np.array([0.5, 0.0, 0.0]), np.array([0.5 / 65536, 0.0, 0.0])
@@ -93,13 +83,6 @@ def test_a_merge_is_the_map_of_the_union_in_any_order():
             whole.merge(parts[number])
         assert whole.digest() == expected
     assert parts[1].digest() == map_of(scans[1:4]).digest()  # the merged map is unchanged
-
-
-def test_a_map_merged_with_itself_holds_everything_twice():
-    scans = scans_at(0.0)
-    surfel_map = map_of(scans)
-    surfel_map.merge(surfel_map)
-    assert surfel_map.digest() == map_of(scans * 2).digest()
 
 
 def test_many_voxels_come_and_go_as_in_a_dict():
@@ -146,18 +129,6 @@ def test_rows_of_voxels_that_left_are_used_again():
             surfel_map.remove(live.pop(0))
     # rows and segments: a fifth more than at step 4 for the chance in counts of voxels
     assert surfel_map.nbytes < 1.2 * settled
-
-
-def test_few_points_are_passed_over():
-    surfel_map = map_of(scans_at(0.0))
-    everything = surfel_map.surfels()
-    for least in (1, 2, 5, 50, 10**6):
-        few = everything.num_points < least
-        expected = everything.select(~few).voxel_index.tolist()
-        assert sorted(surfel_map.surfels(least).voxel_index.tolist()) == sorted(expected)
-        changed = surfel_map.surfels_changed(since=0, min_points=least)
-        assert sorted(changed.voxel_index.tolist()) == sorted(expected)
-    assert len(surfel_map.surfels(0)) == len(surfel_map.surfels(-5)) == len(surfel_map)
 
 
 def test_a_cleared_map_is_as_a_new_one_but_for_its_version():

@@ -145,24 +145,6 @@ def test_a_square_across_an_axis_is_a_perfect_plane(axis):
     assert abs(row['position'] - 0.5).max() <= UNIT_M
 
 
-def test_the_corners_of_a_cube_are_round():
-    row = one_surfel([[a, b, c] for a in (0.25, 0.75) for b in (0.25, 0.75) for c in (0.25, 0.75)])
-    np.testing.assert_allclose(row['eigenvalues'], 8 / 16 / 7, rtol=1e-15)
-    assert row['planarity'] == 0.0
-    assert row['curvature'] == pytest.approx(1 / 3, abs=1e-15)
-    assert abs(np.linalg.norm(row['normal']) - 1.0) <= 1e-15
-
-
-def test_a_plane_turned_into_a_line_loses_its_planarity_as_defined():
-    # points on the two half axes of an ellipse: variances in the ratio of the half axes squared
-    for ratio in (1.0, 0.5, 0.1, 0.01):
-        a, b = 0.25, 0.25 * ratio
-        row = one_surfel(
-            [[0.5 + a, 0.5, 0.5], [0.5 - a, 0.5, 0.5], [0.5, 0.5 + b, 0.5], [0.5, 0.5 - b, 0.5]]
-        )
-        assert row['planarity'] == pytest.approx(2 * ratio**2 / (1 + ratio**2), rel=1e-2)
-
-
 @pytest.mark.parametrize('side', [1.0, -1.0])
 @pytest.mark.parametrize('seed', range(10))
 def test_normals_are_turned_to_the_side_they_are_seen_from(side, seed):

@@ -233,18 +233,6 @@ def test_new_limits_hold_from_the_next_scan_on():
     assert len(window) == 1
 
 
-def test_a_cleared_window_is_as_a_new_one():
-    window, surfel_map = window_with({'max_distance_m': 3.0})
-    for number in range(10):
-        window.insert(scan_at(surfel_map, number, number, [number, 0, 0]))
-    window.clear()
-    assert (len(window), list(window), window.newest, window.nbytes) == (0, [], None, 0)
-    assert surfel_map.digest() == SurfelMap(0.5).digest()
-    for number in range(10):
-        window.insert(scan_at(surfel_map, number, number, [number, 0, 0]))
-    assert len(window) == 4
-
-
 # Clearing
 
 
@@ -289,15 +277,6 @@ def test_voxels_of_settled_scans_are_dropped_too():
     assert surfel_map.num_voxels == 0
     assert len(window) == 3
     assert window.newest.moments.num_points == 0
-
-
-def test_dropping_nothing_changes_nothing():
-    window, surfel_map = window_with({'max_scans': 3})
-    window.insert(scan_at(surfel_map, 0, 0.0, (0.0, 0.0, 0.0)))
-    digest, version = surfel_map.digest(), surfel_map.version
-    assert window.drop_voxels(np.empty((0, 3), int)).shape == (0, 3)
-    assert window.drop_voxels(np.array([[500, 500, 500]])).shape == (0, 3)
-    assert (surfel_map.digest(), surfel_map.version) == (digest, version)
 
 
 @pytest.mark.parametrize(

@@ -111,14 +111,6 @@ def test_the_way_is_measured_anew(window):
     assert surfel_map.digest() == rebuilt(window).digest()
 
 
-def test_moving_nothing_changes_nothing(window):
-    surfel_map, window = window
-    before = surfel_map.version
-
-    assert window.move({}).shape == (0, 3)
-    assert surfel_map.version == before
-
-
 @pytest.mark.parametrize('place', [-1, 3])
 def test_a_place_without_a_scan_is_refused(window, place):
     surfel_map, window = window

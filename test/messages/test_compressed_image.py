@@ -56,15 +56,6 @@ def test_a_jpeg_keeps_its_colours_within_its_losses():
     assert off.mean() < 2.0  # red and blue exchanged it is 60
 
 
-@pytest.mark.parametrize('kind', ['PNG', 'JPEG'])
-def test_grey_and_transparent_images_have_colours_too(kind):
-    grey = scene('color', packed(SMOOTH[..., 1].copy(), 'mono8; compressed', kind)).pixels
-    assert np.abs(grey.astype(int) - SMOOTH[..., 1:2]).mean() < 2.0
-    if kind == 'PNG':
-        clear = np.concatenate([SMOOTH, SMOOTH[..., :1]], axis=2)
-        np.testing.assert_array_equal(scene('color', packed(clear, 'png')).pixels, SMOOTH)
-
-
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
 def test_labels_of_a_png_are_exact(dtype):
     labels = (np.arange(12).reshape(3, 4) * (20 if dtype == np.uint8 else 5000)).astype(dtype)

@@ -144,14 +144,6 @@ def test_a_limited_number_of_images_wait_and_the_oldest_is_dropped():
         depth_scan(CameraImage(image(), None), TOPIC)
 
 
-def test_a_later_calibration_replaces_the_earlier():
-    images = DepthImages()
-    images.add_info('/a', info())
-    images.add_info('/a', info(k=(9.0, 0, 1.5, 0, 9.0, 1.0, 0, 0, 1)))
-    ((_, camera),) = images.add_image('/a', image())
-    assert (camera.fx, camera.fy) == (9.0, 9.0)
-
-
 COLOR_TOPIC = '/camera/color/image'
 RGB = np.random.default_rng(0).integers(0, 256, (3, 4, 3)).astype(np.uint8)
 
@@ -177,11 +169,6 @@ def test_colours_of_any_layout_are_red_green_blue(encoding, stored, padding):
     found = read('color', image(np.ascontiguousarray(stored), encoding, padding))
     np.testing.assert_array_equal(found.pixels, RGB)
     assert (found.stamp_ns, found.frame_id, found.kind) == (5 * 10**9 + 6, 'optical', 'color')
-
-
-def test_grey_is_a_colour():
-    found = read('color', image(RGB[..., 0].copy(), 'mono8'))
-    np.testing.assert_array_equal(found.pixels, np.repeat(RGB[..., :1], 3, axis=2))
 
 
 @pytest.mark.parametrize('big', [False, True])

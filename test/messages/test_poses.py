@@ -60,18 +60,6 @@ def test_odometry_without_a_child_frame_has_the_poses_of_the_base(caplog):
     assert '/odom: child_frame_id is empty' in caplog.text
 
 
-def test_numbers_are_unchanged():
-    entries = Entries()
-    entries.odometry('/odom', STAMP_NS, XYZ)
-    turn = entries[0][3].pose.pose.orientation
-    turn.x, turn.y, turn.z, turn.w = 0.1, 0.2, 0.3, float('nan')
-
-    (pose,) = poses_in('odometry', entries[0][3], base='')
-
-    assert pose.q_xyzw[:3] == (0.1, 0.2, 0.3)
-    assert pose.q_xyzw[3] != pose.q_xyzw[3]
-
-
 @pytest.mark.parametrize('kind', ['odometry', 'tf', 'pose'])
 def test_the_leading_slash_of_ros1_frames_is_left_out(kind):
     entries = Entries()

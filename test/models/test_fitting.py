@@ -347,3 +347,12 @@ def test_invalid_clouds_are_refused(points, viewpoint):
 def test_settings_out_of_bounds_are_refused(settings):
     with pytest.raises(ConfigError, match=next(iter(settings))):
         ModelsConfig(**settings)
+
+
+def test_other_units_are_warned_about(caplog):
+    points = np.random.default_rng(5).uniform(-4.0, 4.0, (3000, 3)) * [1.0, 1.0, 0.0]
+
+    fit(points)
+    assert not caplog.records
+    fit(100.0 * points)
+    assert 'millimetres or centimetres?' in caplog.text

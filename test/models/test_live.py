@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import ModelsLayerConfig
-from surfel_mapper.kernels.layout import INDEX_OFFSET
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models.live import LiveModels
 from surfel_mapper.models.surfel_joining import BLOCK_BITS
@@ -354,19 +353,6 @@ def test_a_ramp_over_itself_is_cut(radius_m, middle_m):
         for place in np.unique(column, axis=0)[::10]:
             heights = local[(column == place).all(axis=1), 2]
             assert heights.max() - heights.min() < 0.9  # the next turn is 1.57 m higher
-
-
-@pytest.mark.parametrize('axis', range(3))
-@pytest.mark.parametrize('voxel', [-INDEX_OFFSET, INDEX_OFFSET - 20])
-def test_planes_at_the_ends_of_the_grid_are_not_joined(axis, voxel):
-    planes = np.concatenate([cells((0.02, 2.0), (0.02, 2.0), z) for z in (0.06, 2.0)])
-    lone = [[1.0, 1.0, 1.0]]
-    points = np.roll(np.concatenate([planes, lone]), axis, axis=1)
-    points[:, axis] += voxel * VOXEL_M
-    lone = points[-1] - voxel * VOXEL_M * np.eye(3)[axis]  # far away
-    _, models = of_points(np.concatenate([points, [lone]]), points[-1])
-    assert [len(models.model.planes), len(models.model.surfaces)] == [2, 0]
-    assert (models.model.labels < 0).sum() == 2
 
 
 def test_sparse_voxels_join_the_plane_that_they_lie_on():

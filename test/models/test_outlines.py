@@ -203,12 +203,6 @@ def test_points_lie_in_one_triangle_if_inside_and_in_none_outside(seed):
     assert set(found) == {0, 1}
 
 
-def test_rectangle_is_two_triangles_beside_other_rings():
-    ladder = [np.array([[9.0, y], [10, y], [10, y + 0.3], [9, y + 0.3]]) for y in (0.1, 1.2, 2.5)]
-    assert len(triangulated([SQUARE])) == 2
-    assert len(triangulated([SQUARE, *ladder])) == 8
-
-
 def test_empty_and_degenerate_rings_give_no_triangles():
     assert triangulated([]).shape == (0, 3, 2)
     assert triangulated([np.array([[0.0, 0], [1, 0], [2, 0]])]).shape == (0, 3, 2)

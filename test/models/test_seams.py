@@ -98,33 +98,6 @@ def test_live_surfaces_meet_within_the_noise(points, size_m, most_deg):
     assert np.mean([surface.rms_m for surface in surfaces]) < 1.5 * NOISE_M
 
 
-def test_seams_after_changes_beside_them_equal_a_batch():
-    points, settings = cylinder(0.3, NOISE_M), ModelsLayerConfig(noise_m=NOISE_M)
-    surfel_map = SurfelMap(0.06)
-    models = LiveModels(settings, surfel_map)
-    surfel_map.add(points, origin=(0.0, 0.0, 5.0))
-    models.update()
-    chart = live_labels(models, points)
-    for surface in models.model.surfaces[:2]:  # its neighbours change at their seams only
-        own = chart == surface.id
-        surfel_map.add(points[own] * [1.03, 1.03, 1.0], origin=(0.0, 0.0, 5.0))
-        update = models.update()
-        assert surface.id in update.updated
-        assert len(update.updated) >= 3
-    batch = LiveModels(settings, surfel_map.copy())
-    batch.update()
-    here, there = live_labels(models, points), live_labels(batch, points)
-    surfaces = {surface.id: surface for surface in batch.model.surfaces}
-    assert len(surfaces) >= 4
-    for surface in models.model.surfaces:
-        own = points[here == surface.id]
-        twin = surfaces[int(there[here == surface.id][0])]
-        assert set(there[here == surface.id]) == {twin.id}
-        local = twin.to_local(surface.lifted(surface.to_local(own)[:, :2]))
-        away_m = np.abs(local[:, 2] - twin.heights(local[:, :2]))
-        assert np.quantile(away_m, 0.9) < NOISE_M  # the history decides where cells begin
-
-
 def test_coverage_is_that_of_own_points():
     points = cylinder(0.3, 0.0)
     model = fit(points, ModelsConfig(voxel_size_m=0.03), (0.0, 0.0, 5.0))

@@ -69,17 +69,6 @@ def test_box_of_a_plane_encloses_it(frame):
     assert max(length_x, length_y) < 2.0 * 2**0.5 + 4 * A
 
 
-def test_patch_in_the_corners_of_large_cells_has_a_shape():
-    config = ModelsConfig(voxel_size_m=0.04, plane_pitch_voxels=100.0)
-    (plane,) = fit(sheet(0.4, 0.4, 0.01), config, (0, 0, 5)).planes
-    shape = shape_of(plane)
-    # a cut leaves half a voxel beside the points, and is rounded down to a 255th of a cell
-    reach = 0.2 + 0.5 * 0.04 + 4.0 / 255
-    assert 0.5 * 0.4**2 < shape.area_m2 < (2.0 * reach) ** 2
-    assert (shape.low[:2] < 0.0).all()
-    assert (shape.high[:2] > 0.0).all()
-
-
 def test_small_board_on_the_edges_of_large_voxels_has_a_shape():
     board = sheet(0.04, 0.04, 0.002, centre=(0.0, 0.0, 0.5), sigma=5e-4)
     _, models = of_points(board, voxel_size_m=1.0)

@@ -77,12 +77,3 @@ def test_ids_stay_when_the_noise_is_found():
     assert before.id in update.updated
     (after,) = models.model.planes
     assert after.id == before.id
-
-
-def test_voxels_of_very_many_points_do_not_overflow_in_larger_ones():
-    surfel_map = map_of(square(0.015), 0.03)
-    moments = surfel_map.moments()
-    for _ in range(20):  # 2^20 times the points: in voxels of 8 times the size beyond the limit
-        surfel_map.merge(surfel_map.copy())
-    assert surfel_map.num_points == 2**20 * moments.num_points
-    assert estimate_noise(surfel_map) == pytest.approx(0.008, rel=0.2)  # of single voxels, clipped

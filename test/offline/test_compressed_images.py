@@ -8,7 +8,7 @@ import pytest
 from surfel_mapper.errors import BagError
 from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
 from test.messages.test_compressed_image import packed, packed_depth
-from test.offline.test_depth import camera_info, IMAGE, image, replayed
+from test.offline.test_depth import camera_info, image, replayed
 from test.offline.test_scene_feed import color_image, COLORED, RED
 
 PACKED = 'sensor_msgs/msg/CompressedImage'
@@ -80,20 +80,3 @@ def test_a_topic_of_another_name_is_refused_with_those_there_are(tmp_path):
     settings = {**SETTINGS, 'input.topics': ['nothing']}
     with pytest.raises(BagError, match=f'no topic /nothing; Image topics: .*{DEPTH_TOPIC}'):
         replayed(recorded(tmp_path / 'bag'), settings)
-
-
-def test_plain_and_packed_images_of_one_camera_are_told_apart_by_name(tmp_path):
-    entries = Entries()
-    camera_info(entries, START_NS - 10)
-    message = image(entries, 0)
-    depth = np.asarray(message.data).view('<u2').reshape(30, 40)
-    add_packed(entries, DEPTH_TOPIC, 1, packed_depth(depth))
-    bag = write_rosbag2(tmp_path / 'bag', entries)
-    assert [topic for topic, kind, *_ in entries if kind == IMAGE] == ['/camera/depth/image']
-    for topic, settings in (
-        ('/camera/depth/image', {}),
-        (DEPTH_TOPIC, {'input.topics': [DEPTH_TOPIC]}),
-    ):
-        plain = {'input.kind': 'depth', 'pose.source': 'identity', **settings}
-        mapper, recording = replayed(bag, plain)
-        assert (recording.topics, mapper.counters.mapped) == ([topic], 1)

@@ -70,21 +70,6 @@ def test_the_scans_left_of_a_kitti_drive_have_their_own_times_and_poses(tmp_path
     np.testing.assert_allclose(found.trajectory.matrices, lidar_poses()[::2], atol=1e-6)
 
 
-@pytest.mark.parametrize('name', ['000007.bin', 'last.bin'])
-def test_more_times_of_a_drive_than_scans_are_refused_if_names_are_not_their_numbers(
-    tmp_path, name
-):
-    path, _, _ = folders.kitti_odometry(tmp_path)
-    velodyne = path / 'velodyne'
-    (velodyne / '000001.bin').unlink()
-    (velodyne / '000002.bin').rename(velodyne / name)
-    says = (
-        'times.txt: 3 rows for 2 scans, expected as many, or scans named by the numbers of .* 2$'
-    )
-    with pytest.raises(FileFormatError, match=says):
-        find_dataset(path)
-
-
 def test_scans_of_a_drive_without_their_oxts_are_registered(tmp_path):
     path, _, stamps_ns = folders.kitti_raw(tmp_path)
     (path / 'oxts' / 'data' / '0000000001.txt').unlink()
@@ -94,31 +79,6 @@ def test_scans_of_a_drive_without_their_oxts_are_registered(tmp_path):
     assert (found.stamps_ns, found.trajectory) == (stamps_ns, None)
     measured = path / 'oxts' / 'data'
     assert found.missing == f'{measured} is not used: no 0000000001.txt in it'
-
-
-@pytest.mark.parametrize(
-    ('make', 'name', 'names'),
-    [
-        (folders.kitti_odometry, 'calib.txt', 'Tr in '),
-        (folders.kitti_raw, 'calib_imu_to_velo.txt', 'R and T in '),
-    ],
-)
-@pytest.mark.parametrize('is_empty', [False, True])
-def test_the_reason_for_registration_names_the_calibration_that_is_missing(
-    tmp_path, make, name, names, is_empty, capsys
-):
-    path, _, _ = make(tmp_path)
-    (file,) = tmp_path.rglob(name)
-    file.unlink()
-    if is_empty:
-        file.touch()
-
-    assert main(['info', str(path)]) == 0
-
-    printed = capsys.readouterr().out
-    assert 'replay takes poses from registration: ' in printed
-    lacks = names if is_empty else ''
-    assert f'is not used: no {lacks}{file}' in printed
 
 
 def test_scans_of_a_data_set_keep_their_times_at_other_poses_without_times(tmp_path):

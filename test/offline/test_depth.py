@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from surfel_mapper import Config, Mapper
-from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.errors import BagError
 from surfel_mapper.messages.images import CameraImage, depth_scan
-from surfel_mapper.offline.bag_recording import early_calibrations
 from surfel_mapper.offline.recording import open_recording
-from surfel_mapper.offline.request import Request, Span
+from surfel_mapper.offline.request import Request
 from surfel_mapper.sensors.depth import PinholeCamera
 from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
 
@@ -118,31 +116,6 @@ def test_a_part_has_the_last_calibration_before_it(tmp_path, infos, focal):
         list(expected.insert_ready())
     assert mapper.counters.mapped == 3
     assert mapper.map.digest() == expected.map.digest()
-
-
-def test_calibrations_repeated_up_to_a_part_are_not_read_from_the_start(tmp_path):
-    entries = Entries()
-    for at in range(80):
-        camera_info(entries, START_NS + at * PERIOD_NS)
-        if at % 60 == 0:
-            camera_info(entries, START_NS + at * PERIOD_NS, topic='/rare/camera_info')
-    span = Span(start_ns=START_NS + 119 * PERIOD_NS)  # its margin begins at number 69
-    with BagReader(write_rosbag2(tmp_path / 'bag', entries)) as reader:
-        found = early_calibrations(reader, {INFO_TOPIC, '/rare/camera_info'}, span)
-    assert found == ['/rare/camera_info']
-
-
-def test_registration_can_be_asked_for(tmp_path):
-    entries = Entries()
-    camera_info(entries, START_NS - 10)
-    image(entries, 0)
-    bag = write_rosbag2(tmp_path / 'bag', entries)
-
-    mapper, recording = replayed(bag, {'input.kind': 'depth'}, poses_from='registration')
-
-    assert recording.config.pose.source == 'registration'
-    assert not recording.config.deskew.enabled
-    assert mapper.counters.mapped == 1
 
 
 def test_an_invalid_camera_is_counted_and_the_next_one_taken(tmp_path):

@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 import re
-import shutil
 
 from mcap.writer import Writer
 import numpy as np
@@ -25,7 +24,7 @@ from surfel_mapper.filters import Chain
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.offline.filtering import filter_clouds
-from test.bags.recorded import CLOUD, drive, NUM_SCANS, ROS1, ROS2, write_ros1
+from test.bags.recorded import CLOUD, drive, ROS1, ROS2, write_ros1
 
 CHAIN = '- range_limit: {min_m: 1}\n- surface_normal: {num_neighbours: 5}\n'
 
@@ -106,16 +105,6 @@ def test_inputs_with_the_same_output_are_refused_before_any_is_written(
     with pytest.raises(FileFormatError, match=re.escape(says)):
         filter_clouds(Chain.from_yaml(CHAIN), inputs, 'out', overwrite=True)
     assert not Path('out').exists()
-
-
-def test_directories_of_bags_keep_their_whole_names(tmp_path, bag):
-    chain = Chain.from_yaml('- range_limit: {min_m: 1}')
-    for name in ('run.1', 'run.2'):
-        shutil.copytree(bag, tmp_path / name)
-    filter_clouds(chain, [tmp_path / 'run.1', tmp_path / 'run.2'], tmp_path / 'out')
-    for name in ('run.1', 'run.2'):
-        with BagReader(tmp_path / 'out' / name) as found:
-            assert found.topics.num_messages(['/points']) == 3
 
 
 @pytest.fixture
@@ -266,34 +255,6 @@ def test_messages_of_other_types_are_copied_with_their_definition(
         assert livox.msgdef.data == definition
         assert livox.digest == digest
         assert [raw for *_, raw in reader.messages([livox])] == LIVOX_RAWS
-
-
-@pytest.mark.parametrize(
-    ('encoding', 'definition', 'says'),
-    [
-        ('ros2msg', '', 'the bag has no definition of it'),
-        ('ros2msg', 'Other other', "no definition of 'livox_ros_driver2/msg/Other'"),
-        ('ros2msg', 'CustomMsg[] inner', 'maximum recursion depth exceeded'),
-        ('ros2msg', '!', 'Could not parse'),
-    ],
-    ids=['none', 'incomplete', 'endless', 'damaged'],
-)
-def test_messages_that_cannot_be_copied_are_left_out_with_a_warning(
-    tmp_path, caplog, encoding, definition, says
-):
-    path = write_mcap(tmp_path / 'a.mcap', encoding, definition)
-    (tmp_path / 'chain.yaml').write_text(CHAIN)
-    files = [str(tmp_path / name) for name in ('chain.yaml', 'a.mcap')]
-    assert main(['filter', *files, '--output', str(tmp_path / 'out')]) == 0
-    livox, log = sorted((record.getMessage() for record in caplog.records), reverse=True)
-    assert livox.startswith(f'{path}: {LIVOX} cannot be copied: {says}')
-    assert livox.endswith('; topics left out: /livox')
-    assert log == (
-        f'{path}: foxglove.Log as json cannot be copied: its messages are not CDR; '
-        'topics left out: /log'
-    )
-    with BagReader(tmp_path / 'out') as reader:
-        assert [(topic.name, topic.count) for topic in reader.topics] == [('/points', NUM_SCANS)]
 
 
 def test_scans_that_a_filter_refuses_are_left_out_and_counted(tmp_path, bag, caplog):

@@ -21,7 +21,6 @@ from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.trajectory import read_trajectory, write_tum
 from surfel_mapper.offline.replay import ReplayOptions
 from surfel_mapper.offline.request import Request
-from surfel_mapper.viz import picture
 from test import extras
 from test.bags.recorded import drive, HEIGHT_M, NUM_SCANS, PERIOD_NS, START_NS, write_rosbag2
 
@@ -111,20 +110,6 @@ def test_the_report_states_heights_and_the_origin_in_the_fixed_frame(near, far):
         [float(height.removesuffix(' m')) for height in view['heights']] for view in data
     )
     np.testing.assert_allclose(found, np.array(expected) + 250.0, rtol=0, atol=1e-9)
-
-
-def test_map_png_has_the_coordinates_of_the_fixed_frame(bag, far, monkeypatch, tmp_path):
-    found = []
-    draw = picture.label
-    monkeypatch.setattr(picture, 'label', lambda ax, frame: (draw(ax, frame), found.append(ax)))
-
-    replayed(bag, tmp_path / 'again', '400000 5400000 250', UTM)
-
-    trajectory = read_trajectory(out_of(far) / 'trajectory.tum').xyz
-    assert all(ax.get_xlabel() == 'x (m)' for ax in found)
-    for ax, axis in zip(found, (1, 2), strict=True):  # from above y is up, from the side z
-        for (low, high), column in ((ax.get_xlim(), 0), (ax.get_ylim(), axis)):
-            assert low < trajectory[:, column].min() <= trajectory[:, column].max() < high
 
 
 @pytest.mark.parametrize('name', ['map.npz', 'map.parquet', 'map.ply', '.'])

@@ -106,33 +106,6 @@ def test_settings_of_the_user_are_kept(tmp_path):
     assert chosen(bag, poses_from='odometry')[0]['pose.source'] == 'odometry'
 
 
-@pytest.mark.parametrize(
-    ('kept', 'frames', 'source', 'reason'),
-    [
-        ((CLOUD, TF, ODOMETRY), MOUNTED, 'tf', '/tf has'),
-        ((CLOUD, '/tf', ODOMETRY), MOUNTED, 'tf', '/tf has'),
-        (
-            (CLOUD, '/tf', ODOMETRY),
-            {'frames.base': 'robot'},
-            'odometry',
-            '/odom has them; not from tf: no transforms lead from odom to lidar',
-        ),
-        (
-            (CLOUD, TF, POSE),
-            {'frames.fixed': 'map'},
-            'pose',
-            '/pose has them; not from tf: no transforms lead from map to lidar; not from '
-            'odometry: no topic',
-        ),
-    ],
-)
-def test_frames_of_the_user_are_kept_and_decide(tmp_path, kept, frames, source, reason):
-    settings, stated = chosen(bag_of(tmp_path, *kept), frames)
-
-    assert plain(settings) == {'pose.source': source, **frames}
-    assert stated.startswith(reason)
-
-
 def test_the_topic_of_the_poses_decides_their_source(tmp_path):
     bag = bag_of(tmp_path, CLOUD, TF, ODOMETRY)
     settings, reason = chosen(bag, pose_topic='/odom')
@@ -195,19 +168,6 @@ def test_scans_with_times_of_their_points_are_deskewed(tmp_path):
 
     registered = {'pose.source': 'registration'}
     assert found == [registered, registered, {**registered, 'deskew.enabled': True}]
-
-
-def test_replay_and_info_say_why_scans_with_times_are_not_deskewed(tmp_path, capsys):
-    folder = write_scans(tmp_path / 'ahead', np.linspace(37.0, 37.1, 100))
-    for arguments, reason in (
-        ([], 'not deskewed: field time: times from 37.0'),
-        (['--poses-from', 'identity'], 'not deskewed: points have times (time), which deskew.'),
-    ):
-        output = str(tmp_path / reason[-9:])
-        assert main(['replay', str(folder), *arguments, '-o', output]) in (0, 4)
-        assert reason in capsys.readouterr().out
-    assert main(['info', str(folder)]) == 0
-    assert 'not deskewed: field time: times from 37.0' in capsys.readouterr().out
 
 
 def test_a_folder_has_no_messages_with_poses(tmp_path):
@@ -298,17 +258,6 @@ def test_las_and_laz_files_are_scans(tmp_path, capsys):
     (tmp_path / 'bad.laz').write_bytes(b'LASF' + bytes(500))
     assert main(['replay', str(tmp_path / 'bad.laz'), '--output', str(tmp_path / 'out')]) == 1
     assert not Path(tmp_path / 'out').exists()
-
-
-def test_surfels_among_scans_are_refused_when_they_are_read(tmp_path, capsys):
-    folder, arguments = write_scans(tmp_path / 'scans'), ['--poses-from', 'identity']
-    assert main(['replay', str(folder), '--output', str(tmp_path / 'out'), *arguments]) == 0
-    (tmp_path / 'out' / 'map.ply').rename(folder / 'map.ply')
-
-    assert main(['replay', str(folder), '--output', str(tmp_path / 'new'), *arguments]) == 1
-
-    assert f'{folder}/map.ply: surfels of a map, expected scans' in capsys.readouterr().err
-    assert not (tmp_path / 'new').exists()
 
 
 def test_the_folder_of_the_scans_is_refused_as_output(tmp_path, capsys):

@@ -151,16 +151,6 @@ def test_several_topics_are_mapped_each_from_its_place_in_the_tree(tmp_path):
     assert mapper.map.digest() == digest_of_two()
 
 
-@pytest.mark.parametrize('source', ['tf', 'odometry'])
-def test_several_topics_are_mapped_from_places_stated_whatever_frame_they_name(tmp_path, source):
-    path = write_rosbag2(tmp_path / 'two', two_sensors(frames=('lidar', 'lidar')))
-    mounts = {'/points': (*MOUNT_M, *NO_TURN), '/rear': (*REAR_M, *NO_TURN)}
-
-    mapper = mapped(path, {'pose.source': source}, topics=BOTH, mounts=mounts)
-
-    assert mapper.map.digest() == digest_of_two()
-
-
 @pytest.mark.parametrize(
     ('settings', 'request_', 'says'),
     [
@@ -269,39 +259,6 @@ def test_a_bag_that_is_cut_off_takes_the_first_of_more_poses(tmp_path):
     assert mapper.map.digest() == digest_of(range(number))
 
 
-@pytest.mark.parametrize(
-    ('span', 'number', 'missing'),
-    [
-        ({}, 5, 6),
-        ({'every': 2}, 4, 5),
-        ({'every': 5}, 5, 6),
-        ({'start_s': 0.15}, 5, 6),
-    ],
-)
-def test_a_pose_that_the_last_scan_lacks_is_reported_before_the_first(
-    tmp_path, bag, span, number, missing
-):
-    request = Request(path=bag, poses=pose_file(tmp_path, 'kitti', range(number)), **span)
-    says = f'kitti: {number} poses, none for scan {missing}; expected one for every scan'
-    with pytest.raises(BagError, match=says), open_recording(request, Config()):
-        pass
-
-
-@pytest.mark.parametrize(
-    ('span', 'number', 'numbers'),
-    [
-        ({'every': 2}, 5, [0, 2, 4]),
-        ({'duration_s': 0.25}, 3, [0, 1, 2]),
-        ({'start_s': 0.15, 'every': 3}, 6, [2, 5]),
-        ({'start_s': 0.05, 'every': 3}, 5, [1, 4]),
-    ],
-)
-def test_poses_that_no_scan_of_the_part_needs_may_be_missing(tmp_path, bag, span, number, numbers):
-    mapper = mapped(bag, poses=pose_file(tmp_path, 'kitti', range(number)), **span)
-
-    assert mapper.map.digest() == digest_of(numbers)
-
-
 def test_two_sources_of_poses_are_refused(tmp_path, bag):
     with pytest.raises(BagError, match='poses of /odom or of'):
         mapped(bag, poses=pose_file(tmp_path, 'tum'), pose_topic='/odom')
@@ -335,39 +292,6 @@ def test_a_folder_of_scans_gives_the_map_of_the_bag(tmp_path, suffix, format_):
     folder = scan_folder(tmp_path, suffix)
 
     mapper = mapped(folder, MOUNTED, poses=pose_file(tmp_path, format_))
-
-    assert mapper.map.digest() == digest_of(range(6))
-
-
-def test_a_part_of_a_folder_is_mapped(tmp_path):
-    folder, file = scan_folder(tmp_path, '.bin'), pose_file(tmp_path, 'kitti')
-
-    mapper = mapped(folder, MOUNTED, poses=file, start_s=0.1, duration_s=0.35, every=2)
-
-    assert mapper.map.digest() == digest_of([1, 3])
-
-
-@pytest.mark.parametrize(
-    ('span', 'number', 'numbers'),
-    [
-        ({'every': 2}, 5, [0, 2, 4]),
-        ({'duration_s': 0.25}, 3, [0, 1, 2]),
-        ({'start_s': 0.1, 'every': 3}, 5, [1, 4]),
-    ],
-)
-def test_poses_that_no_file_of_the_part_needs_may_be_missing(tmp_path, span, number, numbers):
-    folder, file = scan_folder(tmp_path, '.bin'), pose_file(tmp_path, 'kitti', range(number))
-
-    mapper = mapped(folder, MOUNTED, poses=file, **span)
-
-    assert mapper.map.digest() == digest_of(numbers)
-
-
-@pytest.mark.parametrize('unit_ns', [1, 1000])
-def test_scans_are_timed_by_their_names_where_there_are_more_poses(tmp_path, unit_ns):
-    folder = scan_folder(tmp_path, '.ply', (STAMPS // unit_ns).tolist())
-
-    mapper = mapped(folder, MOUNTED, poses=pose_file(tmp_path, 'tum', [0, 1, 2, 5]))
 
     assert mapper.map.digest() == digest_of(range(6))
 

@@ -13,7 +13,7 @@ from surfel_mapper.errors import BagError, FileFormatError
 from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.request import Request
-from surfel_mapper.offline.scan_times import rows_of, times_in_names
+from surfel_mapper.offline.scan_times import times_in_names
 from test.bags.recorded import HEIGHT_M
 from test.offline.test_recording import digest_of, mapped, MOUNTED, pose_file, scan_folder
 
@@ -71,14 +71,6 @@ def test_times_in_a_file_are_those_of_the_scans(tmp_path, place, name, lines, ex
         assert Path(found['times_from']).samefile(path)
 
     assert mapped(folder, MOUNTED, poses=poses).map.digest() == digest_of(range(6))
-
-
-def test_times_beside_the_working_directory_are_found(tmp_path, monkeypatch):
-    folder = scan_folder(tmp_path, '.bin')
-    write_lines(tmp_path / 'times.txt', SECONDS)
-    monkeypatch.chdir(folder)
-
-    assert opened(Path('.'))[0] == TIMES_NS
 
 
 def test_names_that_are_times_come_before_a_file_of_times(tmp_path):
@@ -225,19 +217,6 @@ def test_more_poses_without_times_are_refused_unless_all_names_are_numbers_of_po
     assert not output.exists()
 
 
-@pytest.mark.parametrize('number', [5, 7])
-def test_numbers_in_names_are_no_seconds_of_stamped_poses(tmp_path, number):
-    folder = scan_folder(tmp_path, '.bin', range(6))
-    file = pose_file(tmp_path, 'kitti', range(number))
-    write_lines(tmp_path / 'times.txt', range(number))  # stamps of the poses
-    (tmp_path / 'apart').mkdir()
-    folder = folder.rename(tmp_path / 'apart' / 'scans')
-
-    says = f'{number} poses for 6 scans in .*, expected as many, or times of the scans: in their'
-    with pytest.raises(BagError, match=says):
-        opened(folder, poses=file)
-
-
 @pytest.mark.parametrize('number', [4, 9])
 def test_poses_of_other_times_are_interpolated_at_those_of_a_file(tmp_path, number):
     folder = scan_folder(tmp_path, '.bin')
@@ -253,14 +232,6 @@ def test_poses_of_other_times_are_interpolated_at_those_of_a_file(tmp_path, numb
     assert found == str(folder / 'times.txt')
     assert mapper.map.digest() == digest_of(range(min(number - 1, 6)))
     assert dict(mapper.counters.dropped) == ({} if number == 9 else {'no_pose': 3})
-
-
-def test_a_longer_file_of_times_belongs_to_scans_by_their_numbers(tmp_path):
-    numbers = [1, 2, 4, 5, 6, 8]
-    folder = scan_folder(tmp_path, '.bin', [f'{number:06}' for number in numbers])
-    write_lines(tmp_path / 'times.txt', [f'{0.25 * row}' for row in range(10)])
-
-    assert opened(folder)[0] == [number * 250_000_000 for number in numbers]
 
 
 @pytest.mark.parametrize(
@@ -299,43 +270,3 @@ def test_the_report_states_the_first_number_and_the_trajectory_has_the_times(tmp
     assert found.xyz[:, 0].tolist() == [0.5 * n for n in range(6)]
     summary = json.loads((output / 'summary.json').read_text())
     assert summary['times_from'] == str(folder / 'times.txt')
-
-
-@pytest.mark.parametrize(
-    ('names', 'number', 'rows'),
-    [
-        (['b', 'c'], 2, [0, 1]),
-        (['5', '7'], 2, [0, 1]),
-        (['5', '7'], 8, [5, 7]),
-        (['5', '7'], 7, None),
-        (['5', '7'], 1, None),
-        (['5', '5.0'], 8, None),
-        (['05', '5'], 8, None),
-        (['5', 'x'], 8, None),
-        (['7'], 8, [7]),
-    ],
-)
-def test_rows_are_those_in_order_or_of_the_numbers_in_names(names, number, rows):
-    assert rows_of([Path(f'{name}.pcd') for name in names], number) == rows
-
-
-def test_no_stamp_of_a_pose_is_looked_up_by_an_assumed_time(tmp_path):
-    folder = scan_folder(tmp_path, '.bin', range(6))
-    rows = [f'{0.1 * n} {0.5 * n} 0 {HEIGHT_M} 0 0 0 1' for n in range(6)]
-    poses = write_lines(tmp_path / 'poses.tum', rows)
-    for number in (2, 3):
-        (folder / f'{number}.bin').unlink()
-
-    with pytest.raises(BagError, match=r'6 poses for 4 scans in .*, expected as many, or times'):
-        opened(folder, poses=poses)
-
-
-def test_as_many_poses_belong_to_scans_in_order_also_at_stamps_like_assumed_times(tmp_path):
-    folder = scan_folder(tmp_path, '.bin')
-    rows = [f'{0.1 * n + 0.1:.1f} {0.5 * n} 0 {HEIGHT_M} 0 0 0 1' for n in range(6)]
-    poses = write_lines(tmp_path / 'poses.tum', rows)
-
-    stamps, found = opened(folder, poses=poses)
-
-    assert (stamps, found['times_from']) == ([n * 10**8 for n in range(1, 7)], 'poses')
-    assert mapped(folder, MOUNTED, poses=poses).map.digest() == digest_of(range(6))

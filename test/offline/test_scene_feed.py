@@ -69,25 +69,6 @@ def test_a_topic_that_is_not_in_the_bag_is_refused(tmp_path):
         replayed(recorded(tmp_path), settings)
 
 
-def test_a_part_has_the_calibration_from_the_start_of_the_bag(tmp_path):
-    entries, rng = Entries(), np.random.default_rng(3)
-    across = rng.uniform(-0.4, 0.4, (4000, 2))
-    wall = np.column_stack([across, np.full(4000, 1.2)]).astype(np.float32)
-    camera_info(entries, START_NS - 10, topic='/camera/color/camera_info')
-    for scan in range(0, 75, 5):
-        entries.cloud('/lidar', START_NS + scan * PERIOD_NS, wall, frame_id='optical')
-        color_image(entries, scan, late_ns=-1000)
-    entries.sort(key=lambda entry: entry[2])
-    bag = write_rosbag2(tmp_path / 'bag', entries)
-    settings = {**COLORED, 'input.kind': 'cloud', 'input.topics': ['/lidar']}
-
-    mapper, _ = replayed(bag, settings, start_s=6.0)
-
-    assert mapper.counters.mapped == 3
-    assert mapper.counters.messages_ignored == {}
-    assert RED in set(map(tuple, mapper.tsdf.mesh().colors.tolist()))
-
-
 @pytest.mark.parametrize('number', [3, 80])
 def test_images_without_camera_info_beside_a_lidar_cost_no_scan(tmp_path, number):
     entries, rng = Entries(), np.random.default_rng(3)

@@ -16,9 +16,8 @@ from surfel_mapper.geometry import q_xyzw
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.pipeline.window_aligner import WindowAligner
-from test.alignment.street import drifted, relative_errors, street_scans
+from test.alignment.street import drifted, street_scans
 from test.fields import config_of
 
 NUM_SCANS = 8
@@ -111,29 +110,6 @@ def test_scans_of_another_sensor_are_no_key_scans_for_its_place():
     assert set(aligned.solution.residuals) == {(1, 0), (9, 1), (9, 0)}
 
 
-def test_errors_of_relative_poses_fall(drive):
-    mapper, _ = mapped(drive)
-
-    aligned = mapper.align()
-
-    found = relative_errors(aligned.T_map_sensor, drive[1], NUM_SCANS - 1)
-    drift = relative_errors(drive[2], drive[1], NUM_SCANS - 1)
-    assert found[0] < drift[0] / 10.0
-    assert found[1] < drift[1] / 10.0
-
-
-def test_limits_of_range_and_columns_hold_for_moved_scans(drive):
-    scans = [
-        replace(scan, points=scan.points.astype(dtype))
-        for scan, dtype in zip(drive[0], [np.float32, np.float64] * 4, strict=True)
-    ]
-    limits = {'input.min_range_m': 4.0, 'input.max_range_m': 30.0, 'map.intensity': True}
-    mapper, _ = mapped((scans, *drive[1:]), limits)
-
-    assert mapper.align().num_moved > 0
-    assert mapper.map.digest() == rebuilt(mapper, scans).digest()
-
-
 @pytest.mark.parametrize(
     ('far_m', 'settings'),
     [
@@ -188,41 +164,6 @@ def test_filtered_points_stay_out_after_an_alignment(drive, tmp_path):
     assert mapper.map.digest() == rebuilt(mapper, kept).digest()
 
 
-def test_cleared_voxels_stay_empty_after_an_alignment(drive):
-    mapper, _ = mapped(drive)
-    center = tuple(drive[2][3][:3, 3])
-    mapper.clear_region(Ball(center, 8.0))
-    num_points = mapper.map.num_points
-
-    assert mapper.align().num_moved > 0
-    assert mapper.map.num_points == num_points
-
-
-def test_later_scans_are_corrected_like_the_newest(drive):
-    mapper, _ = mapped(drive, number=6)
-    aligned = mapper.align()
-
-    update = feed(mapper, drive, [6])[-1]
-
-    step = np.linalg.inv(drive[2][5]) @ drive[2][6]
-    np.testing.assert_allclose(
-        update.T_map_sensor, aligned.T_map_sensor[-1] @ step, rtol=0, atol=1e-9
-    )
-    np.testing.assert_allclose(
-        aligned.T_map_fixed @ drive[2][5], aligned.T_map_sensor[-1], rtol=0, atol=1e-9
-    )
-
-
-def test_aligning_again_moves_next_to_nothing(drive):
-    mapper, _ = mapped(drive)
-    mapper.align()
-
-    again = mapper.align()
-
-    assert again.largest_m < 0.01
-    assert mapper.map.digest() == rebuilt(mapper, drive[0]).digest()
-
-
 def test_the_window_is_aligned_every_few_scans(drive):
     mapper, updates = mapped(drive, {'align.every_scans': 3})
 
@@ -248,15 +189,6 @@ def test_changes_and_removals_of_an_update_cover_the_alignment(drive):
     known |= {tuple(i) for i in update.changed.voxel_index.tolist()}
     known -= {tuple(i) for i in update.removed_voxel_index.tolist()}
     assert known == {tuple(i) for i in mapper.map.surfels(5).voxel_index.tolist()}
-
-
-def test_moved_scans_leave_the_window_exactly(drive):
-    mapper, _ = mapped(drive, {'window.max_scans': 4}, number=4)
-    mapper.align()
-
-    feed(mapper, drive, [4, 5])
-
-    assert mapper.map.digest() == rebuilt(mapper, drive[0][2:6]).digest()
 
 
 def test_clearing_forgets_the_correction(drive):
@@ -316,17 +248,3 @@ def test_scans_whose_columns_were_not_kept_are_refused(drive):
 
     with pytest.raises(AlignmentError, match='0 of 3 scans'):
         mapper.align()
-
-
-def test_a_mapper_may_be_restored_to_its_own_map(drive):
-    mapper, _ = mapped(drive, {}, number=3)
-    digest, scans = mapper.map.digest(), list(mapper.window)
-    mapper.restore(mapper.map, scans)
-    assert (mapper.map.digest(), len(mapper.window)) == (digest, 3)
-
-
-def test_the_first_scan_alone_is_nothing_to_align_or_to_warn_of(drive, caplog):
-    _, updates = mapped(drive, {'align.every_scans': 1}, number=2)
-
-    assert [update.alignment is not None for update in updates] == [False, True]
-    assert not caplog.records

@@ -120,63 +120,6 @@ def test_the_newest_checkpoint_is_used_whatever_the_clock_was(tmp_path, clock, a
     assert after.map.digest() == mapper.map.digest()
 
 
-def hostile_checkpoints(path):
-    """Replace a checkpoint by each thing that is none; yield after each."""
-    content = path.read_bytes()
-    for changed in (b'', b'PK', content[:-100], content[:200] + b'x' + content[201:], b'0' * 9999):
-        path.write_bytes(changed)
-        yield changed[:9]
-    path.unlink()
-    path.symlink_to(path)
-    yield 'a link to itself'
-    path.unlink()
-    path.symlink_to('/dev/zero')
-    yield 'a device'
-    path.unlink()
-    os.mkfifo(path)
-    yield 'a pipe'
-    path.unlink()
-    path.mkdir()
-    yield 'a directory'
-
-
-def test_whatever_the_newest_checkpoint_is_the_one_before_is_used(tmp_path, clock):
-    mapper = mapper_in(tmp_path)
-    saving, (newest, _) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
-    digests = []
-    for stamp_s in (1.0, 2.0):
-        drive(mapper, stamp_s)
-        clock.now_s += 10.0
-        saving.save_if_due()
-        digests.append(mapper.map.digest())
-    for name in hostile_checkpoints(newest):
-        after = mapper_in(tmp_path, map__load='latest')
-        load_start(after)
-        assert after.map.digest() == digests[0], name
-
-
-def test_a_checkpoint_for_which_there_is_no_memory_is_passed_over(tmp_path, clock, monkeypatch):
-    mapper = mapper_in(tmp_path)
-    saving, (newest, _) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
-    for stamp_s in (1.0, 2.0):
-        drive(mapper, stamp_s)
-        clock.now_s += 10.0
-        saving.save_if_due()
-    load, tried = checkpoints.load_mapper, []
-
-    def scarce(path, *args):
-        tried.append(path)
-        if path == newest:
-            raise MemoryError
-        return load(path, *args)
-
-    monkeypatch.setattr(checkpoints, 'load_mapper', scarce)
-    after = mapper_in(tmp_path, map__load='latest')
-    load_start(after)
-    assert tried == [*checkpoint_paths(mapper.config.output)]
-    assert after.map.num_voxels
-
-
 def test_a_map_in_tiles_is_a_start_too(tmp_path):
     extras.load('pyarrow')
     mapper = mapper_in(tmp_path)
@@ -254,44 +197,6 @@ def test_a_failure_without_any_checkpoint_says_so(tmp_path, clock):
     assert saving.problem.endswith('expected a directory); there is no good one')
 
 
-def test_a_checkpoint_that_fails_after_its_layers_leaves_those_of_the_one_before(
-    tmp_path, clock, monkeypatch
-):
-    mapper = mapper_in(tmp_path, **{'layers.tsdf.enabled': True})
-    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
-    drive(mapper, 1.0)
-    saving.save()
-    digest = mapper.map.digest()
-    field = newest.with_suffix('.tsdf.npz').read_bytes()
-
-    def full(*_):
-        raise FileFormatError('no space')
-
-    monkeypatch.setattr(saved_state, 'save_map', full)
-    for stamp_s in (2.0, 3.0):
-        drive(mapper, stamp_s)
-        with pytest.raises(FileFormatError, match='no space'):
-            saving.save()
-        assert newest.with_suffix('.tsdf.npz').read_bytes() != field
-        assert before.with_suffix('.tsdf.npz').read_bytes() == field
-        assert load_map(before)[0].digest() == digest
-
-
-def test_a_cut_checkpoint_takes_the_place_of_no_whole_one(tmp_path, clock, monkeypatch):
-    mapper = mapper_in(tmp_path)
-    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
-    drive(mapper, 1.0)
-    saving.save()
-    digest = mapper.map.digest()
-    drive(mapper, 2.0)
-    saving.save()
-    newest.write_bytes(newest.read_bytes()[:-100])
-    drive(mapper, 3.0)
-    saving.save()
-    assert load_map(newest)[0].digest() == mapper.map.digest()
-    assert load_map(before)[0].digest() == digest
-
-
 def test_a_checkpoint_is_not_written_through_a_link(tmp_path, clock):
     mapper = mapper_in(tmp_path)
     newest, _ = checkpoint_paths(mapper.config.output)
@@ -312,14 +217,6 @@ def test_the_oldest_scans_leave_beyond_the_bytes_of_the_map():
     expected = mapper_with()
     drive(expected, *(scan.stamp_ns / 1e9 for scan in mapper.window))
     assert mapper.map.digest() == expected.map.digest()
-
-
-def test_half_of_the_machine_is_the_limit_by_default():
-    mapper, unlimited = mapper_with(window__max_scans=5), mapper_with()
-    total = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
-    assert 0 < mapper.window.max_total_bytes <= total // 2
-    assert unlimited.window.max_total_bytes == 0
-    assert not unlimited.window.keeps_scans
 
 
 def test_a_file_in_place_of_the_directory_is_reported(tmp_path, clock):

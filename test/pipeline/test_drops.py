@@ -2,13 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mapper: scans and points that are left out are counted and logged."""
 
-from dataclasses import replace
 import logging
 
 import numpy as np
 import pytest
 
-from surfel_mapper.counters import MOST_FRAMES, OTHERS
 from test.pipeline.made_scans import (
     add_pose,
     assert_counts_add_up,
@@ -87,26 +85,6 @@ def test_a_scan_that_the_map_refuses_is_dropped_and_the_next_one_mapped():
     assert_counts_add_up(mapper)
 
 
-@pytest.mark.parametrize('threads', [1, 2])
-@pytest.mark.parametrize(('name', 'switch'), [('intensity', 'intensity'), ('rgb', 'color')])
-def test_a_cloud_whose_column_has_two_numbers_a_point_is_bad_only_if_they_are_summed(
-    name, switch, threads, caplog
-):
-    first, second = scan_at(1.0), scan_at(2.0)
-    pair = np.ones((len(first), 2), np.float32)
-    bad, good = replace(first, columns={name: pair}), replace(second, columns={name: pair[:, 0]})
-    settings = {'pose__source': 'identity', 'map__threads': threads}
-    summing, other = mapper_with(**settings, **{f'map__{switch}': True}), mapper_with(**settings)
-    for scan in (bad, good):
-        summing.add_scan(scan)
-    assert [update.stamp_ns for update in summing.insert_ready()] == [good.stamp_ns]
-    assert dropped(summing) == {'bad_cloud': 1}
-    assert f'column {name}: shape (40, 2), expected (40,)' in caplog.text
-    assert_counts_add_up(summing)
-
-    assert len(insert(other, bad, good)) == 2
-
-
 def test_a_warning_names_the_cause_once_a_second_but_every_drop_is_counted(caplog):
     mapper = mapper_with()
     with caplog.at_level(logging.WARNING):
@@ -116,16 +94,3 @@ def test_a_warning_names_the_cause_once_a_second_but_every_drop_is_counted(caplo
     assert 1 <= sum('no frame_id' in text for text in texts) < 20
     assert any("in frame 'lidar' dropped: it has no points" in text for text in texts)
     assert dropped(mapper)['empty_frame_id'] == 20
-
-
-def test_frame_names_without_end_do_not_pile_up():
-    mapper = mapper_with(pose__source='identity')
-    for number in range(MOST_FRAMES + 50):
-        scan = scan_at(1.0 + number, frame_id=f'lidar_{number}')
-        insert(mapper, scan, scan)  # the second is a repetition
-    assert mapper.counters.mapped == MOST_FRAMES + 50
-    assert dropped(mapper) == {'stamp_repeated': MOST_FRAMES + 50}
-    by_frame = mapper.counters.dropped_by_frame
-    assert len(by_frame) == MOST_FRAMES + 1
-    assert by_frame[OTHERS]['stamp_repeated'] == 50
-    assert_counts_add_up(mapper)

@@ -19,12 +19,10 @@ from surfel_mapper.files.map_state import load_map
 from surfel_mapper.layers import Layer
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow
-from surfel_mapper.pipeline.drops import described
 from surfel_mapper.pipeline.layer_stack import LayerStack
 from surfel_mapper.pipeline.loop_closer import LoopCloser
 from surfel_mapper.pipeline.preparation import Preparation
 from surfel_mapper.pipeline.saved_state import save_mapper
-from surfel_mapper.pipeline.window_aligner import WindowAligner
 from test.pipeline.made_scans import add_pose, assert_counts_add_up, insert, mapper_with, scan_at
 
 ERRORS = [MemoryError(), ZeroDivisionError('division by zero')]
@@ -167,55 +165,11 @@ def test_a_layer_that_fails_three_times_in_a_row_is_switched_off(fragile, caplog
     assert 'layers_off' not in mapper.summary()
 
 
-def test_a_layer_that_follows_but_cannot_clear_is_switched_off_too(fragile, monkeypatch):
-    """Each success of the one forgave a failure of the other."""
-
-    def broken(self, inserted):
-        raise MemoryError
-
-    monkeypatch.setattr(fragile, 'voxels_to_clear', broken)
-    mapper = mapper_with()
-    drive(mapper, 1.0, 2.0)
-    assert not mapper.counters.layers_off
-    drive(mapper, 3.0, 4.0)
-    assert mapper.fragile.stamps == [1, 2]
-    assert mapper.counters.messages_ignored == {'fragile': 3}
-    assert mapper.counters.layers_off == {'fragile': 'MemoryError'}
-
-
-def test_failures_of_a_layer_without_results_are_not_in_a_row_if_some_succeed(
-    fragile, monkeypatch
-):
-    """Only a result ended a row of failures, and not every layer has one."""
-    fails = iter([True, True, False, True, True, False])
-
-    def follow(self, inserted):
-        if next(fails):
-            raise MemoryError
-
-    monkeypatch.setattr(fragile, 'follow', follow)
-    mapper = mapper_with()
-    drive(mapper, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
-    assert mapper.counters.messages_ignored == {'fragile': 4}
-    assert not mapper.counters.layers_off
-
-
 def switched_off(fragile, mapper):
     fragile.error = RuntimeError('broken')
     drive(mapper, 1.0, 2.0, 3.0)
     fragile.error = None
     assert 'fragile' in mapper.counters.layers_off
-
-
-def test_a_layer_that_is_off_takes_new_settings_until_it_is_on_again(fragile, monkeypatch):
-    """It kept those of the time when it failed."""
-    taken = []
-    monkeypatch.setattr(fragile, 'reconfigure', lambda self, config: taken.append(config))
-    mapper = mapper_with()
-    switched_off(fragile, mapper)
-    changed = mapper_with(window__max_scans=7).config
-    mapper.reconfigure(changed)
-    assert taken == [changed]
 
 
 @pytest.mark.parametrize('name', ['finish', 'summary'])
@@ -263,30 +217,3 @@ def test_scans_that_a_layer_cannot_use_do_not_switch_it_off(fragile):
     fragile.error = None
     (update,) = drive(mapper, 5.0)
     assert update.fragile == 1
-
-
-def test_an_alignment_without_memory_leaves_the_window(monkeypatch, caplog):
-    settings = {'align__every_scans': 2, 'window__keep_points': True}
-    mapper, expected = mapper_with(**settings), mapper_with(window__keep_points=True)
-    fail_once(monkeypatch, WindowAligner, 'align', MemoryError())
-    updates = drive(mapper, 1.0, 2.0)
-    drive(expected, 1.0, 2.0)
-    assert len(updates) == 2
-    assert mapper.map.digest() == expected.map.digest()
-    assert 'the window is not aligned: MemoryError' in caplog.text
-
-
-def test_guarded_work_is_counted_and_goes_on(caplog):
-    mapper = mapper_with()
-    with mapper.guarded('a timer'):
-        raise KeyError('x')
-    assert mapper.counters.messages_ignored == {'internal_error': 1}
-    assert "a timer failed: KeyError: 'x'" in caplog.text
-    with pytest.raises(KeyboardInterrupt), mapper.guarded('a timer'):
-        raise KeyboardInterrupt
-
-
-def test_errors_are_described_in_a_line_without_control_characters():
-    """The answer of a service has the text of the error too, not only the log."""
-    assert described(ValueError('a\n b\x1b[2J\u202e')) == 'ValueError: a b\\x1b[2J\\u202e'
-    assert described(MemoryError()) == 'MemoryError'

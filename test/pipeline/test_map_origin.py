@@ -14,7 +14,6 @@ from surfel_mapper.files.map_state import load_map, save_map
 from surfel_mapper.geometry import q_xyzw
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.checkpoints import load_start
-from surfel_mapper.pipeline.saved_state import load_mapper, save_mapper
 from surfel_mapper.scan import Scan
 from test.alignment.street import drifted, street_scans
 from test.fields import config_of
@@ -94,18 +93,6 @@ def test_without_an_origin_utm_is_beyond_the_range_of_the_map():
     assert mapper.map.num_points == 0
 
 
-def test_poses_of_the_fixed_frame_in_another_are_shifted_too():
-    # the tree is base_link -> utm, as some localisations publish it
-    expected = mapped(number=1)
-    for origin in (text_of(UTM), 'auto'):
-        mapper = Mapper(config_of({**SETTINGS, 'map.origin': origin}))
-        mapper.add_pose('earth', 'utm', 0, (5.0, 6.0, 7.0), (0, 0, 0, 1), static=True)
-        drive(mapper, UTM, 1)
-        place = mapper.T_map_of('earth', 0)[:3, 3]
-        np.testing.assert_allclose(place + mapper.map.origin_m, [-5.0, -6.0, -7.0], atol=1e-9)
-    assert mapped(text_of(UTM), UTM, number=1).map.digest() == expected.map.digest()
-
-
 @pytest.mark.parametrize('origin', [text_of(ECEF), 'auto'])
 def test_clouds_in_the_fixed_frame_are_moved_exactly(origin):
     rng = np.random.default_rng(3)
@@ -120,18 +107,6 @@ def test_clouds_in_the_fixed_frame_are_moved_exactly(origin):
         maps.append(mapper.map)
     assert maps[0].num_points == len(points)
     assert maps[0].digest() == maps[1].digest()
-
-
-def test_auto_is_found_among_the_points_that_an_origin_can_have():
-    cloud = np.full((100, 3), ECEF, np.float64)
-    cloud[:3] = np.array([np.finfo(np.float32).max, np.nan, -1e9])[:, None]
-    mapper = Mapper(config_of({'pose.source': 'identity', 'map.origin': 'auto'}))
-
-    mapper.add_scan(Scan(points=cloud, stamp_ns=1, frame_id='odom'))
-    (update,) = mapper.insert_ready()
-
-    assert update.num_points == 97
-    assert (np.abs(mapper.map.origin_m - ECEF) <= 256.0).all()
 
 
 def test_the_map_has_a_frame_of_its_own():
@@ -189,20 +164,6 @@ def test_bad_origins_are_refused_by_name(text):
 def test_an_origin_with_poses_by_registration_is_refused():
     with pytest.raises(ConfigError, match=r'map\.origin: .* with pose\.source registration'):
         Mapper(config_of({'map.origin': '1 2 3', 'pose.source': 'registration'}))
-
-
-def test_a_saved_window_is_loaded_and_evicted(tmp_path):
-    window = {'window.max_scans': 4}
-    mapper = mapped(text_of(UTM), UTM, **window)
-    save_mapper(tmp_path / 'map.npz', mapper)
-    again = Mapper(config_of({**SETTINGS, 'map.origin': 'auto', **window}))
-
-    load_mapper(tmp_path / 'map.npz', again)
-
-    for each in (mapper, again):
-        drive(each, UTM, 6, 10 * PERIOD_NS)
-    assert len(again.window) == 4
-    assert again.map == mapper.map
 
 
 def test_a_scan_beyond_the_map_is_dropped_with_the_setting_that_helps(caplog):

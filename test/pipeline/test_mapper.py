@@ -18,7 +18,6 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import compose, interpolate, pose_matrix
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline.regions import Ball
-from surfel_mapper.poses import buffer as buffer_module
 from test.pipeline.made_scans import (
     add_pose,
     assert_counts_add_up,
@@ -138,14 +137,6 @@ def test_a_quaternion_of_two_digits_is_normalised_with_one_warning(caplog):
     assert [record.message for record in caplog.records] == [
         "pose of 'lidar' in 'base_link': quaternion [0, 0, 0.71, 0.71] is normalised"
     ]
-
-
-def test_transforms_that_are_too_many_are_counted(monkeypatch):
-    monkeypatch.setattr(buffer_module, 'MAX_TRANSFORMS', 10)
-    mapper = mapper_with()
-    for k in range(11):
-        add_pose(mapper, 1.0 + 0.1 * k, 1.0)
-    assert dict(mapper.counters.messages_ignored) == {'too_many_transforms': 5}
 
 
 # While it runs

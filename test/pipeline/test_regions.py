@@ -17,11 +17,6 @@ def test_a_box_contains_what_is_between_its_faces_and_on_them():
     assert inside.tolist() == [True, True, True, False, False]
 
 
-def test_a_box_may_be_without_an_end():
-    box = Box((-np.inf, -np.inf, 0.0), (np.inf, np.inf, np.inf))
-    assert np.array_equal(box.contains(POINTS), POINTS[:, 2] >= 0.0)
-
-
 def test_a_ball_contains_what_is_within_its_radius():
     distances = np.linalg.norm(POINTS - [0.5, 0.0, -0.5], axis=1)
     assert np.array_equal(Ball((0.5, 0.0, -0.5), 1.2).contains(POINTS), distances <= 1.2)
@@ -121,8 +116,3 @@ def test_a_polygon_whose_edges_cross_too_many_rows_is_refused_with_its_cost():
     with pytest.raises(ValueError, match='cross 505000 rows'):
         mapper.clear_region(zigzag)
     assert mapper.map.digest() == digest
-
-
-def test_a_polygon_of_too_many_corners_is_refused():
-    with pytest.raises(ValueError, match='of 10001 corners, expected 3 to 10000'):
-        Prism(((0.0, 0.0),) * (MAX_CORNERS + 1))

@@ -219,38 +219,6 @@ def test_after_a_loss_scans_are_joined_once_the_next_ones_agree():
     assert mapper.counters.mapped == 4 + 5
 
 
-def test_a_joined_map_is_that_of_the_scans_at_their_poses():
-    mapper = mapper_with()
-    scans = [scan_at(number) for number in (0, 1, 2, 3, 6, 7, 8, 9)]
-    updates = feed(mapper, scans[:4])
-    feed(mapper, [in_hall(4 + n, np.eye(4)) for n in range(2)])
-
-    updates += feed(mapper, scans[4:])
-
-    expected = Mapper(Config.from_mapping({'pose.source': 'identity'})).map
-    assert len(updates) == len(scans)
-    for scan, update in zip(scans, updates, strict=True):
-        pose = update.T_map_sensor
-        expected.insert(expected.reduce(scan.points, pose, origin=pose[:3, 3], min_range_m=0.1))
-    assert mapper.map.digest() == expected.digest()
-
-
-def test_scans_that_are_joined_follow_an_alignment_among_them():
-    align = {'align__key_distance_m': 0.0, 'align__move_m': 0.0, 'align__move_deg': 0.0}
-    mapper = mapper_with(window__keep_points=True, align__every_scans=6, **align)
-    feed(mapper, [scan_at(number) for number in range(4)])
-    feed(mapper, [in_hall(4 + n, np.eye(4)) for n in range(2)])
-
-    _, aligned, *later = feed(mapper, [scan_at(number) for number in range(6, 10)])
-
-    T_map_fixed = aligned.alignment.T_map_fixed
-    assert np.linalg.norm(T_map_fixed[:3, 3]) > 1e-4
-    assert len(later) == 2
-    for update in later:  # the tracked frame is that of the sensor
-        expected = compose(T_map_fixed, update.T_fixed_body)
-        np.testing.assert_allclose(update.T_map_sensor, expected, rtol=0, atol=1e-9)
-
-
 def test_degenerate_registrations_are_warned_about(caplog):
     mapper = mapper_with()
 
@@ -358,26 +326,6 @@ def test_an_initial_pose_that_cannot_be_used_changes_nothing(frame_id, q, reason
     assert mapper.counters.messages_ignored == {'initial_pose': 1}
     assert reason in caplog.text
     assert len(feed(mapper, [scan_at(0)])) == 1
-
-
-def test_an_initial_pose_is_not_used_where_poses_come_in(caplog):
-    mapper = mapper_with(pose__source='odometry')
-
-    mapper.start_from('odom', (0, 0, 0), (0, 0, 0, 1))
-
-    assert 'poses come from pose.source odometry' in caplog.text
-
-
-def test_live_settings_of_the_registration_hold_from_the_next_scan_on():
-    mapper = mapper_with()
-    feed(mapper, [scan_at(0)])
-
-    changed = replace(mapper.config.registration, min_fit_ratio=1.0)
-    mapper.reconfigure(replace(mapper.config, registration=changed))
-
-    assert feed(mapper, [scan_at(1)]) == []
-    mapper.finish()
-    assert mapper.counters.dropped == {'not_aligned': 1}
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import depth_points, PinholeCamera, SceneImage
-from surfel_mapper.tsdf.queries import labels_of
 from test.layers.test_distance_field import LIDAR, RING
 
 MS = 10**6
@@ -100,22 +99,6 @@ def test_an_image_of_another_size_leaves_the_depth_without_colour(caplog):
     assert mapped(mapper) == [1000 * MS]
     assert not mapper.tsdf.mesh().colors.any()
     assert '40 x 30 pixels, expected 80 x 60' in caplog.text
-
-
-def test_labels_are_joined_like_colours():
-    mapper = mapper_with(
-        **{
-            'layers.tsdf.label_topic': 'labels',
-            'layers.tsdf.semantics': 'single',
-            'layers.tsdf.color_topic': '',
-        }
-    )
-    mapper.add_image(image(1000 * MS, 3, 7, kind='label'))
-    mapper.add_scan(wall(1000 * MS))
-    mapped(mapper)
-    blocks = mapper.tsdf.blocks
-    labels, _ = labels_of(blocks.votes[blocks.rows()].swapaxes(0, 1))
-    assert set(np.unique(labels)) == {-1, 3, 7}
 
 
 def test_points_of_a_lidar_are_coloured_where_a_camera_sees_them_and_only_there():

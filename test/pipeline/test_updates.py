@@ -165,41 +165,6 @@ def test_the_motion_gate_leaves_out_scans_taken_while_standing_still():
     assert drive_gated(window__gate_distance_m=100.0) == [0]
 
 
-def two_lidars(**changes):
-    """Return a mapper of two lidars that are mounted 2.1 m apart, as in docs/inputs.md."""
-    return mapper_with(
-        frames__sensors=('front_lidar', 'rear_lidar'),
-        frames__base_to_sensor=(1.2, 0.0, 0.4, *LEVEL, -0.9, 0.0, 0.5, 0.0, 0.0, 1.0, 0.0),
-        **changes,
-    )
-
-
-def insert_of_both(mapper, stamp_s, x):
-    """Add a scan of each of two lidars; return the frames of those that are mapped."""
-    add_pose(mapper, stamp_s, x=x)
-    scans = [scan_at(stamp_s, frame_id) for frame_id in ('front_lidar', 'rear_lidar')]
-    return [update.scan.frame_id for update in insert(mapper, *scans)]
-
-
-def test_the_motion_gate_looks_at_each_sensor_for_itself():
-    mapper = two_lidars(window__gate_distance_m=0.5)
-    both = ['front_lidar', 'rear_lidar']
-    assert insert_of_both(mapper, 0.0, x=0.0) == both
-    assert insert_of_both(mapper, 1.0, x=0.0) == []
-    assert insert_of_both(mapper, 2.0, x=0.3) == []
-    assert insert_of_both(mapper, 3.0, x=0.6) == both
-    # the rear one is now where the front one was
-    assert insert_of_both(mapper, 4.0, x=0.6 + 2.1) == both
-
-
-def test_the_window_measures_the_way_of_each_sensor_for_itself():
-    mapper = two_lidars(window__max_distance_m=1.3)
-    for stamp_s in range(9):
-        insert_of_both(mapper, stamp_s, x=0.5 * stamp_s)
-    assert [scan.stamp_ns // S for scan in mapper.window] == [6, 6, 7, 7, 8, 8]
-    assert {scan.frame_id for scan in mapper.window} == {'front_lidar', 'rear_lidar'}
-
-
 def test_the_motion_gate_looks_back_to_the_last_scan_mapped():
     mapper = mapper_with(window__gate_distance_m=1.0)
     for number in range(20):  # 0.3 m a scan: each alone would be too little

@@ -185,18 +185,6 @@ def test_scans_with_their_poses_are_mapped_before_time_is_set_back(more_follows)
     assert_counts_add_up(mapper)
 
 
-def test_clearing_right_after_time_was_set_back_drops_the_scans_of_before():
-    mapper = mapper_with(pose__source='identity', map__threads=2)
-    for stamp_s in (100.0, 100.1, 100.2, 1.0):
-        mapper.add_scan(scan_at(stamp_s))
-        list(mapper.insert_ready(more_follows=True))
-    mapper.add_scan(scan_at(1.1))
-    mapper.clear()
-    assert list(mapper.insert_ready()) == []
-    assert len(mapper.window) == 0
-    assert_counts_add_up(mapper)
-
-
 def test_after_time_is_set_back_a_scan_never_gets_a_pose_of_before():
     mapper = mapper_with(pose__max_wait_s=1.0)
     for stamp_s in range(10):
@@ -211,17 +199,6 @@ def test_after_time_is_set_back_a_scan_never_gets_a_pose_of_before():
 
     assert update.T_map_sensor[0, 3] == 100.0
     assert mapper.map.digest() == digest_of((scan, pose_matrix((100.0, 0, 0), LEVEL)))
-
-
-def test_poses_that_were_set_back_before_the_scans_are_kept():
-    mapper = mapper_with()
-    for stamp_s in range(10):
-        add_pose(mapper, stamp_s, x=stamp_s)
-        insert(mapper, scan_at(stamp_s))
-    add_pose(mapper, 1.5, x=100.0)
-    add_pose(mapper, 2.5, x=100.0)
-    (update,) = insert(mapper, scan_at(2.0))
-    assert update.T_map_sensor[0, 3] == 100.0
 
 
 def test_the_mount_of_the_sensor_survives_a_reset():

@@ -96,29 +96,6 @@ def test_reports_and_latencies_use_simulated_time(start, peer):
 
 
 @fault(
-    'a negative time on `/clock`',
-    happens='it is ignored, with a warning; time stays as it was',
-    counted='the log',
-    lost='nothing',
-)
-def test_a_negative_clock_is_ignored(start, peer):
-    node = start('node', *ARGUMENTS, '-p', 'use_sim_time:=true')
-    peer.advertise('/clock', kinds={'/clock': Clock})
-    peer.advertise('/odom', '/points')
-    wrong = Clock()
-    wrong.clock.sec = -1
-
-    def is_noticed():
-        peer.publish('/clock', wrong)
-        return 'message on /clock ignored: -1 s' in node.output
-
-    peer.spin_until(is_noticed, what=lambda: node.output)
-    send(peer, drive(1))
-    peer.diagnosis({'scans.mapped': 1})
-    assert node.stop() == 0
-
-
-@fault(
     'a parameter set to a value of an unknown type',
     happens='the whole request is refused with the reason',
     counted='the answer of the service',

@@ -114,18 +114,6 @@ def test_a_late_client_is_complete_after_the_next_full_map():
     assert_equal(mirror, node)
 
 
-def test_an_old_full_map_does_not_undo_later_changes():
-    node, mirror = Node(), MapMirror(0.5)
-    for number in range(8):
-        _, message = node.map_scan(number * SECOND)
-        mirror.change(message)
-        if number == 4:
-            full = node.full()
-    mirror.replace(full)
-    assert_equal(mirror, node)
-    assert mirror.stamp_ns == 7 * SECOND
-
-
 def test_the_next_full_map_repairs_a_lost_change():
     node, mirror = Node(), MapMirror(0.5)
     for number in range(6):
@@ -154,29 +142,6 @@ def test_a_change_that_cannot_be_published_comes_with_the_next(moments, is_first
         known -= set(pack_keys(change.removed).tolist())
         now = node.mapper.map.keys(node.changes.min_points)
         assert known == set(now.tolist())
-
-
-@pytest.mark.parametrize('moments', [True, False])
-def test_a_scan_whose_changes_cannot_be_derived_comes_with_the_next(moments, monkeypatch):
-    """With ``publish.moments`` the voxels that it had emptied stayed in copies of the map."""
-    node = Node(**{'publish.moments': moments, 'window.max_scans': 2})
-    derive, known = SurfelMap.surfels_changed, set()
-
-    def derive_later(*args):
-        if number in (5, 6):
-            raise MemoryError
-        return derive(*args)
-
-    monkeypatch.setattr(SurfelMap, 'surfels_changed', derive_later)
-    for number in range(9):
-        if number in (5, 6):
-            with pytest.raises(ValueError, match='not enough values'):  # there is no update
-                node.map_scan(number * SECOND)
-            continue
-        change, _ = node.map_scan(number * SECOND)
-        known |= set(pack_keys(change.surfels.voxel_index).tolist())
-        known -= set(pack_keys(change.removed).tolist())
-        assert known == set(node.mapper.map.keys(node.changes.min_points).tolist())
 
 
 def test_a_mirror_follows_clearing_and_loading():
@@ -214,21 +179,6 @@ def test_a_mirror_follows_a_reset_of_time():
     assert node.mapper.counters.resets == 1
     mirror.replace(node.full())
     assert_equal(mirror, node)
-
-
-def test_stamps_of_several_sensors_may_be_out_of_order():
-    node, mirror = Node(), MapMirror(0.5)
-    stamps = [5.0, 5.3, 5.2, 5.5, 5.4]
-    for number, stamp_s in enumerate(stamps):
-        node.mapper._pipeline.guard.forget_scans()  # as if each were from another sensor
-        _, message = node.map_scan(round(stamp_s * SECOND))
-        mirror.change(message)
-        if number == 1:
-            full = node.full()
-        assert mirror.stamp_ns == round(max(stamps[: number + 1]) * SECOND)
-    mirror.replace(full)
-    assert_equal(mirror, node)
-    assert mirror.stamp_ns == round(5.5 * SECOND)
 
 
 @pytest.mark.parametrize('fails_first', [False, True])
@@ -291,45 +241,12 @@ def test_without_moments_only_surfels_are_published():
     assert set(pack_keys(change.removed).tolist()) == known
 
 
-def test_the_first_subscriber_gets_only_the_changes_of_the_next_scan():
-    node = Node()
-    for number in range(3):
-        node.map_scan(number * SECOND)
-        node.changes.reset()
-    before = node.mapper.map.version
-    change, _ = node.map_scan(3 * SECOND, num=50)
-    changed = node.mapper.map.surfels_changed(before, 1)
-    assert len(change.surfels) == len(changed) < len(node.mapper.map)
-
-
-def test_the_published_keys_are_listed_again_at_intervals(monkeypatch):
-    monkeypatch.setattr('surfel_mapper.ros.changes.LIST_EVERY', 3)
-    for moments in (True, False):
-        node = Node(**{'publish.moments': moments})
-        for number in range(8):
-            node.map_scan(number * SECOND)
-            known = node.changes._published
-            assert len(known) < 3
-            expected = np.sort(node.mapper.map.keys(1 if moments else 4))
-            np.testing.assert_array_equal(np.sort(known.keys()), expected)
-
-
 def test_integers_keep_all_their_bits():
     values = np.array([0, 1, -1, 2**62, -(2**63), 2**63 - 1, 0x0123456789ABCDEF])
     pairs = halves(values.reshape(-1, 1))
     assert pairs.dtype == np.uint32
     assert pairs[6].tolist() == [0x89ABCDEF, 0x01234567]  # the low half first
     np.testing.assert_array_equal(whole(pairs), values)
-
-
-def test_a_removed_voxel_has_no_points_and_no_position():
-    node = Node()
-    node.map_scan(0)
-    message = node.message(node.mapper.map.surfels(1), np.array([[7, -8, 9]], np.int32))
-    scan = to_scan(message)
-    assert np.isnan(scan.points[-1]).all()
-    assert scan.columns['num_points'][-1] == 0
-    assert [scan.columns[f'voxel_{axis}'][-1] for axis in 'xyz'] == [7, -8, 9]
 
 
 def test_removed_voxels_have_position_and_index():
@@ -361,36 +278,6 @@ def test_clouds_without_moments_are_refused_and_change_nothing():
     with pytest.raises(CloudFormatError, match=r'voxels of 0\.4 m'):
         MapMirror(0.4).change(full)
     assert mirror.map.digest() == digest
-
-
-def test_impossible_moments_are_refused_and_change_nothing():
-    node, mirror = Node(), MapMirror(0.5)
-    node.map_scan(0)
-    mirror.replace(node.full())
-    digest = mirror.map.digest()
-    surfels = node.mapper.map.surfels(1)
-    bad = node.mapper.map.moments()
-    bad.product[0] = -1
-    content = moment_cloud(surfels, bad, NO_VOXELS)
-    header = node.full().header
-    names = content.__slots__
-    message = SimpleNamespace(header=header, **{n: getattr(content, n) for n in names})
-    far = node.message(surfels, np.array([[0, 0, 2**21]], np.int32))
-    for refused in (message, far):
-        for take in (mirror.replace, mirror.change):
-            with pytest.raises(CloudFormatError):
-                take(refused)
-            assert mirror.map.digest() == digest
-    mirror.replace(node.full())
-    assert mirror.map.digest() == digest
-
-
-def test_an_empty_map_is_mirrored():
-    mirror = MapMirror(0.5)
-    node = Node()
-    mirror.replace(node.full())
-    assert mirror.is_complete
-    assert len(mirror.map) == 0
 
 
 def test_the_memory_for_recent_changes_is_bounded():

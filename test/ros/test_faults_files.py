@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import itertools
 import os
-from pathlib import Path
-import resource
 import shutil
 import signal
 import subprocess
@@ -18,18 +16,14 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
-from diagnostic_msgs.msg import DiagnosticArray
-from std_srvs.srv import Trigger
 
 from surfel_mapper.config import Config
 from surfel_mapper.files.atomic import remove_abandoned
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.ply import read_points
-from surfel_mapper.offline.outputs import ScanTrajectory, write_files, write_maps
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.map_files import save_map
 from surfel_mapper.scan import Scan
-from surfel_mapper.viz.history import History
 from test.ros.driving import ARGUMENTS, drive, send
 from test.ros.fault_table import fault
 from test.ros.live import node_and_peer, ROOT
@@ -78,8 +72,6 @@ def ends_at(number, how, function):
 STEPS_OF_SAVING = 12
 """Two files: the flush of each, its rename and the flush of its directory, before and after."""
 
-STEPS_OF_REPLAY = 30
-"""Five files of three steps, before and after each."""
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM)
 
@@ -112,40 +104,6 @@ def test_killing_the_process_while_saving_leaves_complete_maps(tmp_path, how):
     assert load_map(tmp_path / 'map.npz')[0].digest() == new.map.digest()
     assert len(leftovers(tmp_path)) == len(remove_abandoned(tmp_path)) <= 8
     assert not leftovers(tmp_path)
-
-
-@fault(
-    'SIGKILL or SIGTERM at any step of writing in `replay`',
-    happens='each file is complete or absent; `summary.json` is written last',
-    counted='nothing',
-    lost='that replay; a `.part` file may remain',
-)
-def test_killing_a_replay_while_writing_leaves_complete_files(tmp_path, monkeypatch):
-    from surfel_mapper.viz import picture
-
-    mapper = mapper_of(2, tmp_path)
-    # drawing takes a second and has no steps of writing
-    monkeypatch.setattr(picture, 'draw_map', lambda _, path, *rest, **more: path.write_bytes(b''))
-    summary = {'bag': 'a', 'replay_s': 1.0, 'recorded_s': 1.0, **mapper.summary()}
-    monkeypatch.setattr('surfel_mapper.viz.report.write_report', lambda path, *rest: None)
-    output = tmp_path / 'out'
-
-    def write():
-        formats, trajectory = ['npz', 'ply', 'pcd'], ScanTrajectory(mapper)
-        write_maps(output, formats, mapper, trajectory, window=True)
-        write_files(output, formats, mapper, trajectory, summary, History())
-
-    number = 0
-    while ends_at(number, SIGNALS[number % 2], write):
-        whole = {path.name for path in output.iterdir() if path.suffix != '.part'}
-        assert 'summary.json' not in whole or {'map.npz', 'map.ply', 'map.pcd'} <= whole
-        if 'map.npz' in whole:
-            assert load_map(output / 'map.npz')[0].digest() == mapper.map.digest()
-        if 'map.ply' in whole:
-            read_points(output / 'map.ply')
-        shutil.rmtree(output)
-        number += 1
-    assert number == STEPS_OF_REPLAY
 
 
 class Disk:
@@ -246,36 +204,6 @@ def test_a_read_only_directory_is_reported_and_the_node_continues(running, disk)
     success, said = save(peer)
     assert not success
     assert 'Read-only file system' in said
-    check_unaffected(node, peer)
-
-
-@fault(
-    'no file descriptors left',
-    happens='saving is refused with the reason; connections stay; works again later',
-    counted='the answer of the service, and the log',
-    lost='new peers cannot connect until file descriptors are free',
-)
-def test_the_node_survives_without_file_descriptors(running, tmp_path):
-    node, peer, maps = running
-    link(maps, tmp_path)
-    pid = node._process.pid
-    client = peer.client(Trigger, 'save_map')
-    assert peer.result(client.call_async(Trigger.Request())).success
-    reports = peer.collect(DiagnosticArray, '/diagnostics')
-    peer.spin_until(lambda: reports)
-    before = resource.prlimit(pid, resource.RLIMIT_NOFILE)
-    used = {int(path.name) for path in Path(f'/proc/{pid}/fd').iterdir()}
-    first_free = next(number for number in itertools.count() if number not in used)
-    resource.prlimit(pid, resource.RLIMIT_NOFILE, (first_free, before[1]))
-    try:
-        answer = peer.result(client.call_async(Trigger.Request()))
-        reports.clear()
-        peer.spin_until(lambda: len(reports) > 3, what=lambda: node.output)
-    finally:
-        resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
-    assert not answer.success
-    assert 'Too many open files' in answer.message
-    assert peer.result(client.call_async(Trigger.Request())).success
     check_unaffected(node, peer)
 
 

@@ -320,59 +320,6 @@ def test_a_slow_subscriber_does_not_delay_the_node(stream):
         asleep.close()
 
 
-@fault(
-    'thousands of tiny clouds',
-    happens='each is mapped, or dropped if they arrive too fast',
-    counted='`overload`',
-    lost='clouds beyond `input.max_waiting_clouds`',
-)
-def test_thousands_of_tiny_clouds_are_accounted_for(stream):
-    for number in range(2000):
-        stream.step(PERIOD_NS // 100)
-        if number % 10 == 0:
-            stream.pose()
-        stream.scan(num=4)
-        if number % 10 == 9:
-            stream.peer.spin_for(0.002)
-    stream.pose()
-    grown = stream.settle()
-    assert grown['scans.mapped'] > 100
-
-
-@fault(
-    'a few huge clouds (12 MB)',
-    happens='they are mapped, later ones wait',
-    counted='nothing; losses without shared memory: `clouds_lost`',
-    lost='nothing, with a reliable publisher',
-)
-def test_a_few_huge_clouds_are_mapped(stream):
-    for _ in range(3):
-        wanted = stream.grown()['scans.mapped'] + 1
-        stream.pair(num=1_000_000)
-        stream.peer.spin_until(lambda w=wanted: stream.grown()['scans.mapped'] >= w)
-    stream.wait(scans__mapped=3)
-
-
-@fault(
-    'clouds of ever new frame ids',
-    happens='each is treated as a sensor; of more than 64 the one silent longest is forgotten',
-    counted='drops by frame for the first 128, then as `(others)`',
-    lost='nothing',
-)
-def test_the_memory_for_frames_is_bounded(stream):
-    stream.pair()
-    for number in range(150):
-        stream.step(PERIOD_NS // 10)
-        stream.scan(num=4, frame_id=f'frame{number}')
-        stream.peer.spin_for(0.015)
-    stream.step(2 * SECOND_NS)
-    stream.pair()
-    grown = stream.settle()
-    assert grown['scans.mapped'] >= 2  # the lidar from before and after
-    by_frame = {k.split('.')[2] for k in stream.values() if k.startswith('scans.dropped_by_frame')}
-    assert len(by_frame) <= 129
-
-
 def test_the_map_is_exact_after_all_faults(stream):
     assert stream.peer.call('clear').success
     messages = drive(5)

@@ -95,17 +95,6 @@ def test_the_share_of_drops_decides_between_warning_and_error(num, level):
         assert REMEDIES['overload' if num > 2 else 'bad_cloud'] in said[0][1]
 
 
-def test_any_drop_is_a_warning_by_default():
-    ((level, text),) = found(DiagnosticsConfig(), received=1000, dropped=Counter(no_points=1))
-    assert (level, text) == (WARN, '1 scans dropped just now (no_points 1): the log says why')
-
-
-def test_a_pause_is_a_warning_and_its_drops_are_ignored():
-    ((level, text),) = found(received=20, dropped=Counter(paused=20), paused=True)
-    assert level == WARN
-    assert text.startswith('paused')
-
-
 @pytest.mark.parametrize(('latency_s', 'level'), [(0.3, None), (0.31, WARN), (1.01, ERROR)])
 def test_latency_is_a_warning_or_an_error_beyond_its_limits(latency_s, level):
     said = found(latency_s=latency_s)
@@ -121,16 +110,6 @@ def test_a_layer_that_is_switched_off_is_a_warning_with_its_error():
     ((level, text),) = found(received=20, layers_off={'tsdf': 'MemoryError'})
     assert level == WARN
     assert text == 'layer tsdf is off until ~/clear, it failed repeatedly: MemoryError'
-
-
-def test_latency_is_ignored_with_other_clocks_and_zero_limits():
-    assert found(latency_s=3e8) == []
-    assert found(latency_s=-3e8) == []
-    assert found(DiagnosticsConfig(warn_latency_s=0.0, error_latency_s=0.0), latency_s=9.0) == []
-
-
-def test_losses_of_the_middleware_are_reported():
-    assert found(received=5, loss='3 lost, do this') == [(WARN, '3 lost, do this')]
 
 
 def test_a_total_loss_is_an_error_that_does_not_ask_for_the_lidar():

@@ -25,13 +25,11 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.messages.images import CameraImage, depth_scan
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import poses_in
-from surfel_mapper.ros.base_node import BaseNode
-from surfel_mapper.ros.context import FASTDDS_VARIABLES, PROFILE
+from surfel_mapper.ros.context import FASTDDS_VARIABLES
 from surfel_mapper.ros.inputs import Inputs
-from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.sensors.depth import PinholeCamera
 from surfel_mapper.simulation import Lidar, Simulation, World
-from test.ros.live import cloud, odometry, Peer, room, stamp, START_NS, TIMEOUT_S
+from test.ros.live import cloud, odometry, room, stamp, START_NS, TIMEOUT_S
 
 PERIOD_NS = 100_000_000
 RELIABLE_QOS = QoSProfile(depth=50)
@@ -307,76 +305,6 @@ def test_lost_large_clouds_are_reported_with_a_remedy(start, peer):
         lambda: any('clouds lost on the way' in report.status[0].message for report in reports)
     )
     node.wait_for_output('fastdds_shm.xml')
-
-
-class Interrupted(BaseNode):
-    """A node in which something happens when the publishers of a topic are looked up."""
-
-    interrupts = ()
-
-    def get_publishers_info_by_topic(self, *args):
-        interrupts, self.interrupts = self.interrupts, ()
-        for interrupt in interrupts:
-            interrupt()
-        return super().get_publishers_info_by_topic(*args)
-
-
-@pytest.fixture
-def losing(domain):
-    """Return inputs of three lidars, their node, and a function that subscribes them."""
-    peer = Peer(node_type=Interrupted)
-    config = Config.from_mapping({**SETTINGS, 'input.topics': ['front', 'rear', 'top']})
-    inputs = Inputs(peer.node, config, MappingThread(Mapper(config), None), on_failure=None)
-
-    def subscribe():
-        """Return the functions that take the losses of the new subscriptions, by topic."""
-        inputs.subscribe()
-        return {reader.topic: reader.on_lost for reader in inputs._subscriptions._others}
-
-    yield inputs, peer.node, subscribe
-    inputs.unsubscribe()
-    peer.close()
-
-
-def test_a_first_loss_on_another_topic_during_a_report_is_counted(losing):
-    """The mapping thread makes the report, the thread of the subscriptions notes the loss."""
-    inputs, node, subscribe = losing
-    on_lost = subscribe()
-    assert (inputs.clouds_lost, inputs.loss()) == (0, '')
-    on_lost['/front'](5)
-    node.interrupts = [lambda: on_lost['/rear'](2)]
-    assert 'clouds lost on the way (5 of /front, none arrived)' in inputs.loss()
-    assert inputs.clouds_lost == 7
-    assert '(2 of /rear, ' in inputs.loss()
-    assert '/top' not in inputs.loss()
-
-
-def test_losses_of_all_subscriptions_add_up(losing):
-    """The node is deactivated and activated; the new subscription counts from zero."""
-    inputs, _, subscribe = losing
-    on_lost = subscribe()
-    for total in (3, 5):
-        on_lost['/front'](total)
-    inputs.unsubscribe()
-    on_lost = subscribe()
-    for total in (1, 2):
-        on_lost['/front'](total)
-        assert inputs.clouds_lost == 5 + total
-    assert '(7 of /front, ' in inputs.loss()
-
-
-def test_the_remedy_for_lost_clouds_depends_on_their_size():
-    remedy = f'its command: FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}'
-    assert loss(4_000_000).startswith('clouds lost on the way (5 of /points, up to 4.0 MB each)')
-    assert loss(0).startswith('clouds lost on the way (5 of /points, none arrived)')
-    for size in (0, 4_000_000):
-        assert '/robot/lidar publishes best effort' in loss(size)
-        assert loss(size).endswith(remedy)
-    assert 'overloaded' in loss(10_000)
-    assert remedy not in loss(10_000)
-    reliable = loss(4_000_000, ReliabilityPolicy.RELIABLE)
-    assert 'their publisher is reliable' in reliable
-    assert reliable.endswith(remedy)
 
 
 def test_an_override_that_loses_large_clouds_is_named():

@@ -4,20 +4,14 @@
 
 from __future__ import annotations
 
-import threading
-import time
-
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from nav_msgs.msg import OccupancyGrid
-from rclpy.serialization import serialize_message
 from std_msgs.msg import Int64
 
 from surfel_mapper.files.map_state import load_map, save_map
-from surfel_mapper.layers.layer import Moment, Publication
-from surfel_mapper.ros.layer_outputs import LayerTopic
 from test.layers.test_extending import install, POINTS
 from test.ros.driving import drive, mapped, PERIOD_NS
 from test.ros.live import cloud, LATCHED, odometry, START_NS
@@ -71,30 +65,3 @@ def test_a_node_that_cannot_go_on_saves_its_map(start_anew, peer, tmp_path):
     (saved,) = tmp_path.rglob('*.checkpoint.npz')
     assert str(saved) in node.output
     assert load_map(saved)[0].num_voxels == 3
-
-
-def test_a_set_of_messages_ends_when_its_publisher_is_to_be_destroyed(peer):
-    begun, made = threading.Event(), []
-
-    def messages(moment):
-        for number in range(1000):
-            made.append(number)
-            yield serialize_message(Int64(data=number))
-            begun.set()
-            time.sleep(0.01)
-
-    publication = Publication(
-        topic='numbers',
-        type_name='std_msgs/msg/Int64',
-        messages=messages,
-        is_eager=True,
-        in_background=True,
-    )
-    topic = LayerTopic(peer.node, None, publication, None, Moment)
-    topic.publish_if_read()
-    assert begun.wait(60.0)
-
-    topic.close()
-
-    assert not [each for each in threading.enumerate() if each.name.startswith('publishing')]
-    assert 0 < len(made) < 1000

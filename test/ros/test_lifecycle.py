@@ -6,33 +6,23 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 import signal
-import sys
 
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
-from builtin_interfaces.msg import Time
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.srv import LoadMap
 from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from surfel_mapper.compilation import CompileStage
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.pipeline import Mapper
-from surfel_mapper.pipeline.checkpoints import checkpoint_paths
 from surfel_mapper.ros.context import context
-from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.main import create_node, executing
-from surfel_mapper.ros.node import MapperNode
-from surfel_mapper.ros.pose_outputs import OriginOutput
-from surfel_mapper.ros.session import Session
 from test.ros.driving import ARGUMENTS, arguments, drive, mapped, send
 from test.ros.live import ALL, LATCHED, NODE, RVIZ
 
@@ -153,28 +143,6 @@ def test_settings_changed_before_configure_are_used(start, peer):
     assert values['window_scans'] == '2'
 
 
-def test_settings_changed_while_kernels_compile_are_used(prefork, peer, monkeypatch):
-    answers = []
-
-    def compile_until_set():
-        changed = peer.parameters().set_parameters([Parameter('window.max_scans', value=2)])
-        answers.extend(peer.result(changed).results)
-
-    stages = [CompileStage('settings', compile_until_set)]
-    monkeypatch.setattr(Mapper, 'warm_up_stages', lambda mapper: stages)
-    with context(ARGUMENTS):
-        node = MapperNode()
-        with executing(node):
-            node.start()
-            peer.advertise('/odom', '/points')
-            send(peer, drive(3))
-            _, values = peer.diagnosis({'scans.mapped': 3})
-            node.end()
-        node.destroy_node()
-    assert answers[0].successful
-    assert values['window_scans'] == '2'
-
-
 def test_a_wrong_limit_of_inputs_is_refused_before_any_cloud_comes(domain, monkeypatch):
     monkeypatch.setenv('SURFEL_MAPPER_MAX_BYTES', '4G')
     with context(WAITING):
@@ -188,109 +156,6 @@ def test_a_wrong_limit_of_inputs_is_refused_before_any_cloud_comes(domain, monke
             assert node.state == 'active'
             node.end()
         node.destroy_node()
-
-
-def test_simulated_time_set_at_runtime_outlasts_a_cleanup(prefork, peer):
-    with context(WAITING):
-        node = create_node()
-
-        def follows_clock(seconds):
-            peer.publish('/clock', Clock(clock=Time(sec=seconds)))
-            now = node.get_clock().now
-            peer.spin_until(lambda: now().nanoseconds == seconds * 10**9, timeout_s=20.0)
-
-        with executing(node):
-            node.trigger_configure()
-            simulated = [Parameter('use_sim_time', value=True)]
-            assert peer.result(peer.parameters().set_parameters(simulated)).results[0].successful
-            peer.advertise('/clock', kinds={'/clock': Clock})
-            follows_clock(1)
-            node.trigger_cleanup()
-            node.trigger_configure()
-            assert node.state == 'inactive'
-            follows_clock(2)
-            node.end()
-        node.destroy_node()
-
-
-def test_a_destroyed_node_leaves_the_graph(peer):
-    """Its services, else found by the clients of the next node, answer no more."""
-    with context(WAITING):
-        node = create_node()
-        peer.spin_until(lambda: peer.node.count_services(f'{NODE}/get_state'))
-        node.destroy_node()
-        peer.spin_until(lambda: not peer.node.count_services(f'{NODE}/get_state'))
-
-
-def failing_after(method):
-    """Return a method that does its work, and then fails."""
-
-    def failing(self):
-        method(self)
-        raise MemoryError
-
-    return failing
-
-
-@pytest.mark.parametrize('ending', ['a thread', 'a transition', 'unsubscribing'])
-def test_a_node_that_cannot_go_on_saves_its_map(prefork, peer, monkeypatch, tmp_path, ending):
-    """Topics that fail all the time keep neither ~/changed nor checkpoints back before that."""
-
-    def fail(*_):
-        raise MemoryError
-
-    monkeypatch.setattr(OriginOutput, 'publish', fail)
-    settings = {'output.directory': tmp_path, 'output.checkpoint_s': 0.001}
-    messages = drive(3)
-    with context(arguments(**settings)):
-        node = create_node()
-        with executing(node):
-            node.start()
-            peer.advertise('/odom', '/points')
-            changed = peer.collect(PointCloud2, f'{NODE}/changed', ALL)
-            send(peer, messages)
-            _, values = peer.diagnosis({'scans.mapped': 3})
-            peer.spin_until(lambda: len(changed) == 3)
-            checkpoint, _ = checkpoint_paths(node._config.output)
-            assert checkpoint.is_file()
-            checkpoint.unlink()
-            if ending == 'unsubscribing':
-                monkeypatch.setattr(Inputs, 'unsubscribe', failing_after(Inputs.unsubscribe))
-            if ending == 'a transition':
-                monkeypatch.setattr(Session, 'deactivate', failing_after(Session.deactivate))
-                node.tasks.submit(node.trigger_deactivate)
-            else:
-                node._session.thread.post(lambda: sys.exit('the end'))
-            with pytest.raises((MemoryError, SystemExit)):
-                node.tasks.run(lambda: None)
-            node.end()
-        node.destroy_node()
-    _, mapper = mapped(messages)
-    assert load_map(checkpoint)[0].digest() == mapper.map.digest()
-    assert int(values['messages_ignored.internal_error']) >= 3
-
-
-def test_a_setting_that_changes_while_a_parameter_of_rclpy_is_declared_stays(peer):
-    class Slow(Parameter):
-        """Its name is known after another thread has changed a setting."""
-
-        @property
-        def name(self):
-            changed = peer.parameters().set_parameters([Parameter('window.max_scans', value=2)])
-            assert peer.result(changed).results[0].successful
-            return super().name
-
-    with context(ARGUMENTS):
-        node = MapperNode()
-        with executing(node):
-            node._call_post_set_parameters_callback([Slow('use_sim_time', value=False)])
-            node.start()
-            peer.advertise('/odom', '/points')
-            send(peer, drive(3))
-            _, values = peer.diagnosis({'scans.mapped': 3})
-            node.end()
-        node.destroy_node()
-    assert values['window_scans'] == '2'
 
 
 @pytest.mark.parametrize('how', ['signal', 'shutdown'])
@@ -311,19 +176,6 @@ def test_the_map_is_saved_on_shutdown_if_configured(start, peer, tmp_path, how):
     assert node.output.count('saved ') == 1
     _, mapper = mapped(messages)
     assert load_map(folder / 'map.npz')[0].digest() == mapper.map.digest()
-
-
-def test_a_late_subscriber_gets_the_map_of_an_inactive_node(start, peer):
-    start('node', *ARGUMENTS)
-    peer.advertise('/odom', '/points')
-    early = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
-    send(peer, drive(2))
-    peer.diagnosis({'scans.mapped': 2})
-    peer.spin_until(lambda: early and early[-1].width)
-    assert transit(peer, 'deactivate')
-    late = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
-    peer.spin_until(lambda: late)
-    assert late[0] == early[-1]
 
 
 def test_late_subscribers_get_the_present_map_of_an_inactive_node(start, peer, tmp_path):
@@ -368,16 +220,3 @@ def test_a_node_that_is_killed_continues_from_its_checkpoint(start, peer, tmp_pa
     peer.diagnosis({'state': 'active', 'scans.mapped': 0, 'window_scans': 3})
     _, mapper = mapped(messages)
     assert f'map.checkpoint.npz, digest {mapper.map.digest()}' in second.output
-
-
-def test_a_restarted_node_replaces_the_latched_map_of_a_killed_one(start, peer):
-    first = start('node', *ARGUMENTS)
-    peer.advertise('/odom', '/points')
-    normals = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
-    send(peer, drive(2))
-    peer.spin_until(lambda: normals and normals[-1].width)
-    first.kill()
-
-    start('node', *ARGUMENTS)
-
-    peer.spin_until(lambda: normals[-1].width == 0)

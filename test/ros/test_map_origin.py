@@ -11,7 +11,6 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import OccupancyGrid
-from nav_msgs.srv import LoadMap
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
@@ -122,31 +121,6 @@ def check_files(directory, surfels, origin):
         ordered(found - origin), ordered(surfels.position), rtol=0, atol=2e-9
     )
     assert load_map(directory / 'map.npz')[0].origin_m.tolist() == origin.tolist()
-
-
-def test_a_second_node_goes_on_with_the_origin_of_a_saved_map(start, peer, tmp_path):
-    settings = {**FIXED, 'map.origin': 'auto', 'output.directory': tmp_path / 'maps'}
-    messages = drive_in_utm(4)
-    node = start('node', *arguments(**settings))
-    peer.advertise('/odom', '/points')
-    send(peer, messages[:2])
-    peer.diagnosis({'scans.mapped': 2})
-    assert peer.call('save_map').success
-    assert node.stop() == 0, node.output
-
-    again = start('node', *arguments(**settings))
-    places = peer.collect(PointStamped, f'{BASE}/origin', LATCHED)
-    answer = peer.call('load_map', LoadMap, LoadMap.Request(map_url='map'))
-    assert answer.result == LoadMap.Response.RESULT_SUCCESS, again.output
-    peer.spin_until(lambda: places, what=lambda: again.output)
-    assert places[-1].point.y == NEAR['auto'][1]
-    peer.wait_until_read('/odom', '/points')
-    send(peer, messages[2:])
-    peer.diagnosis({'scans.mapped': 2})
-
-    digest = peer.call('save_map').message.rpartition('digest ')[2]
-    expected = mapped(about(messages, np.array(NEAR['auto'])), **FIXED)[1].map
-    assert digest == expected.digest()
 
 
 def test_without_the_setting_the_log_names_it(start, peer):

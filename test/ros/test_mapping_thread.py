@@ -7,7 +7,6 @@ from __future__ import annotations
 from concurrent.futures import CancelledError
 import threading
 
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
@@ -16,9 +15,7 @@ from surfel_mapper.compilation import PROGRESS
 from surfel_mapper.config import Config
 from surfel_mapper.messages.poses import poses_in, StampedPose
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.poses.buffer import MAX_EDGES
 from surfel_mapper.ros.mapping_thread import MappingThread, MAX_POSES
-from surfel_mapper.sensors.depth import SceneImage
 from test.ros.live import cloud, odometry, room, START_NS
 
 PERIOD_NS = 100_000_000
@@ -117,37 +114,6 @@ def test_a_full_queue_drops_and_counts_the_oldest_clouds(bench):
     assert bench.mapper.counters.dropped_by_frame == {'lidar': {'overload': 3}}
 
 
-@pytest.mark.parametrize('frame_id', ['/lidar', 'lidar'])
-def test_all_drops_of_a_sensor_count_under_one_frame(bench, frame_id):
-    def message(number, point_step=12):
-        found = cloud(START_NS + number, room(seed=1, num=9), frame_id=frame_id)
-        found.point_step = point_step
-        return found
-
-    bench.thread.put_cloud(message(0, point_step=11), '/points')
-    bench.thread.call(lambda: setattr(bench.thread, 'paused', True)).result(TIMEOUT_S)
-    bench.put_cloud(1, message(1))
-    bench.thread.call(lambda: setattr(bench.thread, 'paused', False)).result(TIMEOUT_S)
-    bench.hold()
-    for number in range(MAX_CLOUDS + 1):
-        bench.put_cloud(number, message(number))
-    bench.release()
-    bench.thread.stop()
-    bench.mapper.finish()
-
-    (dropped,) = bench.mapper.counters.dropped_by_frame.items()
-    assert dropped[0] == 'lidar'
-    assert {'paused', 'overload', 'bad_cloud'} < set(dropped[1])
-
-
-def test_drops_of_a_frame_with_an_invalid_name_count_under_the_topic(bench):
-    bench.thread.paused = True
-    bench.put_cloud(START_NS, cloud(START_NS, room(seed=1, num=9), frame_id='x' * 10**4))
-    bench.thread.stop()
-
-    assert bench.mapper.counters.dropped_by_frame == {'/points': {'paused': 1}}
-
-
 def test_a_full_queue_drops_and_counts_the_oldest_poses(bench):
     bench.hold()
     pose = StampedPose('odom', 'base_link', START_NS, (0.0, 0.0, 0.0), UNTURNED)
@@ -178,53 +144,6 @@ def test_a_full_queue_drops_no_static_pose(bench):
     assert bench.mapper.counters.messages_ignored == {'overload': 5}
 
 
-def test_static_poses_beyond_the_edges_of_a_mapper_are_counted(bench):
-    """New names without end must not fill the memory while the thread is busy."""
-    bench.hold()
-    bench.thread.put_poses(map(static_pose, map(str, range(MAX_EDGES + 3))), static=True)
-    bench.release()
-    bench.thread.stop()
-
-    assert bench.mapper.counters.messages_ignored == {'overload': 3}
-    bench.mapper.transforms.lookup('0', str(MAX_EDGES - 1), START_NS)
-
-
-COLORED = Config.from_mapping(
-    {
-        'pose.source': 'identity',
-        'input.kind': 'depth',
-        'layers.tsdf.enabled': True,
-        'layers.tsdf.color': True,
-        'layers.tsdf.color_topic': 'rgb',
-        'layers.tsdf.semantics': 'single',
-        'layers.tsdf.label_topic': 'labels',
-    }
-)
-
-
-def image(kind, stamp_ns, pixels):
-    return SceneImage(kind=kind, stamp_ns=stamp_ns, frame_id='camera', camera=None, pixels=pixels)
-
-
-def test_images_of_two_kinds_do_not_displace_each_other():
-    """A map is saved for 2 s: 60 images of each kind wait, as many as scans are joined with."""
-    bench = Bench(config=COLORED)
-    bench.hold()
-    stamps = [START_NS + i * PERIOD_NS for i in range(63)]
-    for number, stamp_ns in enumerate(stamps):
-        if number < 60:
-            bench.thread.put_image(image('color', stamp_ns, np.zeros((2, 2, 3), np.uint8)))
-        bench.thread.put_image(image('label', stamp_ns, np.zeros((2, 2), np.int32)))
-    bench.release()
-    bench.thread.stop()
-
-    images = bench.mapper._pipeline.images._images
-    assert [found.stamp_ns for found in images['color']] == stamps[:60]
-    assert [found.stamp_ns for found in images['label']] == stamps[3:]
-    assert bench.mapper.counters.messages_ignored == {'overload': 3}
-    assert bench.failures == []
-
-
 def test_a_call_follows_the_queued_clouds_and_returns_result_or_error(bench):
     bench.hold()
     bench.put_pose(START_NS)
@@ -236,21 +155,6 @@ def test_a_call_follows_the_queued_clouds_and_returns_result_or_error(bench):
     assert mapped.result(TIMEOUT_S) == 1
     with pytest.raises(ZeroDivisionError):
         failed.result(TIMEOUT_S)
-
-
-def test_a_function_posted_twice_is_called_once(bench):
-    done = []
-
-    def note():
-        done.append(1)
-
-    bench.hold()
-    bench.thread.post(note)
-    bench.thread.post(note)
-    bench.release()
-    bench.thread.stop()
-
-    assert done == [1]
 
 
 def test_bad_and_paused_clouds_are_counted_and_the_next_is_mapped(bench):
@@ -289,24 +193,6 @@ def test_an_unexpected_error_is_counted_and_the_thread_goes_on():
     assert bench.failures == []
     assert bench.mapper.counters.mapped == 3
     assert bench.mapper.counters.messages_ignored == {'internal_error': 4}
-
-
-def test_an_error_between_two_inputs_is_counted_and_the_next_is_mapped(bench, monkeypatch):
-    """Without memory for the list of drops the thread ended, and with it the node."""
-    has_input, failures = bench.thread._has_input, [MemoryError()]
-
-    def fail_once():
-        if failures:
-            raise failures.pop()
-        return has_input()
-
-    monkeypatch.setattr(bench.thread, '_has_input', fail_once)
-    bench.put_pose(START_NS)
-    bench.put_cloud(START_NS)
-    bench.thread.stop()
-
-    assert bench.stamps == [START_NS]
-    assert bench.mapper.counters.messages_ignored == {'internal_error': 1}
 
 
 def test_a_fatal_error_ends_the_thread_and_cancels_calls():

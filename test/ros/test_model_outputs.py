@@ -299,31 +299,3 @@ def test_a_late_subscriber_gets_everything_without_another_scan(start, peer, qos
         assert sorted(picture.ids('planes') + picture.ids('surfaces')) == expected
         wait_for_outlines(peer, found, expected)
         assert expected == to_scan(found['primitives'][-1]).columns['id'][: len(expected)].tolist()
-
-
-def test_a_late_subscriber_gets_no_outlines_removed_before(start, peer):
-    start_node(start, peer)
-    first = peer.collect(PolygonInstanceStamped, f'{NODE}/outlines', ALL_OUTLINES)
-    messages = drive(True, True, False, False)
-    send(peer, messages[:2])
-    peer.spin_until(lambda: first and stamp_of(first[-1]) == START_NS + PERIOD_NS)
-    (subscription,) = [s for s in peer.node.subscriptions if s.topic_name.endswith('outlines')]
-    peer.node.destroy_subscription(subscription)
-    peer.meet()
-    send(peer, messages[2:])
-    peer.diagnosis({'scans.mapped': 4})
-    late = peer.collect(PolygonInstanceStamped, f'{NODE}/outlines', ALL_OUTLINES)
-    expected = sorted(patch.id for patch in models_of(messages).model.patches)
-    peer.spin_until(lambda: sorted(outlines_in(late)) == expected, what=lambda: str(expected))
-
-
-def test_no_models_are_published_without_subscribers(start, peer):
-    start_node(start, peer)
-    send(peer, drive(True, True, True))
-    _, values = peer.diagnosis({'scans.mapped': 3})
-    for name in TOPICS:
-        assert values[f'published_hz.{NODE}/{name}'] == '0.0'
-    found = peer.collect(PointCloud2, f'{NODE}/primitives', LATCHED)
-    peer.spin_until(lambda: found)
-    peer.spin_for(0.3)
-    assert len(found) == 1

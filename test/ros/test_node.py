@@ -7,7 +7,6 @@ from __future__ import annotations
 from array import array
 from importlib.util import find_spec
 import signal
-import time
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from geometry_msgs.msg import PoseStamped
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool
 from visualization_msgs.msg import MarkerArray
@@ -201,30 +199,6 @@ def test_a_failed_save_states_the_reason(start, peer, tmp_path):
     assert node.is_running()
 
 
-def test_parameters_have_descriptions_and_only_live_ones_change(start, peer):
-    node = start('node', *ARGUMENTS)
-    client = peer.parameters()
-
-    described = peer.result(client.describe_parameters(['window.max_scans', 'map.voxel_size_m']))
-    max_scans, voxel_size_m = described.descriptors
-    assert 'scans' in max_scans.description
-    assert (max_scans.read_only, voxel_size_m.read_only) == (False, True)
-    bounds = voxel_size_m.floating_point_range[0]
-    assert (bounds.from_value, bounds.to_value) == (0.001, 1000.0)
-
-    def change(name, value):
-        response = peer.result(client.set_parameters([Parameter(name, value=value)]))
-        return response.results[0]
-
-    assert 'read-only' in change('map.voxel_size_m', 0.3).reason
-    assert 'expected a value in [0, ' in change('window.max_scans', -1).reason
-    assert change('window.max_scans', 2).successful
-    peer.advertise('/odom', '/points')
-    send(peer, drive(4))
-    _, values = peer.diagnosis({'scans.mapped': 4})
-    assert values['window_scans'] == '2', node.output
-
-
 def test_markers_are_published_to_a_subscriber(start, peer):
     start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
@@ -286,15 +260,6 @@ def test_a_parameter_file_without_node_name_is_refused_with_a_remedy(domain, cap
     assert 'put the settings below /**: and ros__parameters:' in said
 
 
-def test_an_unknown_parameter_gives_no_traceback(start):
-    node = start('node', '--ros-args', '-p', 'map.voxelsize:=1.0')
-    assert node.wait() == 1
-    assert node.output.splitlines()[-1] == (
-        'surfel-mapper node: map.voxelsize: no such setting; did you mean map.voxel_size_m?'
-    )
-    assert 'Traceback' not in node.output
-
-
 @pytest.mark.skipif(find_spec('tf2_msgs') is not None, reason='tf2_msgs is installed')
 def test_a_missing_tf2_msgs_ends_the_node_with_the_install_command(domain, capfd):
     assert main(['node', '--ros-args', '-p', 'pose.source:=tf']) == 1
@@ -311,14 +276,3 @@ def test_a_signal_ends_the_node_cleanly_at_any_time(start, number, when):
     if when == 'ready:':
         assert 'scans received 0, mapped 0' in node.output
         assert node.output.count('digest') == 1
-
-
-def test_several_signals_act_as_one(start):
-    node = start('node', *ARGUMENTS)
-    node.wait_for_output('ready:')
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):
-        if node.is_running():
-            node._process.send_signal(number)
-        time.sleep(0.05)
-    assert node.wait() == 0
-    assert node.output.count('digest') == 1

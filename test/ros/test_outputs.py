@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from array import array
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,14 +22,10 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from surfel_mapper import MapMirror
 from surfel_mapper.filters import Chain
-from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.scan_normals import ADDED
 from surfel_mapper.messages.surfel_markers import normal_colors, SEGMENTS, shades
-from surfel_mapper.ros.base_node import steady_timer
-from surfel_mapper.ros.outputs import Outputs
 from test.messages.test_scan_normals import cloud as odd_cloud
-from test.pipeline.made_scans import insert, mapper_with, scan_at
 from test.ros.driving import arguments, drive, mapped, PERIOD_NS, send
 from test.ros.live import cloud, LATCHED, RVIZ, START_NS
 
@@ -125,103 +120,6 @@ def test_changed_minus_removed_equals_the_map(start, peer):
     assert peer.call('clear').success
     peer.spin_until(lambda: len(removed) > len(messages))
     assert voxels(removed[-1]) == expected
-
-
-def test_a_late_client_gets_all_surfels_once_settings_publish_more(peer):
-    """Settings that published less had been forgotten, if there was no client at that time."""
-    mapper = mapper_with(pose__source='identity')
-    outputs = Outputs(peer.node, mapper, SimpleNamespace())
-    scans = [scan_at(1.0), scan_at(2.0)]
-
-    def set_min_points(number):
-        mapper.reconfigure(mapper.config.replace({'map.min_points': number}))
-        outputs.expire()
-
-    def map_scan(scan):
-        (update,) = insert(mapper, scan)
-        outputs.publish_update(update)
-
-    map_scan(scans[0])
-    set_min_points(1000)
-    changed = peer.subscribe(PointCloud2, '~/changed', MANY)
-    peer.spin_until(outputs._changed.get_subscription_count)
-    map_scan(scans[1])
-    set_min_points(1)
-
-    peer.spin_until(lambda: len(changed) == 2)
-    first, last = ({*map(tuple, np.floor(to_scan(msg).points / 0.5).tolist())} for msg in changed)
-    assert first == set()
-    assert last == {
-        tuple(index) for scan in scans for index in np.floor(scan.points / 0.5).tolist()
-    }
-
-
-@pytest.mark.parametrize('is_removed_read', [True, False])
-def test_changed_has_all_changes_once_it_is_switched_on_again(peer, is_removed_read):
-    """With a subscriber of ~/removed those of scans in between had never come, without, none."""
-    mapper = mapper_with(pose__source='identity', window__max_scans=1)
-    outputs = Outputs(peer.node, mapper, SimpleNamespace())
-    changed = peer.subscribe(PointCloud2, '~/changed', MANY)
-    peer.spin_until(outputs._changed.get_subscription_count)
-    removed = peer.subscribe(PointCloud2, '~/removed', MANY) if is_removed_read else []
-    if is_removed_read:
-        peer.spin_until(outputs._removed.get_subscription_count)
-
-    def switch(is_on):
-        mapper.reconfigure(mapper.config.replace({'publish.changed': is_on}))
-        outputs.expire()
-
-    def map_scan(stamp_s, x):
-        corner = np.array([x, 0.2, 1.2]) + np.random.default_rng(1).uniform(0.0, 0.1, (9, 3))
-        (update,) = insert(mapper, scan_at(stamp_s, points=corner.astype(np.float32)))
-        outputs.publish_update(update)
-
-    map_scan(1.0, 0.2)
-    switch(False)
-    map_scan(2.0, 1.2)
-    map_scan(3.0, 2.2)
-    if is_removed_read:
-        peer.spin_until(lambda: len(removed) == 4)
-        assert [voxels_x(message) for message in removed] == [[], [], [0.25], [1.25]]
-    peer.spin_for(0.1)
-    assert [voxels_x(message) for message in changed] == [[0.25]]
-    switch(True)
-    map_scan(4.0, 3.2)
-
-    peer.spin_until(lambda: len(changed) == 3)
-    assert [voxels_x(message) for message in changed] == [[0.25], [2.25], [3.25]]
-    if is_removed_read:
-        peer.spin_until(lambda: len(removed) == 6)
-        assert [voxels_x(message) for message in removed[4:]] == [[0.25], [2.25]]
-
-
-def voxels_x(message, size_m=0.5):
-    """Return the centres of the voxels of a message along x, ascending."""
-    x = to_scan(message).points[:, 0]
-    return sorted(((np.floor(x / size_m) + 0.5) * size_m).tolist())
-
-
-@pytest.mark.parametrize('rate_hz', [1e-9, 1e-12, 5e-324])
-def test_a_timer_of_any_positive_rate_can_be_made(peer, rate_hz):
-    timer = steady_timer(peer.node, rate_hz, lambda: None)
-
-    assert timer.time_until_next_call() > 9 * 365 * 86400 * 10**9
-
-
-def test_settings_are_applied_after_a_tiny_rate(start, peer):
-    """The timer of such a rate could not be made, and then no setting was applied any more."""
-    node = start_node(start, peer, **{'publish.markers_rate_hz': '1.0e-12'})
-    client = peer.parameters()
-    for name, value in (('publish.normals_rate_hz', 1e-12), ('map.min_points', 10**6)):
-        (answer,) = peer.result(client.set_parameters([Parameter(name, value=value)])).results
-        assert answer.successful, answer.reason
-    messages = drive(1)
-    send(peer, messages)
-    peer.diagnosis({'scans.mapped': 1})
-
-    assert peer.call('publish_normals').message == '0 surfels published'
-    assert 'failed' not in node.output
-    node.check()
 
 
 def test_the_full_map_is_published_on_request(start, peer):
@@ -417,15 +315,3 @@ def test_the_grid_is_returned_on_request(start, peer):
     column = int((0.9 - origin.x) / 0.5)
     assert 0 <= cost[int((0.0 - origin.y) / 0.5), column] < 50
     assert cost[int((3.3 - origin.y) / 0.5), column] == 100
-
-
-def test_voxel_indices_equal_those_of_the_map(start, peer):
-    start_node(start, peer, **{'publish.moments': 'true'})
-    normals = peer.collect(PointCloud2, f'{BASE}/normals', LATCHED)
-    messages = drive(2)
-    send(peer, messages)
-    expected = mapped(messages)[1].map.moments().key
-    peer.spin_until(lambda: normals and normals[-1].width == len(expected))
-    columns = to_scan(normals[-1]).columns
-    index = np.stack([columns[f'voxel_{axis}'] for axis in 'xyz'], axis=1)
-    np.testing.assert_array_equal(pack_keys(index), expected)

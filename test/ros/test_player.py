@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
 
 import pytest
 
@@ -178,25 +176,10 @@ def test_invalid_arguments_are_refused(domain, capsys, bag, arguments, message):
     assert message in capsys.readouterr().err
 
 
-def test_a_rate_of_zero_is_wrong_usage(domain, capsys, bag):
-    with pytest.raises(SystemExit, match='2'):
-        main(['play', str(bag), '--rate', '0'])
-    assert '--rate' in capsys.readouterr().err
-
-
 def test_a_bag_of_ros_1_is_refused_with_how_to_convert_it(domain, capsys, tmp_path):
     bag = write_ros1(tmp_path / 'old.bag', drive(store=ROS1))
     assert main(['play', str(bag)]) == 1
     assert 'rosbags-convert' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    'name',
-    ['no_such_package/msg/Thing', 'std_msgs/msg/NoSuchType', 'odd', 'os/path/join', 'a.b/msg/C'],
-)
-def test_a_type_that_is_not_installed_is_named(domain, name):
-    with pytest.raises(DependencyError, match=name):
-        message_type(name)
 
 
 def test_a_user_configuration_of_fast_dds_is_kept(monkeypatch):
@@ -205,10 +188,6 @@ def test_a_user_configuration_of_fast_dds_is_kept(monkeypatch):
     monkeypatch.setenv('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
     context.enlarge_shared_memory()
     assert 'FASTRTPS_DEFAULT_PROFILES_FILE' not in context.os.environ
-
-
-def test_the_profile_of_shared_memory_is_installed_beside_the_code():
-    assert context.PROFILE.read_text(encoding='utf-8').startswith('<?xml')
 
 
 def test_a_type_of_a_bag_imports_no_module_from_the_working_directory(
@@ -223,21 +202,3 @@ def test_a_type_of_a_bag_imports_no_module_from_the_working_directory(
     with pytest.raises(DependencyError, match='evil_msgs'):
         message_type('evil_msgs/msg/Thing')
     assert not ran.exists()
-
-
-def test_packages_of_messages_are_those_of_the_ament_index(domain, tmp_path, monkeypatch):
-    """Listed as having interfaces: a package that is only installed, or a folder, is not."""
-    for name in ('odd_msgs', 'plain_package'):
-        (tmp_path / name / 'msg').mkdir(parents=True)
-        (tmp_path / name / '__init__.py').write_text('')
-        (tmp_path / name / 'msg' / '__init__.py').write_text('class Thing: ...\n')
-    index = tmp_path / 'share' / 'ament_index' / 'resource_index'
-    for kind, name in (('rosidl_interfaces', 'odd_msgs'), ('packages', 'plain_package')):
-        (index / kind).mkdir(parents=True)
-        (index / kind / name).touch()
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{os.pathsep}{tmp_path}')
-    assert message_type('odd_msgs/msg/Thing').__module__ == 'odd_msgs.msg'
-    with pytest.raises(DependencyError, match='no package plain_package of messages'):
-        message_type('plain_package/msg/Thing')
-    assert 'plain_package' not in sys.modules

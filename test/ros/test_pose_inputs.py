@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from geometry_msgs.msg import PolygonStamped, PoseStamped
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 import pytest
 from sensor_msgs.msg import PointCloud2
@@ -139,17 +139,6 @@ def test_a_configured_source_is_kept(start, peer, source):
     assert (values['pose_source'], values['pose_reason']) == (source, 'configured')
 
 
-def test_topics_of_mapping_nodes_are_no_alternatives(peer):
-    for name in ('/peer/normals', '/lidar'):
-        peer.node.create_publisher(PointCloud2, name, 1)
-    search = TopicSearch(peer.node, 'points', PointCloud2)
-    search.look()
-    assert search.alternatives == ['/lidar', '/peer/normals']
-    peer.node.create_subscription(PolygonStamped, '/peer/clear_polygon', print, 1)
-    search.look()
-    assert search.alternatives == []
-
-
 def test_only_topics_of_the_own_namespace_are_read_instead(domain):
     robot = Peer(['--ros-args', '-r', '__ns:=/robot', '-r', 'odom:=wheels'])
     try:
@@ -248,15 +237,6 @@ def test_node_and_replay_choose_the_same_source(reading, tmp_path, kept, source)
         assert reason.startswith(f'{choice.topic} has them')
 
 
-def test_transforms_before_the_choice_are_used_and_no_others(reading):
-    inputs, edges, topics = reading(messages_of(recorded.TF, recorded.ODOMETRY, recorded.POSE))
-
-    assert str(inputs.choice) == 'pose.source auto takes tf: /tf has them'
-    moving = [('odom', 'base_link', False)] * recorded.NUM_SCANS
-    assert edges == [('base_link', 'lidar', True), *moving]
-    assert topics == ['/tf', '/tf_static']
-
-
 def test_transforms_that_do_not_lead_to_the_cloud_leave_odometry(reading):
     entries = messages_of('/tf', recorded.ODOMETRY)
 
@@ -273,13 +253,6 @@ def test_a_configured_mount_completes_the_transforms(reading):
     inputs, edges, topics = reading(messages_of('/tf', recorded.ODOMETRY), mount)
     assert inputs.source == 'tf'
     assert topics == ['/tf', '/tf_static']
-    assert edges == [('odom', 'base_link', False)] * recorded.NUM_SCANS
-
-
-@pytest.mark.parametrize('kept', [recorded.TF, recorded.ODOMETRY])
-def test_a_configured_mount_is_kept_although_the_static_one_came(reading, kept):
-    mount = {'frames.base_to_sensor': [*recorded.MOUNT_M, 0.0, 0.0, 0.0, 1.0]}
-    _, edges, _ = reading(messages_of(kept, '/tf_static'), mount)
     assert edges == [('odom', 'base_link', False)] * recorded.NUM_SCANS
 
 

@@ -15,7 +15,6 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int32, String
 
-from surfel_mapper.errors import ConfigError
 from surfel_mapper.ros.base_node import BaseNode
 from surfel_mapper.ros.context import PROFILE
 from surfel_mapper.ros.diagnostics import publishers
@@ -127,28 +126,6 @@ def test_reliability_follows_publishers_that_come_and_go(bench):
     bench.check_connected(third, 'best effort alone')
 
 
-def test_a_restarted_best_effort_publisher_needs_no_new_subscription(bench):
-    publisher = bench.advertise(BEST_EFFORT)
-    bench.peer.spin_until(lambda: bench.peer.node.count_publishers('/followed'))
-    bench.subscribe()
-    bench.wait_until('best effort')
-    before = bench.peer.node.subscriptions
-    bench.peer.node.destroy_publisher(publisher)
-    bench.peer.spin_for(0.5)
-    publisher = bench.advertise(BEST_EFFORT)
-    bench.check_connected(publisher, 'back')
-    assert list(bench.peer.node.subscriptions) == list(before)
-
-
-def test_the_graph_is_looked_at_before_the_first_subscription(bench, capfd):
-    bench.advertise(BEST_EFFORT)
-    bench.peer.spin_until(lambda: bench.peer.node.count_publishers('/followed'))
-    bench.subscribe()
-    assert bench.executor.reliabilities() == {'/followed': 'best effort'}
-    bench.peer.spin_for(0.3)
-    assert 'incompatible QoS' not in capfd.readouterr().err
-
-
 def test_no_message_is_lost_or_doubled_when_the_subscription_changes(bench):
     bench.subscribe()
     reliable = bench.advertise(RELIABLE)
@@ -235,40 +212,3 @@ def test_an_override_that_keeps_messages_away_is_named(domain, capfd, policy, ch
         peer.close()
     assert bench.failures == []
     assert capfd.readouterr().err.count(f'/chosen: /peer {said}') == 1
-
-
-@pytest.mark.parametrize('overridden', [False, True])
-def test_an_error_at_subscribing_names_the_overrides_only_if_there_are_any(
-    domain, monkeypatch, overridden
-):
-    arguments = ['--ros-args', *reliably('/chosen')] if overridden else []
-    peer = Peer(arguments, BaseNode)
-    bench = Bench(peer, 'chosen')
-
-    def fail(*args, **kwargs):
-        raise RuntimeError('no memory')
-
-    monkeypatch.setattr(peer.node, 'create_subscription', fail)
-    try:
-        with pytest.raises(ConfigError, match='no memory') as caught:
-            bench.subscribe()
-    finally:
-        peer.close()
-    assert ('qos_overrides./chosen.subscription.reliability' in str(caught.value)) == overridden
-    assert '/chosen' in str(caught.value)
-
-
-def test_the_depth_set_by_the_user_stays_with_every_new_subscription(domain):
-    peer = Peer(['--ros-args', '-p', 'qos_overrides./deep.subscription.depth:=7'], BaseNode)
-    bench = Bench(peer, 'deep')
-    try:
-        bench.subscribe()
-        publisher = bench.advertise(BEST_EFFORT)
-        bench.wait_until('best effort')
-        bench.check_connected(publisher, 'one')
-        (subscription,) = [s for s in peer.node.subscriptions if s.topic_name == '/deep']
-        assert subscription.qos_profile.depth == 7
-    finally:
-        bench.executor.stop()
-        peer.close()
-    assert bench.failures == []

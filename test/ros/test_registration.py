@@ -76,27 +76,6 @@ def test_odometry_and_track_are_those_that_a_mapper_finds(start, peer):
     assert mapper.map.digest() in node.output
 
 
-def test_the_track_begins_anew_if_time_is_set_back_or_the_map_is_cleared(start, peer):
-    node = start('node', *arguments())
-    node.wait_for_output('ready')
-    tracks = peer.collect(Path, '/surfel_mapper/track', LATCHED)
-    peer.advertise('/points')
-
-    def track_after(*seconds):
-        """Return the stamps of the track, s since the start, once it has the last of some."""
-        send(peer, [cloud(START_NS + s * 10**9, scan_at(s % 10).points) for s in seconds])
-        peer.spin_until(lambda: tracks and stamps()[-1] == seconds[-1], what=lambda: node.output)
-        return stamps()
-
-    def stamps():
-        return [pose.header.stamp.sec - START_NS // 10**9 for pose in tracks[-1].poses]
-
-    assert track_after(100, 101, 102) == [100, 101, 102]
-    assert track_after(0, 1, 2) == [0, 1, 2]
-    assert peer.call('clear').success
-    assert track_after(3) == [3]
-
-
 def test_registration_on_a_frozen_map_starts_from_an_initial_pose(start, peer, tmp_path):
     save_map(tmp_path / 'room.npz', map_of(ROOM))
     far_off = '[40.0, -30.0, 0.0, 0.0, 0.0, 0.0, 1.0]'

@@ -4,9 +4,6 @@
 
 from __future__ import annotations
 
-from threading import Event
-from types import SimpleNamespace
-
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
@@ -14,17 +11,15 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from geometry_msgs.msg import Point32, PolygonStamped
 from nav_msgs.srv import LoadMap
 from rclpy.parameter import Parameter
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Trigger
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError, PoseError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball, Box, Prism
-from surfel_mapper.ros.map_files import MapWriter
-from surfel_mapper.ros.mapping_thread import MappingThread
-from surfel_mapper.ros.services import MAX_WAITING, prism, Services
+from surfel_mapper.ros.services import prism
 from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
-from test.ros.live import NODE, odometry, stamp, START_NS, TIMEOUT_S
+from test.ros.live import NODE, stamp, START_NS
 
 ANSWERS = LoadMap.Response
 SQUARE = ((-1.0, -1.0), (2.0, -1.0), (2.0, 1.5), (-1.0, 1.5))
@@ -158,11 +153,6 @@ def test_an_invalid_polygon_is_refused(corner, frame_id, error, reason):
         prism(polygon([corner, (1.0, 0.0), (1.0, 1.0)], frame_id), Mapper(Config()))
 
 
-def test_the_slash_of_ros_1_is_no_part_of_the_frame_of_a_polygon():
-    mapper = Mapper(Config())
-    assert prism(polygon(SQUARE, '/odom'), mapper) == prism(polygon(SQUARE, 'odom'), mapper)
-
-
 def test_a_loaded_map_continues_where_it_was_saved(peer, node, tmp_path):
     twin = feed(peer, 3)
     saved = digest(peer)
@@ -219,44 +209,3 @@ def test_concurrent_requests_are_answered_while_clouds_are_mapped(peer, node):
 
     assert all(answer.result().success for answer in answers)
     peer.diagnosis({'scans.mapped': 4})
-
-
-def test_a_pause_drops_clouds_and_uses_poses(peer, node):
-    feed(peer, 1)
-    assert peer.call('pause', SetBool, SetBool.Request(data=True)).success
-    send(peer, drive(2)[1:])
-    status, values = peer.diagnosis({'scans.dropped.paused': 1})
-    assert values['scans.dropped_by_frame.lidar.paused'] == '1'
-    assert 'paused: clouds are dropped until' in status.message
-    assert status.level == b'\1'
-    assert peer.call('pause', SetBool, SetBool.Request(data=False)).success
-    between = START_NS + 2 * PERIOD_NS
-    peer.publish('/odom', odometry(between, (0.4, 0.0, 0.0)))
-    send(peer, drive(4)[3:])
-    peer.diagnosis({'scans.mapped': 2})
-
-
-def test_requests_beyond_the_queue_are_refused_at_once(peer):
-    mapper = Mapper(Config())
-    thread, busy, released = MappingThread(mapper, pytest.fail), Event(), Event()
-    thread.start(lambda update: None)
-    thread.call(lambda: (busy.set(), released.wait(TIMEOUT_S)))
-    assert busy.wait(TIMEOUT_S)
-    writer = MapWriter(mapper, thread)
-    Services(peer.node, mapper, thread, SimpleNamespace(expire=lambda: None), writer)
-    client = peer.node.create_client(Trigger, '/peer/clear')
-    peer.spin_until(client.service_is_ready)
-    answers = []
-    for _ in range(MAX_WAITING):
-        answers.append(client.call_async(Trigger.Request()))
-        peer.spin_for(0.02)
-
-    refused = peer.result(client.call_async(Trigger.Request()))
-
-    assert not refused.success
-    assert refused.message == f'{MAX_WAITING} requests wait already; try again'
-    assert not any(answer.done() for answer in answers)
-    released.set()
-    peer.spin_until(lambda: all(answer.done() for answer in answers))
-    assert all(answer.result().success for answer in answers)
-    thread.stop()

@@ -115,41 +115,6 @@ def test_all_eager_messages_are_taken_before_every_other_one(peer, bench):
     assert bench.executor.topics() == ['/eager', '/others']
 
 
-def test_an_error_of_the_thread_itself_ends_it_and_is_reported(peer, bench, monkeypatch):
-    error = RuntimeError('unexpected')
-
-    def fail():
-        raise error
-
-    bench.executor.subscribe(String, 'others', bench.take, ALL)
-    monkeypatch.setattr(bench.executor, '_follow_publishers', fail)
-    bench.executor.start()
-    published(peer, 'others', String, ['a'])
-
-    peer.spin_until(lambda: bench.failures)
-    assert bench.failures == [error]
-
-
-def test_received_messages_are_taken_before_the_end(peer, bench):
-    busy, released = threading.Event(), threading.Event()
-
-    def take(message):
-        busy.set()
-        released.wait(TIMEOUT_S)
-        bench.take(message)
-
-    bench.executor.subscribe(String, 'others', take, ALL)
-    bench.executor.start()
-    published(peer, 'others', String, ['a', 'b', 'c'])
-    assert busy.wait(TIMEOUT_S)
-    stopping = threading.Thread(target=bench.executor.stop)
-    stopping.start()
-    stopping.join(0.2)  # it now waits for the callback
-    released.set()
-    stopping.join(TIMEOUT_S)
-    assert bench.taken == ['a', 'b', 'c']
-
-
 def test_stopping_works_while_messages_keep_arriving(peer, bench, monkeypatch):
     monkeypatch.setattr('surfel_mapper.ros.subscription_executor.LAST_S', 0.1)
     publisher = peer.node.create_publisher(String, 'others', ALL)
@@ -166,14 +131,3 @@ def test_stopping_works_while_messages_keep_arriving(peer, bench, monkeypatch):
     stopping.start()
     stopping.join(TIMEOUT_S)
     assert not stopping.is_alive()
-
-
-def test_stopping_and_restarting_works_at_any_time(peer, bench):
-    bench.executor.stop()
-    for _ in range(3):
-        bench.executor.subscribe(String, 'others', bench.take, ALL)
-        bench.executor.start()
-        bench.executor.stop()
-        assert bench.executor.topics() == []
-        assert 'intake' not in [thread.name for thread in threading.enumerate()]
-    assert not peer.node.count_subscribers('others')

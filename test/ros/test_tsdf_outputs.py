@@ -12,16 +12,15 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from nav_msgs.msg import OccupancyGrid
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
 from surfel_mapper.sensors.depth import PinholeCamera
 from surfel_mapper.tsdf.sensors import LidarModel
 from test.messages.test_compressed_image import packed, packed_depth
 from test.ros.live import cloud, LATCHED, odometry, stamp, START_NS
-from test.ros.test_inputs import arguments, camera_info, depth_image, OPTICAL
+from test.ros.test_inputs import arguments, camera_info, OPTICAL
 from test.ros.test_node import PERIOD_NS
 from test.ros.test_outputs import BASE, start_node
 
@@ -122,31 +121,6 @@ def test_distances_to_obstacles_come_as_cloud_and_slice(start, peer):
     assert ((cost > 0) & (cost < 100)).sum() > 300
 
 
-def test_colours_come_from_the_image_beside_a_depth_image(start, peer):
-    settings = {
-        'input.kind': 'depth',
-        'frames.base_to_sensor': OPTICAL,
-        'layers.tsdf.enabled': 'true',
-        'layers.tsdf.mesh_rate_hz': 10.0,
-        'layers.tsdf.color': 'true',
-        'layers.tsdf.color_topic': '/rgb/image',
-    }
-    kinds = {'/depth/image': Image, '/depth/camera_info': CameraInfo, '/rgb/image': Image}
-    start('node', *arguments(**settings))
-    peer.advertise('/odom', *kinds, kinds=kinds)
-    meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
-    camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
-    peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
-    peer.publish('/depth/camera_info', camera_info(camera))
-    depth = np.full((60, 80), 2000, np.uint16)
-    peer.publish('/depth/image', depth_image(START_NS, depth, '16UC1'))
-    pixels = np.full((60, 80, 3), (200, 100, 0), np.uint8)
-    peer.publish('/rgb/image', depth_image(START_NS, pixels, 'rgb8'))
-    peer.spin_until(lambda: shown(meshes))
-    colors = np.array([(c.r, c.g, c.b) for m in shown(meshes).values() for c in m.colors])
-    np.testing.assert_allclose(colors, np.tile([200, 100, 0], (len(colors), 1)) / 255, atol=0.01)
-
-
 def test_packed_images_are_taken_and_damaged_ones_counted(start, peer):
     depth_topic, info = '/cam/depth/compressedDepth', '/cam/camera_info'
     color_topic = '/cam/color/compressed'
@@ -186,32 +160,6 @@ def test_packed_images_are_taken_and_damaged_ones_counted(start, peer):
             'messages_ignored.bad_image': 1,
         }
     )
-
-
-def test_rates_changed_while_running_hold_at_once(start, peer):
-    start_node(start, peer, **{**SETTINGS, 'layers.tsdf.slice_rate_hz': 0.0})
-    slices = peer.collect(OccupancyGrid, f'{BASE}/tsdf_slice', LATCHED)
-    directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
-    peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
-    peer.publish('/points', cloud(START_NS, RADIUS_M * directions))
-    peer.diagnosis({'scans.mapped': 1})
-    assert not slices
-    done = peer.result(
-        peer.parameters().set_parameters(
-            [
-                Parameter('layers.tsdf.slice_rate_hz', value=10.0),
-                Parameter('layers.tsdf.slice_height_m', value=2.5),
-            ]
-        )
-    )
-    assert all(result.successful for result in done.results)
-    peer.spin_until(lambda: len(slices) > 2)
-    grid = slices[-1]
-    y, x = np.nonzero(np.array(grid.data).reshape(grid.info.height, grid.info.width) == 100)
-    corner = grid.info.origin.position
-    distance = np.hypot(corner.x + (x + 0.5) * 0.2 - 0.1, corner.y + (y + 0.5) * 0.2)
-    # 2 m above the sensor the sphere of 5 m is a circle of sqrt(21) m; its inside is free.
-    assert 21**0.5 - 0.4 < distance.min() < 21**0.5
 
 
 def test_a_late_reader_gets_the_whole_mesh_and_then_changes_only(start, peer):

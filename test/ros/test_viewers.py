@@ -17,18 +17,13 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
-from geometry_msgs.msg import Point
-from sensor_msgs.msg import PointCloud2, PointField
-from std_msgs.msg import ColorRGBA
-from visualization_msgs.msg import Marker, MarkerArray
+from sensor_msgs.msg import PointCloud2
 
-from surfel_mapper.ros import node_view
 from surfel_mapper.viz.discs import DrawnDiscs
-from surfel_mapper.viz.scene import Scene
 from surfel_mapper.viz.server import free_port, LIVE
 from test import extras
 from test.ros.driving import arguments, drive, mapped, send
-from test.ros.live import cloud, LATCHED, NODE, room, START_NS, TIMEOUT_S
+from test.ros.live import LATCHED, NODE, TIMEOUT_S
 
 NUM_SCANS = 6
 
@@ -139,77 +134,6 @@ def test_a_node_is_viewed_by_its_topics(start, peer, tmp_path):
 
     found = shown(file, '/map/surfels')[-1]
     np.testing.assert_allclose(in_order(found), in_order(expected), atol=1e-4)
-
-
-def test_messages_that_cannot_be_shown_are_left_out(start, peer, tmp_path):
-    """Anyone can publish on the topics of a node; a view ended with a traceback."""
-    file = tmp_path / 'view.rrd'
-    view = start('view', '--live', '/other', '--rrd', file)
-    topics = {f'/other/{name}': kind for name, kind in FOREIGN.items()}
-    publishers = {
-        topic: peer.node.create_publisher(kind, topic, LATCHED) for topic, kind in topics.items()
-    }
-    peer.spin_until(lambda: all(p.get_subscription_count() for p in publishers.values()))
-    point = Point(x=1.0)
-    odd = Marker(ns='odd\x1b[31m\n', type=Marker.TRIANGLE_LIST, points=[point] * 4)
-    lines = Marker(ns='lines', type=Marker.LINE_LIST, points=[point] * 3)
-    colours = Marker(type=Marker.TRIANGLE_LIST, points=[point] * 3, colors=[ColorRGBA()] * 2)
-    for topic, message, reason in (
-        ('/other/normals', PointCloud2(width=10, height=1), 'normals: a message is not shown'),
-        ('/other/changed', PointCloud2(width=10, height=1), 'changed: a message is not shown'),
-        ('/other/mesh', odd, '4 points and 0 colours'),
-        ('/other/mesh', colours, '3 points and 2 colours'),
-        ('/other/planes', MarkerArray(markers=[lines]), '3 points and 0 colours'),
-    ):
-        publishers[topic].publish(message)
-        view.wait_for_output(reason)
-        peer.spin_for(1.1)
-        view.check()
-    plain = cloud(START_NS, room(seed=1, num=100))
-    publishers['/other/normals'].publish(plain)
-    view.wait_for_output('no normal_x, normal_y, normal_z')
-    publishers['/other/normals'].publish(plane_cloud(50, 3.0))
-    peer.spin_for(3.0)
-    assert view.stop() == 0, view.output
-    assert '\x1b' not in view.output
-    assert len(shown(file, '/map/surfels')) >= 1
-
-
-@pytest.mark.parametrize(('least_s', 'expected'), [(0.0, [1.0, 2.0, 3.0]), (np.inf, [1.0, 3.0])])
-def test_a_view_shows_maps_at_most_so_often_and_the_newest_at_its_end(
-    peer, tmp_path, monkeypatch, least_s, expected
-):
-    monkeypatch.setattr(node_view, 'MAP_S', least_s)
-    file = tmp_path / 'shown.rrd'
-    with Scene.to_file(file) as scene:
-        view = node_view.NodeView(peer.node, '/other', scene, 'normal')
-        for height in (1.0, 2.0, 3.0):
-            view.show_normals(plane_cloud(40, height))
-        view.finish()
-        view.finish()
-    heights = [float(found[0, 2]) for found in shown(file, '/map/surfels')]
-    assert heights == expected
-
-
-def plane_cloud(num, height):
-    """Return a cloud of a level plane with normals."""
-    names = ('x', 'y', 'z', 'normal_x', 'normal_y', 'normal_z')
-    fields = [PointField(name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate(names)]
-    table = np.tile(np.float32([0.0, 0.0, height, 0.0, 0.0, 1.0]), (num, 1))
-    table[:, 0] = np.arange(num)
-    header = cloud(START_NS, room(seed=1, num=1)).header
-    return PointCloud2(
-        header=header,
-        height=1,
-        width=num,
-        fields=fields,
-        point_step=24,
-        row_step=24 * num,
-        data=table.tobytes(),
-    )
-
-
-FOREIGN = {'normals': PointCloud2, 'changed': PointCloud2, 'mesh': Marker, 'planes': MarkerArray}
 
 
 def test_a_node_that_is_not_there_is_named_with_those_that_are(start, peer, tmp_path):

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from surfel_mapper.config import Config
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
-from surfel_mapper.sensors.depth import depth_points, free_rays, PinholeCamera
 from surfel_mapper.sensors.free_rays import free_directions
 from surfel_mapper.tsdf.queries import FREE, states, UNKNOWN
 from surfel_mapper.tsdf.sensors import LidarModel
@@ -150,31 +149,3 @@ def test_rays_without_a_return_are_deskewed_by_the_time_of_their_column(threads,
     middle = expected.mean(axis=0)
     points = np.outer([4.0, 8.0, 12.0, 16.0], middle / np.linalg.norm(middle))
     assert set(states(mapper.tsdf.blocks, points)) == {FREE}
-
-
-def test_pixels_of_depth_at_infinity_are_free_up_to_the_range():
-    camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
-    depth = np.full((60, 80), 2.0, np.float32)
-    depth[:, 40:], depth[:, 60:] = np.inf, np.nan
-    rays = free_rays(depth, camera)
-    assert len(rays) == 60 * 20
-    mapper = Mapper(
-        Config.from_mapping(
-            {
-                'pose.source': 'identity',
-                'layers.tsdf.enabled': True,
-                'map.min_points': 1,
-                'layers.tsdf.max_range_m': 6.0,
-            }
-        )
-    )
-    seen_by = (80, 60, 70.0, 70.0, 39.5, 29.5)
-    mapper.add_scan(
-        Scan(
-            points=depth_points(depth, camera), stamp_ns=S, frame_id='c', camera=seen_by, free=rays
-        )
-    )
-    assert len(list(mapper.insert_ready())) == 1
-    points = np.array([[-0.5, 0.0, 4.0], [0.5, 0.0, 4.0], [1.6, 0.0, 4.0]])
-    assert states(mapper.tsdf.blocks, points).tolist() == [UNKNOWN, FREE, UNKNOWN]
-    assert free_rays(np.full((60, 80), 65535, np.uint16), camera) is None

@@ -94,16 +94,6 @@ def test_noise_moves_points_along_their_beam_with_the_deviation_asked_for():
     np.testing.assert_allclose(beams, quiet.directions().reshape(-1, 3), atol=1e-6)
 
 
-def test_noise_depends_on_seed_and_number_of_the_scan_alone():
-    lidar = Lidar(beams=4, columns=64, elevation_deg=(-30.0, -5.0), range_noise_m=0.1, seed=5)
-    other = Lidar(beams=4, columns=64, elevation_deg=(-30.0, -5.0), range_noise_m=0.1, seed=6)
-    first = lidar.scan(FLOOR, HERE, number=7).points
-    lidar.scan(FLOOR, HERE, number=8)
-    np.testing.assert_array_equal(lidar.scan(FLOOR, HERE, number=7).points, first)
-    assert (lidar.scan(FLOOR, HERE, number=8).points != first).any()
-    assert (other.scan(FLOOR, HERE, number=7).points != first).any()
-
-
 def test_with_a_pose_for_each_column_every_column_is_seen_from_its_own():
     poses = np.array([pose_matrix((0.1 * c, 0.0, 0.01 * c), (0, 0, 0, 1)) for c in range(32)])
     rolling = SMALL.scan(FLOOR, poses)

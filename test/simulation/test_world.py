@@ -57,21 +57,6 @@ def test_no_surface_is_of_no_primitive():
     assert np.isnan(world.reflectivity(none)).all()
 
 
-@pytest.mark.parametrize(
-    ('origins', 'directions', 'says'),
-    [
-        ([0.0, 0.0], [[1.0, 0.0, 0.0]], 'origins: shape'),
-        ([[0.0, 0.0, 0.0]] * 2, [[1.0, 0.0, 0.0]] * 3, '2 rows for 3'),
-        ([0.0, 0.0, 0.0], [[2.0, 0.0, 0.0]], 'unit vectors'),
-        ([0.0, 0.0, 0.0], [[np.nan, 0.0, 0.0]], 'unit vectors'),
-        ([0.0, np.nan, 0.0], [[1.0, 0.0, 0.0]], 'origins: not all finite'),
-    ],
-)
-def test_invalid_rays_are_refused(origins, directions, says):
-    with pytest.raises(ValueError, match=says):
-        World([BOX]).raycast(origins, directions)
-
-
 def test_a_street_is_the_same_for_the_same_seed_and_another_for_another():
     street = World.street(seed=3, length_m=40.0)
     assert street.primitives == World.street(seed=3, length_m=40.0).primitives

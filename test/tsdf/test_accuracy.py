@@ -163,7 +163,6 @@ def test_far_from_the_origin_distances_are_as_exact():
     assert abs(there.distance[rows] - here.distance[here.rows()]).max() < 1e-4
 
 
-OS = LidarModel(rows=64, columns=1024, vertical_fov_deg=60.0, max_range_m=30.0)
 SIZES = dict(voxel_size_m=0.2, truncation_m=0.6)
 
 
@@ -211,27 +210,3 @@ def test_the_cosine_is_that_of_the_angle_to_the_plane():
         assert inside.sum() > 10_000
         assert np.percentile(abs(image.cosine - expected)[inside], 99) < 0.01
         assert image.cosine.min() >= 0.35 - 1e-6
-
-
-def test_beyond_the_edge_of_a_thing_no_slope_is_seen():
-    range_m = np.full((480, 640), 4.0)
-    range_m[:, 300:310] = 2.0  # a pole
-    cosine = image_of(VGA, range_m).with_cosines(0.05).cosine
-    assert cosine[:, 295:315].min() > 0.9
-    alone = np.full((480, 640), np.nan)
-    alone[200, 300] = 2.0
-    assert (image_of(VGA, alone).with_cosines(0.05).cosine == 1.0).all()
-
-
-def test_along_rays_the_ground_has_holes_that_cosines_close():
-    image = image_of(OS, ground(OS, 1.53))
-    near = {}
-    for distance in ('along_ray', 'to_plane'):
-        vertices = zero_crossings(fused(image, **SIZES, distance=distance, carve=False))
-        away = np.linalg.norm(vertices[:, :2], axis=1)
-        vertices = vertices[(away > 4.0) & (away < 9.0)]
-        assert abs(vertices[:, 2] + 1.53).max() < 0.1
-        near[distance] = len(np.unique(np.floor(vertices[:, :2] / 0.2), axis=0))
-    area = np.pi * (9.0**2 - 4.0**2) / 0.2**2
-    assert near['to_plane'] > 0.97 * area
-    assert near['along_ray'] < 0.9 * area

@@ -178,16 +178,3 @@ def test_blocks_do_not_come_and_go_where_the_radius_holds_all_that_is_seen(caplo
     assert [record.message.split(':')[0] for record in caplog.records] == [
         'layers.tsdf.max_radius_m'
     ]
-
-
-def test_evicted_blocks_inserted_again_are_unchanged():
-    one = integrator(voxel_size_m=0.1, truncation_m=0.3, max_radius_m=1.5, color=True)
-    one.integrate(image_of(SENSOR, np.full((8, 90), 2.5)), np.eye(4), 7)
-    before = one.blocks.copied(one.blocks.rows())
-    one.blocks.clear_updated()
-    removed = one.blocks.evict([0.0, 0.0, 0.0], 7)
-    assert 0 < len(removed) < len(before)
-    one.blocks.insert(removed)
-    rows = one.blocks.find(before.index)
-    assert np.array_equal(one.blocks.field[rows], before.field)
-    assert np.array_equal(one.blocks.head[rows, 2], before.stamp_ns)

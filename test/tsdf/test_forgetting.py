@@ -109,31 +109,3 @@ def test_fifty_blue_after_500_red_are_blue_at_a_cap_of_ten(by_points):
     assert by_points or red.min() > left - 0.01
     assert blue.min() > 195.0
     assert weight.max() == 10.0
-
-
-def test_blocks_that_are_free_for_long_are_skipped_and_nothing_is_missed(monkeypatch):
-    fields = []
-    for settled in (4, 10**9):
-        monkeypatch.setattr('surfel_mapper.tsdf.integrator.SETTLED', settled)
-        one, skipped = integrator(voxel_size_m=0.05, truncation_m=0.15, carve=True), 0
-        for number in range(30):
-            board = np.abs(np.arange(80) - 40) < 8
-            depth = np.where(board & (number >= 20), 1.0, 2.5) * np.ones((60, 1))
-            image = image_of(SMALL, depth * SMALL.ray_length)
-            done = one.integrate(image, np.eye(4), number * PERIOD_NS)
-            skipped += done.num_skipped
-        blocks = one.blocks
-        order = np.lexsort(blocks.index(blocks.rows()).T)
-        fields.append((blocks.copied(blocks.rows()[order]), skipped))
-    (found, num_skipped), (expected, none_skipped) = fields
-    assert none_skipped == 0
-    assert num_skipped > 100
-    np.testing.assert_array_equal(found.index, expected.index)
-    known = found.field[:, 1] > 0
-    np.testing.assert_array_equal(known, expected.field[:, 1] > 0)
-    free = expected.field[:, 0] == np.float32(0.15)
-    np.testing.assert_array_equal(found.field[:, 0] == np.float32(0.15), free)
-    # The board stands in space that was free for 20 scans: fewer of them counted, if skipped.
-    assert ((found.field[:, 0] < 0) & known).sum() >= ((expected.field[:, 0] < 0) & known).sum()
-    on_wall = (found.index[:, 2] >= 5) & known.any(axis=1)
-    np.testing.assert_allclose(found.field[on_wall, 0], expected.field[on_wall, 0], atol=1e-6)

@@ -40,21 +40,6 @@ def test_a_scan_again_changes_nothing_but_the_weight_up_to_its_cap(monkeypatch):
             np.testing.assert_allclose(W, np.minimum(count * first[block][1], cap), rtol=1e-5)
 
 
-def test_at_the_cap_a_step_decays_by_the_gain_of_one_measurement():
-    one = integrator(**SIZES, weight_mode='constant', max_weight=4.0)
-    for _ in range(10):
-        one.integrate(wall(SMALL, 2.0), np.eye(4))
-    before = field(one)
-    gain = 1.0 / (4.0 + 1.0)
-    for count in range(1, 5):
-        one.integrate(wall(SMALL, 2.1), np.eye(4))
-        for block, (D, W) in before.items():
-            inside = (W == 4.0) & (abs(D - 0.05) < 0.1)
-            after = field(one)[block][0][inside]
-            expected = D[inside] + 0.1 * (1.0 - (1.0 - gain) ** count)
-            np.testing.assert_allclose(after, expected, atol=2e-5)
-
-
 def test_the_order_of_measurements_does_not_matter():
     images = [wall(SMALL, range_m) for range_m in (2.0, 2.1, 1.95)]
     states = []

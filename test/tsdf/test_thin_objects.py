@@ -8,7 +8,7 @@ import pytest
 from surfel_mapper.tsdf.mesh import Mesher
 from surfel_mapper.tsdf.sensors import LidarModel
 from test.bench.mesh_error import distances_to_mesh
-from test.tsdf.scenes import image_of, integrator, SMALL
+from test.tsdf.scenes import image_of, integrator
 
 LIDAR = LidarModel(rows=32, columns=1024, vertical_fov_deg=30.0, max_range_m=40.0)
 VOXEL_M = 0.2
@@ -69,16 +69,6 @@ def test_only_narrow_runs_before_farther_ones_are_thin():
     assert thin.any(axis=0).sum() == len(columns)
 
 
-def test_masked_pixels_and_cameras_have_no_thin_objects():
-    range_m, on_pole = ranges(POLES, 0.05)
-    image = image_of(LIDAR, range_m)
-    assert image.thin(0.2, 0.25).sum() > 100
-    assert not image.with_images(mask=on_pole).thin(0.2, 0.25).any()
-    depth = np.full((SMALL.rows, SMALL.columns), 3.0)
-    depth[:, 40] = 1.0
-    assert not image_of(SMALL, depth).thin(0.2, 0.25).any()
-
-
 def test_thin_objects_of_dynamic_labels_leave_no_surface():
     range_m, on_pole = ranges(POLES, 0.05)
     solid = {}
@@ -91,18 +81,6 @@ def test_thin_objects_of_dynamic_labels_leave_no_surface():
         solid[len(dynamic)] = (known & (one.blocks.distance[row] < 0.3)).sum()
     assert solid[0] > 20
     assert solid[1] == 0
-
-
-def test_voxels_about_thin_objects_take_no_colour_of_the_background():
-    one = integrator(**SIZES, color=True)
-    range_m, on_pole = ranges(POLES, 0.03)
-    color = np.where(on_pole[..., None], (255, 0, 0), (0, 0, 255)).astype(np.uint8)
-    one.integrate(image_of(LIDAR, range_m).with_images(color=color), np.eye(4))
-    row = one.blocks.find(np.floor(np.array([4.0, 0.1, 0.0]) / 1.6).astype(int))
-    colored = one.blocks.color[row][3] > 0
-    assert (np.abs(one.blocks.distance[row]) < 0.3).sum() > 20
-    assert colored.any()
-    assert not one.blocks.color[row][2, colored].any()
 
 
 @pytest.mark.parametrize('pixel', [(16, 100), (3, 700), (30, 0)])

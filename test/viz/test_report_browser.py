@@ -168,28 +168,6 @@ def test_dragging_turns_the_map_and_reset_turns_it_back(opened):
     assert complaints == []
 
 
-def test_the_wheel_comes_nearer_and_colours_can_be_chosen(opened):
-    page, complaints = opened
-    far = pixels(page)
-    box = page.locator('#surfels').bounding_box()
-    page.mouse.move(box['x'] + 200, box['y'] + 200)
-    page.mouse.wheel(0, -400)
-
-    def is_nearer(image):
-        return num_coloured(image) > 1.1 * num_coloured(far)
-
-    assert is_nearer(picture_when(page, is_nearer))
-
-    def is_blue(image):  # up is (0.5, 0.5, 1) in the colours of normals
-        drawn = np.ptp(image, axis=2) > 0.1
-        return (image[drawn].argmax(axis=1) == 2).mean() > 0.95
-
-    for colouring, blue in (('planarity', False), ('normal', True)):
-        page.locator('#colouring').select_option(colouring, force=True)
-        assert is_blue(picture_when(page, lambda image, blue=blue: is_blue(image) == blue)) == blue
-    assert complaints == []
-
-
 def test_a_click_shows_the_values_of_a_surfel(opened):
     page, complaints = opened
     box = page.locator('#surfels').bounding_box()
@@ -211,21 +189,6 @@ def test_a_click_shows_the_values_of_a_surfel(opened):
     page.mouse.click(box['x'] + box['width'] - 5, box['y'] + 60)  # above the horizon of the map
     page.locator('#values').wait_for(state='hidden')
     assert complaints == []
-
-
-def test_the_whole_map_is_in_view_on_a_telephone(browser, written):
-    page = browser.new_page(viewport={'width': 390, 'height': 844}, is_mobile=True, has_touch=True)
-    page.set_default_timeout(1000 * WAIT_S)
-    page.goto(written.as_uri())
-    assert page.locator('#help').inner_text().startswith('A finger turns')
-    image = picture_when(page, lambda image: num_coloured(image) > 2000)
-    found = np.nonzero(np.ptp(image, axis=2) > 0.1)
-    assert len(found[0]) > 2000
-    for place, end in zip(found, image.shape[:2], strict=True):
-        assert place.min() > 0
-        assert place.max() < end - 1
-    assert page.evaluate('document.documentElement.scrollWidth') <= 390
-    page.close()
 
 
 def test_a_mesh_can_be_shown_in_its_colours(browser, tmp_path):

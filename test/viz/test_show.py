@@ -234,14 +234,6 @@ def test_a_bag_is_mapped_while_it_is_shown(tmp_path):
     ('name', 'content', 'message'),
     [
         ('map.npz', b'PK', r'map\.npz'),
-        (
-            'mesh.ply',
-            b'ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n'
-            b'property float z\nelement face 1\n'
-            b'property list uchar int vertex_indices\nend_header\n'
-            b'0 0 0\n3 0 0 0\n',
-            r'mesh\.ply: faces as text, expected a binary PLY',
-        ),
         ('a.obj', b'v 0 0 0\nf 1 2 3\n', r'a\.obj: no obj file: index 1 is out of bounds'),
         ('a.obj', b'v 0 x 0\n', r'a\.obj: no obj file: could not convert'),
         ('poses.tum', b'1 2 3\n', r'poses\.tum'),

@@ -155,21 +155,3 @@ def test_a_recording_for_which_there_is_no_room_is_a_sentence(tmp_path):
     assert 'map.rrd: cannot be written: ' in done.stderr
     assert 'Traceback' not in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ['map.npz']
-
-
-def test_a_recording_has_any_name_and_replaces_another_as_a_whole(tmp_path):
-    """Rerun takes no names that are not UTF-8, and overwrote a file at once."""
-    path = tmp_path / os.fsdecode(b'a\xff.rrd')
-    path.write_bytes(b'before')
-    shown = scene.Scene.to_file(path)
-    shown.points('map', np.zeros((10, 3)), 0.1)
-    shown.__exit__(KeyError, KeyError())
-    assert [*tmp_path.iterdir()] == [path]
-    assert path.read_bytes() == b'before'
-    with scene.Scene.to_file(path) as shown:
-        shown.points('map', np.zeros((10, 3)), 0.1)
-        assert path.read_bytes() == b'before'
-    assert [*tmp_path.iterdir()] == [path]
-    path.rename(tmp_path / 'a.rrd')
-    done = rerun('verify', tmp_path / 'a.rrd')
-    assert done.returncode == 0, done.stderr

@@ -36,16 +36,16 @@ class CostsLayer(Layer):
             ),
         )
 
-    def _version(self, now: Moment) -> tuple[float, ...]:
+    def _version(self, moment: Moment) -> tuple[float, ...]:
         """Return a value for each map and cell of the sensor; a frozen map keeps its version."""
         surfel_map = self.around.surfel_map
-        cell = np.floor(now.T_map_sensor[:2, 3] / surfel_map.voxel_size_m)
+        cell = np.floor(moment.T_map_sensor[:2, 3] / surfel_map.voxel_size_m)
         return surfel_map.version, *cell.tolist()
 
-    def _grid_messages(self, now: Moment) -> list[bytes]:
+    def _grid_messages(self, moment: Moment) -> list[bytes]:
         config, surfel_map = self.config, self.around.surfel_map
         surfels = surfel_map.surfels(config.map.min_points)
-        center = now.T_map_sensor[:2, 3]
+        center = moment.T_map_sensor[:2, 3]
         grid = traversability(surfels, surfel_map.voxel_size_m, center, config.grid)
         content = (grid.resolution_m, grid.origin, grid.cost)
-        return [occupancy_grid(*content, stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
+        return [occupancy_grid(*content, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)]

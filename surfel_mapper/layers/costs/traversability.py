@@ -61,7 +61,7 @@ def traversability(
     surfels: Surfels, voxel_size_m: float, center: npt.ArrayLike, limits: GridConfig
 ) -> CostGrid:
     """
-    Return the costs of the ground around a place.
+    Return the costs of the ground around a position.
 
     Parameters
     ----------
@@ -82,12 +82,12 @@ def traversability(
     """
     number = max(math.ceil(limits.size_m / voxel_size_m), 1)
     first = np.floor(np.asarray(center, np.float64) / voxel_size_m).astype(np.int64) - number // 2
-    place = surfels.voxel_index[:, :2] - first
-    inside = ((place >= 0) & (place < number)).all(axis=1) & np.isfinite(surfels.planarity)
+    index = surfels.voxel_index[:, :2] - first
+    inside = ((index >= 0) & (index < number)).all(axis=1) & np.isfinite(surfels.planarity)
     cost = np.full(number * number, UNKNOWN, np.int8)
     if inside.any():
         chosen = surfels.select(inside)
-        cell = place[inside, 1] * number + place[inside, 0]
+        cell = index[inside, 1] * number + index[inside, 0]
         ground = ground_of(chosen, cell, limits.clearance_m)
         slope_deg = np.degrees(np.arccos(np.minimum(ground.upright, 1.0)))
         step_m = steps(chosen, ground, voxel_size_m, number, limits.max_slope_deg)
@@ -131,16 +131,16 @@ def steps(
     index = surfels.voxel_index[ground.top, :2]
     for axis, stride in ((0, 1), (1, number)):
         has_next = ground.cell // (number if axis else 1) % number < number - 1
-        here = np.flatnonzero(has_next)
-        there = row_of[ground.cell[here] + stride]
-        here, there = here[there >= 0], there[there >= 0]
-        border = (index[here] + 0.5) * voxel_size_m
+        own = np.flatnonzero(has_next)
+        neighbour = row_of[ground.cell[own] + stride]
+        own, neighbour = own[neighbour >= 0], neighbour[neighbour >= 0]
+        border = (index[own] + 0.5) * voxel_size_m
         border[:, axis] += 0.5 * voxel_size_m
         heights = [
             top[rows, 2] + ((border - top[rows, :2]) * slope[rows]).sum(axis=1)
-            for rows in (here, there)
+            for rows in (own, neighbour)
         ]
         step = np.abs(heights[0] - heights[1])
-        for rows in (here, there):  # each row is the neighbour of one at most
+        for rows in (own, neighbour):  # each row is the neighbour of one at most
             highest[rows] = np.maximum(highest[rows], step)
     return np.asarray(highest)

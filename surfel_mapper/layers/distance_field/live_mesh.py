@@ -97,27 +97,27 @@ class LiveMesh:
         """Copy some of the changed blocks; return True once all are; called by the map's owner."""
         return self._changed.copy_next()
 
-    def changed(self, now: Moment) -> Iterable[bytes]:
+    def changed(self, moment: Moment) -> Iterable[bytes]:
         """Return MarkerArrays of the tiles that have changed; called by the owner of the map."""
-        return self._messages(self._changed.take(), now, is_complete=False)
+        return self._messages(self._changed.take(), moment, is_complete=False)
 
-    def complete(self, now: Moment) -> Iterable[bytes]:
+    def complete(self, moment: Moment) -> Iterable[bytes]:
         """Return MarkerArrays of all tiles, which replace any before."""
-        return self._messages(self._changed.take(), now, is_complete=True)
+        return self._messages(self._changed.take(), moment, is_complete=True)
 
     def _messages(
-        self, changes: list[Changes], now: Moment, *, is_complete: bool
+        self, changes: list[Changes], moment: Moment, *, is_complete: bool
     ) -> Iterator[bytes]:
         tiles = self._apply(changes)
         markers, size = [], 0
         if is_complete or not self._is_known:  # a viewer may show tiles of an earlier map
             self._is_known = True
             tiles = [tile for tile, keys in self._tiles.items() if keys]
-            markers.append(clearing(now))
+            markers.append(clearing(moment))
         for tile in tiles:
             mesh = self._mesher.parts(self._tiles[tile])
             number = self._numbers.setdefault(tile, len(self._numbers))
-            stamp_ns, frame_id = now.stamp_ns, now.frame_id
+            stamp_ns, frame_id = moment.stamp_ns, moment.frame_id
             markers.append(mesh_marker(mesh, number=number, stamp_ns=stamp_ns, frame_id=frame_id))
             size += 3 * len(mesh) * CORNER_BYTES
             if size > MAX_BYTES:
@@ -128,12 +128,12 @@ class LiveMesh:
 
     def _apply(self, changes: list[Changes]) -> list[Tile]:
         """Update the triangles; return the tiles that have changed."""
-        keys = sorted({key for part in changes for key in self._mesher.apply(part)})
-        there, touched = self._mesher.keys(), dict[Tile, None]()
+        keys = sorted({key for change in changes for key in self._mesher.apply(change)})
+        meshed, touched = self._mesher.keys(), dict[Tile, None]()
         for key, tile in zip(keys, tiles_of(keys), strict=True):
             touched[tile] = None
             content = self._tiles.setdefault(tile, {})
-            if key in there:
+            if key in meshed:
                 content[key] = None
             else:
                 content.pop(key, None)
@@ -161,16 +161,16 @@ class WholeMesh:
         """Copy some of the changed blocks; return True once all are; called by the map's owner."""
         return self._changed.copy_next()
 
-    def messages(self, now: Moment) -> Iterable[bytes]:
+    def messages(self, moment: Moment) -> Iterable[bytes]:
         """Return one Marker; called by the owner of the map."""
-        return self._marker(self._changed.take(), now)
+        return self._marker(self._changed.take(), moment)
 
-    def _marker(self, changes: list[Changes], now: Moment) -> Iterator[bytes]:
-        for part in changes:
-            self._mesher.apply(part)
+    def _marker(self, changes: list[Changes], moment: Moment) -> Iterator[bytes]:
+        for change in changes:
+            self._mesher.apply(change)
         mesh = self._mesher.parts()
         yield marker_bytes(
-            mesh_marker(mesh, number=0, stamp_ns=now.stamp_ns, frame_id=now.frame_id)
+            mesh_marker(mesh, number=0, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)
         )
 
 
@@ -181,13 +181,13 @@ def tiles_of(keys: list[int]) -> list[Tile]:
     return [(x, y, z) for x, y, z in tiles.tolist()]
 
 
-def clearing(now: Moment) -> Marker:
+def clearing(moment: Moment) -> Marker:
     """Return the marker that deletes all others."""
     return Marker(
         ns='mesh',
         id=0,
         type=TRIANGLE_LIST,
         action=DELETE_ALL,
-        frame_id=now.frame_id,
-        stamp_ns=now.stamp_ns,
+        frame_id=moment.frame_id,
+        stamp_ns=moment.stamp_ns,
     )

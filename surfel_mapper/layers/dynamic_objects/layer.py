@@ -98,12 +98,12 @@ class DynamicObjectsLayer(Layer):
         """
         verdict = self._verdict(scan, T_map_sensor, keys)
         stay = np.concatenate([keys[verdict == SEEN], hit])
-        known = ~np.isin(self._keys, stay) & np.isin(self._keys, keys)
+        kept = ~np.isin(self._keys, stay) & np.isin(self._keys, keys)
         through = np.setdiff1d(keys[verdict == THROUGH], hit)
-        found = np.concatenate([self._keys[known], through])
-        counts = np.concatenate([self._counts[known], np.ones(len(through), np.int64)])
-        self._keys, place = np.unique(found, return_inverse=True)
-        self._counts = np.bincount(place, counts, len(self._keys)).astype(np.int64)
+        candidates = np.concatenate([self._keys[kept], through])
+        counts = np.concatenate([self._counts[kept], np.ones(len(through), np.int64)])
+        self._keys, inverse = np.unique(candidates, return_inverse=True)
+        self._counts = np.bincount(inverse, counts, len(self._keys)).astype(np.int64)
         empty = self._counts >= self.config.dynamic.min_scans
         return unpack_keys(self._keys[empty])
 

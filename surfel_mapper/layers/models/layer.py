@@ -160,40 +160,46 @@ class ModelsLayer(Layer):
     def _current_shapes(self) -> list[PatchShape]:
         return self._shapes.of(self.models.model, self.models.versions)
 
-    def _marker_messages(self, now: Moment) -> list[bytes]:
+    def _marker_messages(self, moment: Moment) -> list[bytes]:
         markers = model_markers(
             self._current_shapes(),
             self.models.model.gaussians,
             self.around.surfel_map.voxel_size_m,
-            stamp_ns=now.stamp_ns,
-            frame_id=now.frame_id,
+            stamp_ns=moment.stamp_ns,
+            frame_id=moment.frame_id,
         )
         return [marker_array(markers)]
 
-    def _primitive_messages(self, now: Moment) -> list[bytes]:
+    def _primitive_messages(self, moment: Moment) -> list[bytes]:
         gaussians, versions = self.models.model.gaussians, self.models.versions
         columns = primitive_columns(self._current_shapes(), gaussians, versions)
-        return [cloud_bytes(from_columns(columns), stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
+        return [
+            cloud_bytes(from_columns(columns), stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)
+        ]
 
-    def _surfel_messages(self, now: Moment) -> list[bytes]:
+    def _surfel_messages(self, moment: Moment) -> list[bytes]:
         columns = surfel_primitive_columns(self.models.surfels, self.models.model)
-        return [cloud_bytes(from_columns(columns), stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
+        return [
+            cloud_bytes(from_columns(columns), stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)
+        ]
 
-    def _all_outlines(self, now: Moment) -> Iterable[bytes]:
+    def _all_outlines(self, moment: Moment) -> Iterable[bytes]:
         self._published = dict.fromkeys(self._published, 0)  # and removed ones, empty
-        return self._changed_outlines(now)
+        return self._changed_outlines(moment)
 
-    def _changed_outlines(self, now: Moment) -> Iterable[bytes]:
+    def _changed_outlines(self, moment: Moment) -> Iterable[bytes]:
         """Yield outlines that have changed, and empty ones of patches that were removed."""
         shapes = {shape.patch.id: shape for shape in self._current_shapes()}
         versions = {number: self.models.versions[number] for number in shapes}
-        before, self._published = self._published, versions
+        previous, self._published = self._published, versions
         rings: dict[int, npt.NDArray[np.float64]] = {}
-        rings |= {number: np.empty((0, 3)) for number in before.keys() - shapes.keys()}
+        rings |= {number: np.empty((0, 3)) for number in previous.keys() - shapes.keys()}
         rings |= {
             number: bridged(shapes[number].rings)
             for number, version in versions.items()
-            if before.get(number) != version
+            if previous.get(number) != version
         }
         for number, ring in rings.items():
-            yield polygon_instance(ring, number, stamp_ns=now.stamp_ns, frame_id=now.frame_id)
+            yield polygon_instance(
+                ring, number, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id
+            )

@@ -96,18 +96,18 @@ def panels_of(points: npt.NDArray[Any], model: MultiModel, title: str = '') -> l
     """
     cloud = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     cloud = cloud[:: -(-len(cloud) // MOST_POINTS) or 1]
-    parts = [patch.samples(0.5 * model.voxel_size_m) for patch in model.patches]
+    samples = [patch.samples(0.5 * model.voxel_size_m) for patch in model.patches]
     colors = np.concatenate([primitive_colors([p.id for p in model.patches]), [GREY]])
     few = np.minimum(model.gaussians.num_points, MOST_OF_GAUSSIAN)
-    parts.append(replace(model.gaussians, num_points=few).samples())
+    samples.append(replace(model.gaussians, num_points=few).samples())
     caption = (
         f'{len(model.planes)} planes, {len(model.surfaces)} surfaces, '
         f'{len(model.gaussians)} Gaussians: {model.size_bytes} bytes'
     )
-    painted = np.repeat(colors, [len(part) for part in parts], axis=0)
+    painted = np.repeat(colors, [len(sample) for sample in samples], axis=0)
     return [
         Panel(title=title or f'{len(points)} points', points=cloud),
-        Panel(title=caption, points=np.concatenate(parts), colors=painted),
+        Panel(title=caption, points=np.concatenate(samples), colors=painted),
     ]
 
 

@@ -34,21 +34,21 @@ Others are mostly parts of tree crowns, of which one in nine merges within a met
 
 
 @kernel(error_model='numpy')
-def find_small_curved(rows, starts, count, normal, limit, found):
+def find_small_curved(rows, starts, count, normal, limit, is_small):
     """
     Find curved charts that are too small.
 
-    rows    (M,) int32; chart k has those from starts[k] to starts[k + 1] - 1
-    count   (R,) int64
-    normal  (R, 3) float64, of either sign
-    limit   least cosine between two normals of a flat chart
-    found   (K,) bool, out
+    rows      (M,) int32; chart k has those from starts[k] to starts[k + 1] - 1
+    count     (R,) int64
+    normal    (R, 3) float64, of either sign
+    limit     least cosine between two normals of a flat chart
+    is_small  (K,) bool, out
 
     Pairs of normals are compared, so the result does not depend on the order of the rows.
     """
     for k in range(len(starts) - 1):
         first, end = starts[k], starts[k + 1]
-        found[k] = False
+        is_small[k] = False
         if end - first >= LEAST_CURVED_VOXELS:
             continue
         num_points, least = 0, 1.0
@@ -58,7 +58,7 @@ def find_small_curved(rows, starts, count, normal, limit, found):
             for j in range(first, i):
                 m = normal[rows[j]]
                 least = min(least, abs(n[0] * m[0] + n[1] * m[1] + n[2] * m[2]))
-        found[k] = least < limit and num_points < LEAST_CURVED_POINTS
+        is_small[k] = least < limit and num_points < LEAST_CURVED_POINTS
 
 
 @inlined(error_model='numpy')
@@ -140,8 +140,8 @@ def is_folded(normals, mean, limit):
             lowest = min(lowest, cosine)
     if len(normals) < 2 or below == 0 or below > MOST_FOLDED:
         return len(normals) >= 2 and below > 0
-    place = 0.01 * (100.0 - FOLD_PERCENTILE) * (len(normals) - 1)
-    low = int(place)
+    rank = 0.01 * (100.0 - FOLD_PERCENTILE) * (len(normals) - 1)
+    low = int(rank)
     if below != low + 1:
         return below > low
-    return highest + (place - low) * (lowest - highest) < limit
+    return highest + (rank - low) * (lowest - highest) < limit

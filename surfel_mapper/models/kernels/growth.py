@@ -100,8 +100,8 @@ def grow_patches(
             plane[j] = tangent[u, j] if slot < 0 else candidate_plane[u, slot, j]
         for k in range(first[u], first[u + 1]):
             v = rows[k]
-            place = -1 if label[v] == patch else slot_of(candidate[v], patch)
-            if place < 0:
+            free_slot = -1 if label[v] == patch else slot_of(candidate[v], patch)
+            if free_slot < 0:
                 continue
             num = 0
             for i in range(starts[v], starts[v + 1]):
@@ -110,11 +110,11 @@ def grow_patches(
                 continue
             if label[v] < 0 and flat[v] and abs_cosine(normal[v], plane) < least_cosine:
                 continue
-            candidate[v, place] = patch
+            candidate[v, free_slot] = patch
             for j in range(4):
-                candidate_plane[v, place, j] = plane[j]
+                candidate_plane[v, free_slot, j] = plane[j]
             if label[v] < 0 and num >= LEAST_SHARE * (starts[v + 1] - starts[v]):
-                queue[tail, 0], queue[tail, 1] = v, place
+                queue[tail, 0], queue[tail, 1] = v, free_slot
                 tail += 1
 
 

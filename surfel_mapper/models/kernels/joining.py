@@ -36,16 +36,16 @@ def sort_owners(first, owners, means, counts, least, out):
     for i in range(len(owners)):
         if owners[i] >= least:
             starts[owners[i] - least + 1] += 1
-    place = np.empty(len(starts), np.int64)
+    next_row = np.empty(len(starts), np.int64)
     for k in range(len(starts) - 1):
-        place[k] = starts[k]
+        next_row[k] = starts[k]
         starts[k + 1] += starts[k]
     for v in range(len(first) - 1):
         for i in range(first[v], first[v + 1]):
             if owners[i] < least:
                 continue
-            row = place[owners[i] - least]
-            place[owners[i] - least] += 1
+            row = next_row[owners[i] - least]
+            next_row[owners[i] - least] += 1
             to_voxel[row], to_count[row] = v, counts[i]
             for j in range(3):
                 to_mean[row, j] = means[i, j]
@@ -65,46 +65,46 @@ def touching_patches(starts, voxel, adjacent, first, owners, pairs):
     low, rows = adjacent
     number, num = len(starts) - 1, 0
     table = np.empty((number, 3), np.int64)
-    marked, count, found = table[:, 0], table[:, 1], table[:, 2]
+    marked, count, touched = table[:, 0], table[:, 1], table[:, 2]
     for k in range(number):
         marked[k], count[k] = -1, 0
     for k in range(number):
-        num_found = 0
+        num_touched = 0
         for i in range(starts[k], starts[k + 1]):
             own = voxel[i]
             for n in range(low[own] - 1, low[own + 1]):
                 v = rows[n] if n >= low[own] else own
                 for m in range(first[v], first[v + 1]):
-                    other = owners[m]
-                    if other < 0 or other == k or marked[other] == i:
+                    neighbour = owners[m]
+                    if neighbour < 0 or neighbour == k or marked[neighbour] == i:
                         continue
-                    marked[other] = i
-                    if count[other] == 0:
-                        found[num_found] = other
-                        num_found += 1
-                    count[other] += 1
-        for n in range(num_found):
+                    marked[neighbour] = i
+                    if count[neighbour] == 0:
+                        touched[num_touched] = neighbour
+                        num_touched += 1
+                    count[neighbour] += 1
+        for n in range(num_touched):
             if num < len(pairs):
-                pairs[num, 0], pairs[num, 1], pairs[num, 2] = k, found[n], count[found[n]]
-            count[found[n]] = 0
+                pairs[num, 0], pairs[num, 1], pairs[num, 2] = k, touched[n], count[touched[n]]
+            count[touched[n]] = 0
             num += 1
     return num
 
 
 @inlined(error_model='numpy')
-def gather(rows, number, stride, points, weights, found, low):
+def gather(rows, number, stride, points, weights, columns, low):
     """
     Copy every stride-th of the first ``number`` rows as height_errors takes them; return the end.
 
     rows             (N,) int64
     points, weights  (P, 3), (P,) float64
-    found            (4, M) float64, out from column low on: x, y, z, weight
+    columns          (4, M) float64, out from column low on: x, y, z, weight
     """
     for n in range(0, number, stride):
         i = rows[n]
         for j in range(3):
-            found[j, low] = points[i, j]
-        found[3, low] = weights[i]
+            columns[j, low] = points[i, j]
+        columns[3, low] = weights[i]
         low += 1
     return low
 
@@ -131,11 +131,11 @@ def height_errors(points, low, high, normal, errors):
     sums, right = np.empty((9, 9)), np.empty((5, 5))
     terms, matrix = np.empty(most), np.empty((most, most))
     scale = local_points(points, low, normal, local)
-    left = turn = 0.0
+    residual = turn = 0.0
     for again in range(2):
         size = most if again else TERMS[1]
         degree = 4 if size > TERMS[1] else 2
-        left = height_sums(local, degree, powers, sums, right)
+        residual = height_sums(local, degree, powers, sums, right)
         solve_heights(size, sums, right, terms, matrix)
         if not again:
             solve_transposed(size, matrix, terms)
@@ -143,9 +143,9 @@ def height_errors(points, low, high, normal, errors):
     done = 0
     for d in range(len(errors)):
         for p in range(done, TERMS[d]):
-            left -= terms[p] * terms[p]
+            residual -= terms[p] * terms[p]
         done = TERMS[d]
-        errors[d] = max(left, 0.0) * scale * scale
+        errors[d] = max(residual, 0.0) * scale * scale
     return turn
 
 

@@ -80,19 +80,19 @@ def trace_loop(ways, start_x, start_y, corners, num):
     connected there.
     """
     x, y = start_x, start_y
-    left = 4  # there is none at the start
+    left_turn = 4  # there is none at the start
     while True:
         corners[num, 0], corners[num, 1] = x, y
         num += 1
         direction = 0
         while not ways[x, y] >> direction & 1:
             direction += 1
-        if left < 4 and ways[x, y] >> left & 1:
-            direction = left
+        if left_turn < 4 and ways[x, y] >> left_turn & 1:
+            direction = left_turn
         ways[x, y] ^= 1 << direction
         x += (direction == 0) - (direction == 2)
         y += (direction == 1) - (direction == 3)
-        left = (direction + 1) % 4
+        left_turn = (direction + 1) % 4
         if x == start_x and y == start_y:
             return num
 

@@ -73,7 +73,7 @@ class Regions(NamedTuple):
     """
 
     root: npt.NDArray[np.int64]
-    after: npt.NDArray[np.int64]
+    next_patch: npt.NDArray[np.int64]
     last: npt.NDArray[np.int64]
     patches: npt.NDArray[np.int64]
     rows: npt.NDArray[np.int64]
@@ -109,7 +109,7 @@ def join_layers(pairs, points, weights, starts, regions):
                     away += (points[row, j] - mean[j]) * normal[j]
                 squares += weights[row] * away * away
                 total += weights[row]
-            patch = regions.after[patch]
+            patch = regions.next_patch[patch]
         away = math.sqrt(squares / total)
         if away < LAYER_SIGMAS * regions.patch_sigma[large]:
             patch = small
@@ -117,7 +117,7 @@ def join_layers(pairs, points, weights, starts, regions):
                 for j in range(3):
                     regions.patch_normal[patch, j] = normal[j]
                 regions.patch_sigma[patch] = max(regions.patch_sigma[patch], away)
-                patch = regions.after[patch]
+                patch = regions.next_patch[patch]
             for j in range(3):
                 regions.normal[small, j] = normal[j] * regions.patch_points[small]
             join_pair(small, large, regions)
@@ -129,8 +129,8 @@ def join_pair(small, large, regions):
     patch = small
     while patch >= 0:
         regions.root[patch] = large
-        patch = regions.after[patch]
-    regions.after[regions.last[large]] = small
+        patch = regions.next_patch[patch]
+    regions.next_patch[regions.last[large]] = small
     regions.last[large] = regions.last[small]
     regions.patches[large] += regions.patches[small]
     regions.rows[large] += regions.rows[small]
@@ -157,7 +157,7 @@ def join_smooth(edges, adjacent, points, weights, starts, boxes, floor, regions)
     floor     square of the residuals that are not resolved, m^2
     regions   Regions, in place
     """
-    first, others = adjacent
+    first, touching = adjacent
     state = points, weights, starts, boxes, floor
     scratch = np.empty((2, len(points)), np.int64), np.empty((4, 2 * len(points)))
     root, patches = regions.root, regions.patches
@@ -187,12 +187,12 @@ def join_smooth(edges, adjacent, points, weights, starts, boxes, floor, regions)
         join_pair(small, large, regions)
         while patch >= 0:
             for n in range(first[patch], first[patch + 1]):
-                other = root[others[n]]
-                if other != large and marked[other] != joined:
-                    marked[other] = joined
-                    pairs[num, 0], pairs[num, 1] = large, other
+                neighbour = root[touching[n]]
+                if neighbour != large and marked[neighbour] != joined:
+                    marked[neighbour] = joined
+                    pairs[num, 0], pairs[num, 1] = large, neighbour
                     num += 1
-            patch = regions.after[patch]
+            patch = regions.next_patch[patch]
         joined += 1
 
 
@@ -226,7 +226,7 @@ def gain_of(a, b, state, scratch, regions):
         while patch >= 0:
             if dot(regions.patch_normal[patch], normals[2]) < CHART_COSINE:
                 return 0.0
-            patch = regions.after[patch]
+            patch = regions.next_patch[patch]
     small = a if regions.extent[a] < regions.extent[b] else b
     rows, points = scratch
     num_a = rows_near(a, small, state, regions, rows[0])
@@ -286,7 +286,7 @@ def rows_near(region, small, state, regions, rows):
                 rows[num] = i
                 num += dx * dx + dy * dy + dz * dz < limit_sq
                 i += 1
-        patch = regions.after[patch]
+        patch = regions.next_patch[patch]
     return num
 
 
@@ -313,7 +313,7 @@ def heights(points, low, high, normal, quartic, floor):
 
 
 @kernel(error_model='numpy')
-def describe_regions(names, state, regions, limits, normals, found):
+def describe_regions(names, state, regions, limits, normals, out):
     """
     Compute normals of regions, and how curved they are.
 
@@ -322,7 +322,7 @@ def describe_regions(names, state, regions, limits, normals, found):
     limits   gain, turn and bend from which a region is curved; quartics are fitted only if the
              gain of a quadric alone is less, but its turn and bend are not
     normals  (J, 3) float64, out
-    found    (J, 4) float64, out: gain of the best height field over a plane; turn, rad, and bend,
+    out      (J, 4) float64, out: gain of the best height field over a plane; turn, rad, and bend,
              m, of the quadric; rms from a plane, m
     """
     points, weights, _, _, floor = state
@@ -338,7 +338,7 @@ def describe_regions(names, state, regions, limits, normals, found):
             best, plane, sigma, turn, bend = heights(
                 own, zero, end, normals[k], quartic > 0, floor
             )
-            found[k, 0], found[k, 1], found[k, 2], found[k, 3] = plane - best, turn, bend, sigma
+            out[k, 0], out[k, 1], out[k, 2], out[k, 3] = plane - best, turn, bend, sigma
             if not (turn > limits[1] and bend > limits[2] and plane - best <= limits[0]):
                 break
 

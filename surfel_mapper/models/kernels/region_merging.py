@@ -83,7 +83,7 @@ def find_pairs(means, values, frames, scales, rules, pairs, lengths):
     pairs    (M, 2) int64, out: pairs beyond M are counted only
     lengths  (M,) float64, out: distances of their means, m
     """
-    found = 0
+    num = 0
     delta = np.empty(3)
     least_plane, least_arc = rules[0] - 1e-12, rules[2] - 1e-12
     for i in range(len(means)):
@@ -104,10 +104,10 @@ def find_pairs(means, values, frames, scales, rules, pairs, lengths):
                 gap(delta, length, values[i], frames[i], values[j], frames[j]) < rules[4]
             ):
                 continue
-            if found < len(pairs):
-                pairs[found, 0], pairs[found, 1], lengths[found] = i, j, length
-            found += 1
-    return found
+            if num < len(pairs):
+                pairs[num, 0], pairs[num, 1], lengths[num] = i, j, length
+            num += 1
+    return num
 
 
 @kernel(error_model='numpy')
@@ -126,9 +126,9 @@ def merge_pairs(points, starts, boxes, pairs, near, parent):
         parent[k] = k
     for p in range(len(pairs)):
         i, j = pairs[p, 0], pairs[p, 1]
-        one, other = find_root(parent, i), find_root(parent, j)
-        if one != other and touch(points, starts[i], starts[j], boxes[i], boxes[j], near):
-            parent[max(one, other)] = min(one, other)
+        root_i, root_j = find_root(parent, i), find_root(parent, j)
+        if root_i != root_j and touch(points, starts[i], starts[j], boxes[i], boxes[j], near):
+            parent[max(root_i, root_j)] = min(root_i, root_j)
     for k in range(len(parent)):
         parent[k] = find_root(parent, k)
 

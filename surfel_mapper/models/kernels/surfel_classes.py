@@ -116,10 +116,10 @@ def classify_sparse(rows, neighbours, own, surfels, rules, kind, normal):
             continue
         votes = 0.0
         for h in range(-1, len(near)):
-            other = near[h] if h >= 0 else row
-            if other >= 0 and not math.isnan(own_normal[other, 0]):
-                m = own_normal[other]
-                votes += count[other] * (m[0] * n[0] + m[1] * n[1] + m[2] * n[2])
+            voxel = near[h] if h >= 0 else row
+            if voxel >= 0 and not math.isnan(own_normal[voxel, 0]):
+                m = own_normal[voxel]
+                votes += count[voxel] * (m[0] * n[0] + m[1] * n[1] + m[2] * n[2])
         kind[row] = FLAT
         for j in range(3):
             normal[row, j] = -n[j] if votes < 0.0 else n[j]
@@ -164,12 +164,12 @@ def variance(c, x, y, z):
 
 
 @kernel(error_model='numpy')
-def mark_material(rows, before, count, position, normal, kind, reported, rules, material):
+def mark_material(rows, old_kind, count, position, normal, kind, reported, rules, material):
     """
     Mark the rows whose change since the last report is material, and update the report.
 
     rows      (K,) int32
-    before    (K,) uint8, their previous classes
+    old_kind  (K,) uint8, their previous classes
     reported  count (R,), position (R, 3), normal (R, 3) as last reported, in place
     rules     square of the distance m^2, cosine, factor of the count
     material  (R,) bool, all False; out
@@ -186,7 +186,7 @@ def mark_material(rows, before, count, position, normal, kind, reported, rules, 
         if more < less:
             more, less = less, more
         if (
-            before[i] != kind[row]
+            old_kind[i] != kind[row]
             or away > rules[0]
             or cosine < rules[1]
             or more >= rules[2] * less

@@ -35,32 +35,32 @@ def rows_of_groups(group, flags, extra, rows):
 
 
 @kernel(error_model='numpy')
-def connected_components(rows, links, neighbours, places, parent):
+def connected_components(rows, links, neighbours, index_of, parent):
     """
     Find the connected components of linked voxels.
 
     rows        (M,) int32
     links       (R,) uint64
     neighbours  (R, 2 H) int32
-    places      (R,) int32, all -1; restored afterwards
+    index_of    (R,) int32, all -1; restored afterwards
     parent      (M,) int64, out: index of the first voxel of the component
     """
     for i in range(len(rows)):
-        places[rows[i]] = i
+        index_of[rows[i]] = i
         parent[i] = i
     for i in range(len(rows)):
         bits, h = links[rows[i]], 0
         while bits:
             if bits & np.uint64(1):
-                j = places[neighbours[rows[i], h]]
+                j = index_of[neighbours[rows[i], h]]
                 if j >= 0:
-                    one, other = find_root(parent, i), find_root(parent, np.int64(j))
-                    parent[max(one, other)] = min(one, other)
+                    root_i, root_j = find_root(parent, i), find_root(parent, np.int64(j))
+                    parent[max(root_i, root_j)] = min(root_i, root_j)
             bits >>= np.uint64(1)
             h += 1
     for i in range(len(rows)):
         parent[i] = find_root(parent, i)
-        places[rows[i]] = -1
+        index_of[rows[i]] = -1
 
 
 @kernel(error_model='numpy')
@@ -84,15 +84,15 @@ def name_components(rows, parent, key, component):
 
 
 @kernel(error_model='numpy')
-def sort_by_group(rows, group, places, ordered, starts):
+def sort_by_group(rows, group, number_of, ordered, starts):
     """
     Sort rows by group, in the order in which groups and rows first appear.
 
-    rows     (M,) int32
-    group    (R,) int32, of each row
-    places   (R,) int32, all -1; restored afterwards
-    ordered  (M,) int32, out
-    starts   (M + 1,) int64, out: start of each group, and M
+    rows       (M,) int32
+    group      (R,) int32, of each row
+    number_of  (R,) int32, all -1; restored afterwards
+    ordered    (M,) int32, out
+    starts     (M + 1,) int64, out: start of each group, and M
 
     Returns the number of groups.
     """
@@ -100,11 +100,11 @@ def sort_by_group(rows, group, places, ordered, starts):
     of_row = np.empty(len(rows), np.int64)
     for i in range(len(rows)):
         name = group[rows[i]]
-        if places[name] < 0:
-            places[name] = num
+        if number_of[name] < 0:
+            number_of[name] = num
             starts[num + 1] = 0
             num += 1
-        of_row[i] = places[name]
+        of_row[i] = number_of[name]
         starts[of_row[i] + 1] += 1
     starts[0] = 0
     filled = np.empty(num, np.int64)
@@ -112,7 +112,7 @@ def sort_by_group(rows, group, places, ordered, starts):
         filled[k] = starts[k]
         starts[k + 1] += starts[k]
     for i in range(len(rows)):
-        places[group[rows[i]]] = -1
+        number_of[group[rows[i]]] = -1
         ordered[filled[of_row[i]]] = rows[i]
         filled[of_row[i]] += 1
     return num
@@ -155,12 +155,12 @@ def mean_normals(rows, starts, flat, normal, means):
 
 
 @kernel(error_model='numpy')
-def find_doubtful(rows, starts, means, normal, position, rules, found):
+def find_doubtful(rows, starts, means, normal, position, rules, is_doubtful):
     """
     Find groups that may be folded or overlap themselves.
 
-    rules  least cosine of a normal to the mean; least height along the mean normal, m
-    found  (K,) bool, out
+    rules        least cosine of a normal to the mean; least height along the mean normal, m
+    is_doubtful  (K,) bool, out
     """
     for k in range(len(starts) - 1):
         low, high, least = np.inf, -np.inf, 1.0
@@ -171,7 +171,7 @@ def find_doubtful(rows, starts, means, normal, position, rules, found):
             height = x * position[row, 0] + y * position[row, 1] + z * position[row, 2]
             least = min(least, cosine)
             low, high = min(low, height), max(high, height)
-        found[k] = least < rules[0] or high - low > rules[1]
+        is_doubtful[k] = least < rules[0] or high - low > rules[1]
 
 
 @kernel(error_model='numpy')
@@ -255,7 +255,7 @@ def find_pieces(owner, block, key, piece):
     for group in owner:
         number = max(number, group + 1)
     head, recent = np.empty(number, np.int32), np.empty(number, np.int32)
-    after, least = np.empty(len(owner), np.int32), np.empty(len(owner), np.int32)
+    next_piece, least = np.empty(len(owner), np.int32), np.empty(len(owner), np.int32)
     head[:] = -1
     recent[:] = -1
     num = 0
@@ -268,10 +268,10 @@ def find_pieces(owner, block, key, piece):
         if at < 0 or block[least[at]] != block[row]:
             at = head[group]
             while at >= 0 and block[least[at]] != block[row]:
-                at = after[at]
+                at = next_piece[at]
             if at < 0:
                 at = num
-                after[at], least[at], head[group] = head[group], row, at
+                next_piece[at], least[at], head[group] = head[group], row, at
                 num += 1
             recent[group] = at
         if key[row] < key[least[at]]:
@@ -283,17 +283,17 @@ def find_pieces(owner, block, key, piece):
 
 
 @kernel(error_model='numpy')
-def common_labels(labels, starts, found):
+def common_labels(labels, starts, common):
     """
     Find the groups whose members all have the same label.
 
     labels  (M,) int32
     starts  (K + 1,) int64, first member of each group, and M
-    found   (K,) int64, out: that label, -1 for several
+    common  (K,) int64, out: that label, -1 for several
     """
-    for k in range(len(found)):
-        found[k] = labels[starts[k]]
+    for k in range(len(common)):
+        common[k] = labels[starts[k]]
         for i in range(starts[k] + 1, starts[k + 1]):
-            if labels[i] != found[k]:
-                found[k] = -1
+            if labels[i] != common[k]:
+                common[k] = -1
                 break

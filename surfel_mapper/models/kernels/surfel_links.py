@@ -80,33 +80,33 @@ def unlink(gone, neighbours, links, marks, marked):
     for i in range(len(gone)):
         row = gone[i]
         for h in range(2 * half):
-            other = neighbours[row, h]
-            if other < 0:
+            neighbour = neighbours[row, h]
+            if neighbour < 0:
                 continue
-            neighbours[other, (h + half) % (2 * half)] = -1
+            neighbours[neighbour, (h + half) % (2 * half)] = -1
             neighbours[row, h] = -1
             if h >= half:
-                num = set_link(other, row, h - half, False, links, marks, marked, num)
+                num = set_link(neighbour, row, h - half, False, links, marks, marked, num)
         links[row] = 0
     return num
 
 
 @kernel(error_model='numpy')
-def link_neighbours(came, found, neighbours):
+def link_neighbours(came, around, neighbours):
     """
     Enter voxels into the lists of their neighbours.
 
     came        (C,) int32, rows
-    found       (C, 2 H) int32, rows of their neighbours, -1 for none
+    around      (C, 2 H) int32, rows of their neighbours, -1 for none
     neighbours  (R, 2 H) int32, in place
     """
     half = neighbours.shape[1] // 2
     for i in range(len(came)):
         for h in range(2 * half):
-            other = found[i, h]
-            neighbours[came[i], h] = other
-            if other >= 0:
-                neighbours[other, (h + half) % (2 * half)] = came[i]
+            neighbour = around[i, h]
+            neighbours[came[i], h] = neighbour
+            if neighbour >= 0:
+                neighbours[neighbour, (h + half) % (2 * half)] = came[i]
 
 
 @kernel(error_model='numpy')
@@ -134,13 +134,13 @@ def update_links(chosen, is_chosen, neighbours, state, rules, links, marks, mark
                         row, np.int64(neighbours[row, h]), h, False, links, marks, marked, num
                     )
         for h in range(half):
-            after, before = np.int64(neighbours[row, h]), np.int64(neighbours[row, half + h])
-            if after >= 0 and kind[row] == FLAT:
-                joined = are_linked(row, after, state, rules)
-                num = set_link(row, after, h, joined, links, marks, marked, num)
-            if before >= 0 and not is_chosen[before] and kind[before] == FLAT:
-                joined = are_linked(before, row, state, rules)
-                num = set_link(before, row, h, joined, links, marks, marked, num)
+            ahead, behind = np.int64(neighbours[row, h]), np.int64(neighbours[row, half + h])
+            if ahead >= 0 and kind[row] == FLAT:
+                joined = are_linked(row, ahead, state, rules)
+                num = set_link(row, ahead, h, joined, links, marks, marked, num)
+            if behind >= 0 and not is_chosen[behind] and kind[behind] == FLAT:
+                joined = are_linked(behind, row, state, rules)
+                num = set_link(behind, row, h, joined, links, marks, marked, num)
     return num
 
 
@@ -163,9 +163,9 @@ def spread(rows, neighbours, steps, marks, marked):
         high = num
         for i in range(low, high):
             for h in range(neighbours.shape[1]):
-                other = neighbours[marked[i], h]
-                if other >= 0:
-                    num = mark(other, marks, marked, num)
+                neighbour = neighbours[marked[i], h]
+                if neighbour >= 0:
+                    num = mark(neighbour, marks, marked, num)
         low = high
     for i in range(num):
         marks[marked[i]] = False
@@ -203,16 +203,16 @@ def find_hosts(chosen, neighbours, state, covariance, rules, host, level):
                 near = neighbours[row, h]
                 if near < 0 or level[near] != step - 1:
                     continue
-                other = host[near] if step > 1 else near
-                if kind[other] != FLAT:
+                candidate = host[near] if step > 1 else near
+                if kind[candidate] != FLAT:
                     continue
-                x, y, z = normal[other, 0], normal[other, 1], normal[other, 2]
-                dx = position[row, 0] - position[other, 0]
-                dy = position[row, 1] - position[other, 1]
-                dz = position[row, 2] - position[other, 2]
+                x, y, z = normal[candidate, 0], normal[candidate, 1], normal[candidate, 2]
+                dx = position[row, 0] - position[candidate, 0]
+                dy = position[row, 1] - position[candidate, 1]
+                dz = position[row, 2] - position[candidate, 2]
                 if not dx * dx + dy * dy + dz * dz < rules[2]:
                     continue
                 away = abs(x * dx + y * dy + z * dz)
                 if away < best and variance(c, x, y, z) < rules[1]:
                     best = away
-                    host[row], level[row] = other, step
+                    host[row], level[row] = candidate, step

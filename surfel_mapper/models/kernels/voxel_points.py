@@ -67,11 +67,11 @@ def find_core(starts, adjacent, share, least, core):
         for k in range(first[v], first[v + 1]):
             most[v] = max(most[v], starts[rows[k] + 1] - starts[rows[k]])
     for _ in range(WIDER_ROUNDS):
-        before = most.copy()
+        previous = most.copy()
         for v in range(len(core)):
-            if before[v] < least:  # few points anywhere near: is it an outlier or far away?
+            if previous[v] < least:  # few points anywhere near: is it an outlier or far away?
                 for k in range(first[v], first[v + 1]):
-                    most[v] = max(most[v], before[rows[k]])
+                    most[v] = max(most[v], previous[rows[k]])
     for v in range(len(core)):
         core[v] = most[v] < least or starts[v + 1] - starts[v] >= share * most[v]
 

@@ -110,13 +110,13 @@ def mark_rays(image, cosine, directions, pose, reach, side, marks, near):
             dy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z
             dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z
             cell, tx, ix, sx, nx = walk(pose[0, 3], dx, start, end, side * side)
-            place, ty, iy, sy, ny = walk(pose[1, 3], dy, start, end, side)
-            cell += place
-            place, tz, iz, sz, nz = walk(pose[2, 3], dz, start, end, 1)
-            cell += place
+            offset, ty, iy, sy, ny = walk(pose[1, 3], dy, start, end, side)
+            cell += offset
+            offset, tz, iz, sz, nz = walk(pose[2, 3], dz, start, end, 1)
+            cell += offset
             marks[cell >> 6] |= np.int64(1) << (cell & 63)
             for _ in range(nx + ny + nz):
-                left, leaves = cell, min(tx, ty, tz)
+                previous, leaves = cell, min(tx, ty, tz)
                 if tx <= ty and tx <= tz:
                     cell += sx
                     nx -= 1
@@ -131,7 +131,7 @@ def mark_rays(image, cosine, directions, pose, reach, side, marks, near):
                     tz = tz + iz if nz > 0 else np.inf
                 marks[cell >> 6] |= np.int64(1) << (cell & 63)
                 if leaves >= surface:
-                    near[left >> 6] |= np.int64(1) << (left & 63)
+                    near[previous >> 6] |= np.int64(1) << (previous & 63)
             if surface < np.inf:
                 near[cell >> 6] |= np.int64(1) << (cell & 63)
 
@@ -173,7 +173,7 @@ def list_marks(marks, side, low, index):
     low    (3,) int64, block at the lower corner of the cube
     index  (K, 3) int64, out: ascending
     """
-    place = 0
+    row = 0
     for number in range(len(marks)):
         word = marks[number]
         if word == 0:
@@ -182,10 +182,10 @@ def list_marks(marks, side, low, index):
         for bit in range(64):
             if word >> bit & 1:
                 cell = number * 64 + bit
-                index[place, 0] = low[0] + cell // (side * side)
-                index[place, 1] = low[1] + cell // side % side
-                index[place, 2] = low[2] + cell % side
-                place += 1
+                index[row, 0] = low[0] + cell // (side * side)
+                index[row, 1] = low[1] + cell // side % side
+                index[row, 2] = low[2] + cell % side
+                row += 1
 
 
 @njit(cache=True, nogil=True)

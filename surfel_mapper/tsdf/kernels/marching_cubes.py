@@ -37,15 +37,15 @@ def edge_between(first, second):
 
 def lines_of(face, inside):
     """Yield lines from edge to edge around every run of inside corners of a face."""
-    for place in range(4):
-        corner, before = face[place], face[place - 1]
-        if not inside[corner] or inside[before]:
+    for index in range(4):
+        corner, previous = face[index], face[index - 1]
+        if not inside[corner] or inside[previous]:
             continue
-        last = place
+        last = index
         while inside[face[(last + 1) % 4]]:
             last += 1
-        after = face[(last + 1) % 4]
-        yield edge_between(before, corner), edge_between(face[last % 4], after)
+        following = face[(last + 1) % 4]
+        yield edge_between(previous, corner), edge_between(face[last % 4], following)
 
 
 def triangles_of(case):
@@ -73,7 +73,7 @@ def num_on_faces(fan):
     """Return the number of diagonals of a fan that lie on a face of the cube."""
     apex, diagonals = fan[0][0], [triangle[1] for triangle in fan[1:]]
     return sum(
-        {apex, end} <= {edge_between(face[place], face[place - 1]) for place in range(4)}
+        {apex, end} <= {edge_between(face[index], face[index - 1]) for index in range(4)}
         for end in diagonals
         for face in FACES
     )
@@ -127,8 +127,8 @@ def describe(field, min_weight, bits):
     for row in range(len(field)):
         distance, weight = field[row, 0], field[row, 1]
         for n in range(distance.shape[0]):
-            known = np.uint8(KNOWN) if weight[n] >= least else np.uint8(0)
-            bits[row, n] = known | (np.uint8(INSIDE) if distance[n] < 0 else np.uint8(0))
+            observed = np.uint8(KNOWN) if weight[n] >= least else np.uint8(0)
+            bits[row, n] = observed | (np.uint8(INSIDE) if distance[n] < 0 else np.uint8(0))
 
 
 @njit(cache=True, nogil=True)
@@ -151,17 +151,17 @@ def find_cases(neighbours, side, field, bits, max_step_m, cases, counts):
         has_distance = max_step_m == np.inf
         for k in range(side):
             for j in range(side):
-                known = inside = np.uint8(0)
+                observed = inside = np.uint8(0)
                 for i in range(side + 1):
                     a, b = whole[k, j, i], whole[k, j + 1, i]
                     c, d = whole[k + 1, j, i], whole[k + 1, j + 1, i]
-                    before, behind = known, inside
-                    known = a & b & c & d & KNOWN
+                    previous, behind = observed, inside
+                    observed = a & b & c & d & KNOWN
                     inside = (a & 1) | (b & 1) << 2 | (c & 1) << 4 | (d & 1) << 6
                     if i == 0:
                         continue
                     case = behind | inside << 1
-                    if known & before == 0 or case == 255:
+                    if observed & previous == 0 or case == 255:
                         case = np.uint8(0)
                     if case > 0:
                         if not has_distance:
@@ -180,8 +180,8 @@ def is_torn(distance, i, j, k, case, max_step_m):
     """Return whether a step along an edge of a cube across the surface is too large."""
     for corner in range(8):
         for axis in range(3):
-            other = corner | 1 << axis
-            if other == corner or (case >> corner & 1) == (case >> other & 1):
+            neighbour = corner | 1 << axis
+            if neighbour == corner or (case >> corner & 1) == (case >> neighbour & 1):
                 continue
             x, y, z = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
             end = distance[z + (axis == 2), y + (axis == 1), x + (axis == 0)]
@@ -191,7 +191,7 @@ def is_torn(distance, i, j, k, case, max_step_m):
 
 
 @njit(cache=True, nogil=True)
-def march(neighbours, index, side, field, cases, starts, triangles, edges, places, num_vertices):
+def march(neighbours, index, side, field, cases, starts, triangles, edges, along, num_vertices):
     """
     Write the triangles of every block, and their vertices, each once a block.
 
@@ -202,7 +202,7 @@ def march(neighbours, index, side, field, cases, starts, triangles, edges, place
     starts        (K + 1,) int64, number of the first triangle of each block
     triangles     (T, 3) int32, out: vertices, counted from the first of the block
     edges         (V, 4) int32, out: voxel index at the start of the edge (3), and its axis
-    places        (V,) float64, out: position along the edge, in [0, 1]
+    along         (V,) float64, out: position along the edge, in [0, 1]
     num_vertices  (K,) int64, out: vertices of each block; those of all blocks lie one by one
     """
     distance = np.empty((side + 1, side + 1, side + 1), np.float32)
@@ -234,7 +234,7 @@ def march(neighbours, index, side, field, cases, starts, triangles, edges, place
                         d0 = np.float64(distance[z, y, x])
                         end = distance[z + (axis == 2), y + (axis == 1), x + (axis == 0)]
                         d1 = np.float64(end)
-                        places[vertex] = 0.5 if abs(d0 - d1) <= FLAT else d0 / (d0 - d1)
+                        along[vertex] = 0.5 if abs(d0 - d1) <= FLAT else d0 / (d0 - d1)
                         vertex += 1
                     triangles[out, corner] = numbers[z, y, x, axis]
                 out += 1

@@ -67,7 +67,7 @@ def sample(points, scale, bits, least, field, head, table, state, distance, grad
             continue
         i, j, k = np.floor(x), np.floor(y), np.floor(z)
         u, v, w = x - i, y - j, z - k
-        known = True
+        complete = True
         for n in range(8):
             di, dj, dk = n & 1, n >> 1 & 1, n >> 2
             row, voxel = find_voxel(
@@ -81,10 +81,10 @@ def sample(points, scale, bits, least, field, head, table, state, distance, grad
                 depth,
             )
             if row < 0 or not field[row, 1, voxel] >= least or field[row, 1, voxel] <= 0.0:
-                known = False
+                complete = False
                 break
             corner[n] = field[row, 0, voxel]
-        if not known:
+        if not complete:
             continue
         # Along x first, then y, then z; the gradient from the same four and two values.
         c00, c10 = corner[0] + u * (corner[1] - corner[0]), corner[2] + u * (corner[3] - corner[2])
@@ -99,19 +99,19 @@ def sample(points, scale, bits, least, field, head, table, state, distance, grad
 
 
 @njit(cache=True, nogil=True)
-def classify(points, bits, least, occupied, field, head, table, state, found):
+def classify(points, bits, least, occupied, field, head, table, state, states):
     """
     Classify the voxel of each point as unknown, free or occupied.
 
     points    (P, 3) float64, voxels
     occupied  float32 m, largest distance of an occupied voxel
-    found     (P,) uint8, out
+    states    (P,) uint8, out
     """
     recent = np.array([1 << 40, 0, 0, -1])
     depth = state[DEPTH]
     for p in range(len(points)):
         x, y, z = np.floor(points[p, 0]), np.floor(points[p, 1]), np.floor(points[p, 2])
-        found[p] = UNKNOWN
+        states[p] = UNKNOWN
         if not (abs(x) < 1e12 and abs(y) < 1e12 and abs(z) < 1e12):
             continue
         row, voxel = find_voxel(
@@ -119,4 +119,4 @@ def classify(points, bits, least, occupied, field, head, table, state, found):
         )
         if row < 0 or not field[row, 1, voxel] >= least or field[row, 1, voxel] <= 0.0:
             continue
-        found[p] = OCCUPIED if field[row, 0, voxel] <= occupied else FREE
+        states[p] = OCCUPIED if field[row, 0, voxel] <= occupied else FREE

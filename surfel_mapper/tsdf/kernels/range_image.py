@@ -140,21 +140,21 @@ def cosines(image, directions, pitch, reach_m, max_range, cosine):
                 continue
             inverse = 1.0 / range_m
             across, down = steps(farthest_column * inverse), steps(farthest_row * inverse)
-            left, right = column - across, column + across
+            left_column, right_column = column - across, column + across
             if around:
-                left = left + columns if left < 0 else left
-                right = right - columns if right >= columns else right
+                left_column = left_column + columns if left_column < 0 else left_column
+                right_column = right_column - columns if right_column >= columns else right_column
             gap_m = across * pitch[1] * range_m
-            first = known(image, row, left, columns, max_range)
-            second = known(image, row, right, columns, max_range)
+            first = valid_range(image, row, left_column, columns, max_range)
+            second = valid_range(image, row, right_column, columns, max_range)
             beside = slope(first, range_m, second, gap_m)
             gap_m = down * pitch[0] * range_m
-            first = known(image, row - down, column, columns, max_range)
-            second = known(image, row + down, column, columns, max_range)
+            first = valid_range(image, row - down, column, columns, max_range)
+            second = valid_range(image, row + down, column, columns, max_range)
             above = slope(first, range_m, second, gap_m)
             if beside == 0 or above == 0:
                 continue
-            column1, row1 = left if beside < 0 else right, row + above * down
+            column1, row1 = left_column if beside < 0 else right_column, row + above * down
             ux, uy, uz = unit(directions, row, column)
             ax, ay, az = unit(directions, row, column1)
             bx, by, bz = unit(directions, row1, column)
@@ -188,7 +188,7 @@ def unit(directions, row, column):
 
 
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def known(image, row, column, columns, max_range):
+def valid_range(image, row, column, columns, max_range):
     """Return the range of a pixel, 0 if unknown or outside of the image."""
     if row < 0 or column < 0 or row >= image.shape[0] or column >= columns:
         return 0.0
@@ -208,10 +208,10 @@ def slope(first, middle, second, gap_m):
     a slope; a steep slope must continue on the other side. Along a plane the inverse of the range
     is linear.
     """
-    before = abs(first - middle) if first > 0.0 else np.inf
-    after = abs(second - middle) if second > 0.0 else np.inf
-    side = -1 if before <= after else 1
-    if min(before, after) <= GENTLE * gap_m:
+    first_gap = abs(first - middle) if first > 0.0 else np.inf
+    second_gap = abs(second - middle) if second > 0.0 else np.inf
+    side = -1 if first_gap <= second_gap else 1
+    if min(first_gap, second_gap) <= GENTLE * gap_m:
         return side
     if first <= 0.0 or second <= 0.0:
         return 0
@@ -248,10 +248,10 @@ def find_thin(image, level, step_m, widest_m, max_range, thin):
             begin, last = first % columns, (column - 1) % columns
             width = (column - first) * level[row] * image[row, begin]
             if 0.0 < width <= widest_m and image[row, begin] <= max_range:
-                left, right = image[row, (begin - 1) % columns], image[row, column % columns]
+                left_m, right_m = image[row, (begin - 1) % columns], image[row, column % columns]
                 is_inside = around or (first > 0 and column < columns)
-                behind = (left <= 0.0 or left > image[row, begin]) and (
-                    right <= 0.0 or right > image[row, last]
+                behind = (left_m <= 0.0 or left_m > image[row, begin]) and (
+                    right_m <= 0.0 or right_m > image[row, last]
                 )
                 if is_inside and behind:
                     for inside in range(first, column):
@@ -262,6 +262,6 @@ def find_thin(image, level, step_m, widest_m, max_range, thin):
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def joined(image, row, column, columns, step_m, max_range):
     """Return whether a pixel and the one before it in its row are of one run."""
-    before, here = image[row, (column - 1) % columns], image[row, column % columns]
-    known = before > 0.0 and here > 0.0 and max(before, here) <= max_range
-    return known and abs(here - before) <= step_m
+    previous, current = image[row, (column - 1) % columns], image[row, column % columns]
+    valid = previous > 0.0 and current > 0.0 and max(previous, current) <= max_range
+    return valid and abs(current - previous) <= step_m

@@ -8,31 +8,16 @@ import numpy as np
 
 from surfel_mapper.alignment.kernels.registration import (
     cell_keys,
-    number_rows,
     PLANE,
     SIGMAS_SQ,
     sum_equations,
 )
 from surfel_mapper.geometry import se3_exp
 from surfel_mapper.kernels.layout import BITS
-from surfel_mapper.mapping.kernels.queries import keys_in_box
-from surfel_mapper.mapping.moments import pack_keys, unpack_keys
-from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.moments import pack_keys
 from test.kernels.modes import both
 
 POSE = se3_exp(np.array([3.0, -2.0, 1.0, 0.2, -0.3, 1.5]))[:3].copy()
-
-
-@both
-def test_cells_get_the_key_of_their_voxel(call):
-    rng = np.random.default_rng(1)
-    cells = rng.uniform(-30.0, 30.0, (200, 3))
-    keys = np.empty(200, np.int64)
-
-    call(cell_keys, cells, POSE, (1 << BITS) / 0.5, BITS, keys)
-
-    expected = np.floor((cells @ POSE[:, :3].T + POSE[:, 3]) / 0.5)
-    np.testing.assert_array_equal(unpack_keys(keys), expected)
 
 
 @both
@@ -43,20 +28,6 @@ def test_cells_outside_of_the_grid_or_invalid_have_no_voxel(call):
     call(cell_keys, cells, np.eye(4)[:3].copy(), (1 << BITS) / 0.5, BITS, keys)
 
     assert keys.tolist() == [pack_keys(np.zeros((1, 3), int))[0], -1, -1, -1]
-
-
-@both
-def test_rows_are_numbered_in_the_order_of_first_use(call):
-    found = np.array([7, -1, 3, 7, 5, 3], np.int32)
-    number = np.full(9, -1, np.int32)
-    number[5] = 0  # known before
-    known = np.full(7, -1, np.int32)
-
-    num_known = call(number_rows, found, number, known, 1)
-
-    assert num_known == 3
-    assert found.tolist() == [1, -1, 2, 1, 0, 2]
-    assert known[1:3].tolist() == [7, 3]
 
 
 def equations(cells, place, planes, width_sq):
@@ -122,21 +93,3 @@ def test_the_gradient_is_that_of_the_robust_cost(call):
         turn = se3_exp(np.concatenate([np.zeros(3), step[3:]]))[:3, :3]
         moved[:, :3], moved[:, 3] = turn @ POSE[:, :3], POSE[:, 3] + step[:3]
         assert math.isclose(gradient[axis], (cost(moved) - cost(POSE)) / delta, rel_tol=1e-3)
-
-
-@both
-def test_the_voxels_in_a_box_are_found(call):
-    rng = np.random.default_rng(3)
-    surfel_map = SurfelMap(1.0)
-    gone = surfel_map.add(rng.uniform(-8.0, 8.0, (100, 3)))
-    surfel_map.add(rng.uniform(-8.0, 8.0, (300, 3)))
-    used = surfel_map.num_voxels
-    surfel_map.remove(gone)
-    low, high = np.array([-3, -8, 0]), np.array([2, 8, 4])
-
-    rows = surfel_map._table.rows.array
-    found = call(keys_in_box, rows, used, low, high)
-
-    index = surfel_map.moments().voxel_index
-    inside = ((index >= low) & (index <= high)).all(axis=1)
-    assert sorted(found.tolist()) == pack_keys(index[inside]).tolist()

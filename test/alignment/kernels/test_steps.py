@@ -48,11 +48,3 @@ def test_a_step_solves_the_equations_in_the_determined_directions(seed):
     assert (values < 1e-9).sum() == (2 if seed % 2 else 0)
     np.testing.assert_allclose(hessian @ step, -gradient, atol=1e-9 * np.abs(gradient).max())
     np.testing.assert_allclose(vectors[values < 1e-9] @ (step * scale), 0.0, atol=1e-9)
-
-
-def test_equations_without_information_give_no_step():
-    step, values, vectors, radius = solved(np.zeros((6, 6)), np.ones(6))
-    assert not step.any()
-    assert not values.any()
-    assert np.array_equal(vectors, np.eye(6))
-    assert radius == 1.0

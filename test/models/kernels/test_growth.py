@@ -16,10 +16,7 @@ from surfel_mapper.models.cloud_noise import (
 )
 from surfel_mapper.models.growth import free_surfels
 from surfel_mapper.models.kernels.growth import (
-    assign_points,
     find_facets,
-    grow_patches,
-    SLOTS,
 )
 from surfel_mapper.models.kernels.voxel_points import (
     find_core,
@@ -134,39 +131,6 @@ def test_noise_grows_with_the_square_of_the_range():
     n0, n2 = estimate_noise(voxels, thinned.means, core, 0.06, np.zeros(3))
     for far in (2.0, 3.0, 4.0):
         assert n0 + n2 * far**2 == pytest.approx(1.5e-3 * far**2, rel=0.4)
-
-
-@both
-def test_points_of_a_corner_go_to_the_face_that_they_lie_on(call):
-    points, face = corner()
-    thinned, voxels = by_voxel(points)
-    face = face[voxels.rows]
-    # only the voxels in the middle of the faces are labelled
-    middle = (thinned.means > 0.25).sum(axis=1) == 2
-    label = np.where(middle, thinned.means.argmin(axis=1), -1).astype(np.int32)
-    planes = np.column_stack([np.eye(3), [-0.03, -0.04, -0.05]])
-    tangent = planes[label]
-    tolerance, number = np.full(3, 0.005), len(label)
-    candidate = np.full((number, SLOTS), -1, np.int32)
-    candidate_plane = np.empty((number, SLOTS, 4))
-    state = voxels.points, voxels.starts
-    free = np.zeros(number, bool), np.zeros((number, 3)), 0.8
-    call(
-        grow_patches,
-        *state,
-        voxels.adjacent,
-        label,
-        tangent,
-        tolerance,
-        free,
-        candidate,
-        candidate_plane,
-    )
-    owner = np.empty(len(face), np.int32)
-    call(assign_points, *state, label, tangent, tolerance, candidate, candidate_plane, owner)
-    away = np.abs(voxels.points @ planes[:, :3].T + planes[:, 3])
-    assert (away[np.arange(len(owner)), owner] <= away.min(axis=1) + 1e-12).all()
-    assert (owner == face).mean() > 0.99  # points on edges are on both faces
 
 
 @both

@@ -4,19 +4,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models.kernels.region_merging import touch
-from surfel_mapper.models.multi_model import Surface
 from surfel_mapper.models.patches import (
     bend_height,
     described,
-    fit_patches,
     PatchPoints,
     weighted_fit,
 )
@@ -76,18 +71,3 @@ def test_touch_equals_the_least_of_all_distances(call, seed):
     for near in (0.05, 0.2, 0.4, 0.8):
         found = call(touch, points, np.array([0, 40]), np.array([40, 80]), *boxes, near)
         assert found == (cdist(one, other).min() < near)
-
-
-def test_given_kinds_of_patches_are_kept():
-    flat = bowl(1.0) * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
-    groups = PatchPoints(
-        points=np.concatenate([flat, bowl(1.0)]),
-        starts=np.array([0, 4000, 8000]),
-        normals=np.tile([0.0, 0.0, 1.0], (2, 1)),
-        thickness=np.full(2, 0.04),
-    )
-    config, above = ModelsConfig(voxel_size_m=0.04), np.array([0.0, 0.0, 9.0])
-    for curved in ([True, False], [True, True], None):
-        given = replace(groups, curved=None if curved is None else np.array(curved))
-        kinds = [isinstance(patch, Surface) for patch in fit_patches(given, config, above)]
-        assert kinds == (curved or [False, True])
