@@ -5,7 +5,9 @@
 #     docker build --target robot -t surfel_mapper:robot .        ROS 2 Jazzy from apt, the node
 #     docker build --target desktop -t surfel_mapper:desktop .    bags and scans, no ROS
 # `--net=host --ipc=host` lets the node see the topics of the machine; a folder of bags and maps
-# is mounted at /data. `develop` is the image of .devcontainer.
+# is mounted at /data. Neither runs as root. Fast DDS cannot open the shared memory of another user,
+# and the user of the image owns its kernels: build with `--build-arg UID=$(id -u)` of the user that
+# runs the driver. `develop` is the image of .devcontainer.
 
 FROM ros:jazzy-ros-base AS robot
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
@@ -21,7 +23,11 @@ RUN apt-get update && apt-get install -y --no-install-recommends \
         'numba>=0.61' 'rosbags>=0.11.7,<0.12' 'mcap>=1.1'
 COPY . /ros2_ws/src/surfel_mapper
 WORKDIR /ros2_ws
-RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select surfel_mapper
+ARG UID=1000
+RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select surfel_mapper \
+    && useradd --uid "$UID" --non-unique --create-home mapper \
+    && install -d -o mapper /data /var/cache/surfel_mapper
+USER mapper
 ENV PATH=/opt/surfel_mapper_venv/bin:$PATH NUMBA_CACHE_DIR=/var/cache/surfel_mapper
 # Kernels are compiled for the processor that builds the image; another kind compiles its own.
 RUN source /opt/ros/jazzy/setup.bash && source install/setup.bash \
@@ -40,7 +46,12 @@ RUN apt-get update && apt-get install -y --no-install-recommends chromium git ma
 FROM python:3.12-slim AS desktop
 COPY . /src
 ENV NUMBA_CACHE_DIR=/var/cache/surfel_mapper
-RUN pip install --no-cache-dir '/src[cluster,formats,las]' && rm -rf /src && surfel-mapper compile
+ARG UID=1000
+RUN pip install --no-cache-dir '/src[cluster,formats,las]' && rm -rf /src \
+    && useradd --uid "$UID" --non-unique --create-home mapper \
+    && install -d -o mapper /data /var/cache/surfel_mapper
+USER mapper
+RUN surfel-mapper compile
 WORKDIR /data
 ENTRYPOINT ["surfel-mapper"]
 CMD ["--help"]

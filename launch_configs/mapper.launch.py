@@ -86,9 +86,10 @@ ARGUMENTS = [
     ),
     DeclareLaunchArgument(
         'use_sim_time',
-        default_value='false',
-        choices=BOOLEAN,
-        description='Take the time from /clock, as for a bag played with --clock.',
+        default_value='',
+        choices=['', *BOOLEAN],
+        description='Take the time from /clock, as for a bag played with --clock; empty: as set '
+        'by an including launch file (SetParameter) or the file.',
     ),
     DeclareLaunchArgument(
         'rviz', default_value='false', choices=BOOLEAN, description='Start RViz with its view.'
@@ -122,9 +123,9 @@ def settings_file(values: dict[str, str]) -> str:
     return str(path)
 
 
-def overrides(values: dict[str, str]) -> dict[str, object]:
-    """Return the parameters that the launch arguments set."""
-    found: dict[str, object] = {'use_sim_time': values['use_sim_time'] == 'true'}
+def overrides(values: dict[str, str]) -> list[dict[str, object]]:
+    """Return the parameters that the launch arguments set; none if they set no parameter."""
+    found: dict[str, object] = simulated_time(values)
     if values['autostart'] == 'false':
         found['autostart'] = False
     for argument, (name, kind) in SETTINGS.items():
@@ -133,7 +134,13 @@ def overrides(values: dict[str, str]) -> dict[str, object]:
                 found[name] = kind(values[argument])
         except ValueError:
             raise ValueError(f'{argument}:={values[argument]}: expected a number') from None
-    return found
+    return [found] if found else []
+
+
+def simulated_time(values: dict[str, str]) -> dict[str, object]:
+    """Return the parameter use_sim_time if the argument is given."""
+    value = values['use_sim_time']
+    return {'use_sim_time': value == 'true'} if value else {}
 
 
 def view(values: dict[str, str]) -> str:
@@ -167,7 +174,7 @@ def nodes(context: LaunchContext) -> list[Node]:
             name='surfel_mapper',
             namespace=values['namespace'],
             output='screen',
-            parameters=[settings_file(values), overrides(values)],
+            parameters=[settings_file(values), *overrides(values)],
             remappings=[(topic, values[argument]) for argument, topic in TOPICS.items()],
             ros_arguments=['--log-level', f'{logger(values)}:={values["log_level"]}'],
             respawn=values['respawn'] == 'true',
@@ -185,7 +192,7 @@ def nodes(context: LaunchContext) -> list[Node]:
                 namespace=values['namespace'],
                 output='log',
                 arguments=['-d', view(values), *fixed],
-                parameters=[{'use_sim_time': values['use_sim_time'] == 'true'}],
+                parameters=[simulated_time(values)] if values['use_sim_time'] else [],
             )
         )
     return found

@@ -58,7 +58,7 @@ def test_a_tensor_on_a_graphics_card_is_refused_with_its_reason():
 
 
 def test_masked_points_are_left_out():
-    """NumPy makes an array of the values under the mask."""
+    """The values under the mask would be points otherwise."""
     masked = np.ma.masked_array(POINTS, np.zeros(POINTS.shape, bool))
     masked[7:50, 1] = np.ma.masked
     kept, found = SurfelMap(0.5), SurfelMap(0.5)

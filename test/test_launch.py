@@ -75,7 +75,7 @@ def values(launch, **changes):
 def test_the_default_is_the_node_with_the_default_settings(launch):
     (node,) = launch.nodes(values(launch))
     assert (node.package, node.executable, node.namespace) == ('surfel_mapper', 'node', '')
-    assert node.parameters == [str(FOLDER / 'default.yaml'), {'use_sim_time': False}]
+    assert node.parameters == [str(FOLDER / 'default.yaml')]
     assert ('points', 'points') in node.remappings
 
 
@@ -112,7 +112,6 @@ def test_arguments_override_existing_settings_with_their_type(launch):
     given = {'pose_source': 'odometry', 'input_kind': 'depth', 'voxel_size': '0.2'}
     (node,) = launch.nodes(values(launch, **given, fixed_frame='map', autostart='false'))
     assert node.parameters[1] == {
-        'use_sim_time': False,
         'autostart': False,
         'pose.source': 'odometry',
         'input.kind': 'depth',
@@ -121,8 +120,15 @@ def test_arguments_override_existing_settings_with_their_type(launch):
     }
     known = {declared.name: declared for declared in declarations()}
     for name, value in node.parameters[1].items():
-        assert name == 'use_sim_time' or type(value) is type(known[name].default)
+        assert type(value) is type(known[name].default)
     assert set(launch.SOURCES) == set(known['pose.source'].choices)
+
+
+@pytest.mark.parametrize('value', ['', 'true', 'false'])
+def test_simulated_time_is_set_only_if_asked(launch, value):
+    for node in launch.nodes(values(launch, use_sim_time=value, rviz='true')):
+        given = [item for item in node.parameters if isinstance(item, dict)]
+        assert given == ([{'use_sim_time': value == 'true'}] if value else [])
 
 
 def test_the_view_of_a_namespace_shows_its_topics(launch):

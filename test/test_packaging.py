@@ -71,6 +71,23 @@ def test_workflows_run_targets_of_the_makefile():
     assert named <= targets
 
 
+def test_workflows_name_actions_by_digest_and_state_their_permissions():
+    for path in (ROOT / '.github/workflows').glob('*.yml'):
+        text = path.read_text(encoding='utf-8')
+        used = re.findall(r'uses: (.*)', text)
+        assert used
+        assert all(re.fullmatch(r'[\w/-]+@[0-9a-f]{40}  # v[0-9.]+', action) for action in used)
+        assert yaml.safe_load(text)['permissions'] == {'contents': 'read'}
+
+
+def test_no_image_to_run_ends_as_root():
+    targets = re.split(r'^FROM .* AS ', (ROOT / 'Dockerfile').read_text(), flags=re.MULTILINE)[1:]
+    for target in targets:
+        if not target.startswith('develop'):
+            assert 'USER mapper' in target
+            assert target.index('USER mapper') < target.index('compile\n')
+
+
 def test_the_changelog_begins_with_what_is_to_come_or_with_this_version():
     changelog = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8')
     headings = re.findall(r'^(.+)\n-{3,}$', changelog, flags=re.MULTILINE)

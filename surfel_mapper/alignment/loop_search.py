@@ -26,8 +26,8 @@ import numpy.typing as npt
 from surfel_mapper.alignment.correspondences import loop_candidates, path_lengths
 from surfel_mapper.alignment.loops import Loop, LoopSolution, solve_loops
 from surfel_mapper.alignment.recognition import Candidate, Recognition
-from surfel_mapper.alignment.registration import means, Registration, RegistrationResult
-from surfel_mapper.alignment.surfel_planes import PlaneLevels
+from surfel_mapper.alignment.registration import Registration, RegistrationResult
+from surfel_mapper.alignment.surfel_planes import means, PlaneLevels
 from surfel_mapper.alignment.window import carried
 from surfel_mapper.config import LoopsConfig, RegistrationConfig
 from surfel_mapper.errors import DependencyError

@@ -19,18 +19,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.kernels.steps import solve_step
-from surfel_mapper.alignment.moving_along import moving_along, staying
-from surfel_mapper.alignment.surfel_planes import PlaneLevels, SurfelPlanes
+from surfel_mapper.alignment.scan_view import ScanView
+from surfel_mapper.alignment.surfel_planes import means, PlaneLevels, SurfelPlanes
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
-from surfel_mapper.kernels.layout import BITS, HALF
-from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.reducer import Reducer
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
@@ -53,31 +50,29 @@ LEAST_RATIO = 1e-12
 SEARCH_STEP_DEG = 7.5
 """Step of the heading search, deg."""
 
+ROUGH_CELLS, ROUGH_STEPS, ROUGH_PLACES = 1000, 8, 12
+"""Cells and Gauss-Newton steps with which the search compares all headings, and the number of best
+places from which it goes on: a third of the time of converging from every heading."""
+
 SEARCH_CELLS = 3000
-"""Maximum number of cells that the heading search, and the search for what moves along, use."""
+"""Number of cells with which it goes on from these."""
 
 SEARCH_STARTS = 4
 """Number of best places of the search from which the whole scan is aligned."""
 
-AMBIGUOUS = 0.85
+MAX_SEEN_THROUGH = 0.1
+"""Share of surfaces seen through from which on a pose far from the prediction has to be searched
+for: at most 0.05 at right poses of a dense lidar, 0.14 and more at wrong ones."""
+
+SEEN_THROUGH_POWER = 6
+"""A place counts by its support times (1 - seen through) to this power: a surface in free space
+outweighs several cells that fit."""
+
+AMBIGUOUS = 0.9
 """Places with this share of the best support fit equally well; the nearest is taken."""
 
 FARTHER = 1.5
 """A place that needs this times the motion of the nearest is no rival of it."""
-
-ALONG = 0.5
-"""Cosine from which on a degenerate direction leaves the position along a motion undetermined."""
-
-CLEARER = 2.5
-"""Ratio of the shares of cells that do not fit from which on a stop explains a scan better than
-company: 2.8 to 5 between two scans of a street, at most 2.3 among nine trucks."""
-
-CLEARER_IF_ALL_STAYS = 1.6
-"""The same if ALL cells that could tell the motion stay: 1.7 to 2.3 after a stop."""
-
-ALL = 0.85
-"""Share of such cells: .89 to 1 after a stop, up to .77 among nine trucks and .87 if they are seen
-by a quarter of the points."""
 
 SAME_PLACE_DEG = 10.0
 """Poses of the search that differ by less, and by less than a voxel, are one place."""
@@ -114,12 +109,9 @@ class RegistrationResult:
         0 if there is none, or if the first start fitted and no search was needed.
     is_found : bool
         The place was found by a search and differs from that of the first start.
-    moving_along : float
-        Share of the cells that move along with the sensor and were left out; of the others there
-        are ``num_cells``.
-    has_stopped : bool
-        The standing cells do not tell the motion, and the whole scan fits clearly better at one
-        that ends harder than by braking: a collision, or a repeated cloud.
+    seen_through : float
+        Share of the surfaces of the map in view that the scan sees through, in [0, 1]; nan if the
+        pose is near the first start and no search was needed.
 
     """
 
@@ -134,13 +126,17 @@ class RegistrationResult:
     radius_m: float
     rival: float = 0.0
     is_found: bool = False
-    moving_along: float = 0.0
-    has_stopped: bool = False
+    seen_through: float = math.nan
 
     @property
     def support(self) -> float:
-        """Share of all cells that fit, the score of a pose."""
+        """Share of all cells that fit."""
         return self.overlap * self.fit
+
+    @property
+    def score(self) -> float:
+        """Support, reduced if the scan sees through the map."""
+        return self.support * (1.0 - self.seen_through) ** SEEN_THROUGH_POWER
 
 
 class Registration:
@@ -185,7 +181,6 @@ class Registration:
         deviation_m: float,
         expected_support: float = 0.0,
         is_lost: bool = False,
-        before: npt.NDArray[np.float64] | None = None,
     ) -> RegistrationResult:
         """
         Return the pose of a scan on a map.
@@ -207,69 +202,43 @@ class Registration:
         is_lost : bool
             The starts are guesses: they are all tried, and of places that fit about equally well
             each is a rival of the best, however far it is.
-        before : (B, 3) float64, m, optional
-            Cells of the scan at the second start, if the motion from there to the first start is
-            large and certain. If it tells that many cells move along, the others decide; if these
-            do not tell the motion, and the whole scan fits clearly better at another, that does.
 
         """
         levels = PlaneLevels(self.config, surfel_map, cells, starts)
-        if before is not None:
-            standing = self._standing(cells, before, levels, starts, deviation_m)
-            if standing is not None and not determines(standing, starts):
-                way_m = math.dist(starts[0][:3, 3], starts[1][:3, 3])  # it may end anywhere on it
-                whole = self.align(cells, surfel_map, starts[::-1], way_m, expected_support)
-                stays = staying(*self._compared(cells, before, levels, starts))
-                clearer = CLEARER_IF_ALL_STAYS if stays >= ALL else CLEARER
-                if determines(whole, starts) and clearer * (1.0 - whole.fit) < 1.0 - standing.fit:
-                    return replace(whole, has_stopped=True)
-            if standing is not None:
-                return standing
         found = self._descend(cells, levels, starts[0], deviation_m)
         is_usual = found.converged and found.support >= expected_support and self.fits(found)
-        if is_lost or not is_usual:
-            width_m = levels.voxel_size_m(self.config.coarse_levels)
-            others = [
-                self._descend(cells, levels, start, width_m)
-                for start in self._places(cells, levels, starts)
-            ]
-            first = found.T_map_sensor
-            found = self._chosen([found, *others], starts, is_lost)
-            is_found = not is_near(found.T_map_sensor, first, self._voxel_size_m)
-            found = replace(found, is_found=is_found)
-        return found
+        is_predicted = deviation_m <= self._voxel_size_m and not is_lost
+        if is_usual and is_predicted and self._is_near(found, starts[0]):
+            return found
+        view = ScanView(cells)
+        found = self._viewed(found, view, levels)
+        if is_usual and not is_lost and found.seen_through <= MAX_SEEN_THROUGH:
+            return found
+        width_m = levels.voxel_size_m(self.config.coarse_levels)
+        others = [
+            self._viewed(self._descend(cells, levels, start, width_m), view, levels)
+            for start in self._places(cells, levels, starts)
+        ]
+        chosen = self._chosen([found, *others], starts, is_lost)
+        return replace(chosen, is_found=not self._is_near(chosen, found.T_map_sensor))
 
-    def _standing(
-        self,
-        cells: npt.NDArray[np.float64],
-        before: npt.NDArray[np.float64],
-        levels: PlaneLevels,
-        starts: Sequence[Transform],
-        deviation_m: float,
-    ) -> RegistrationResult | None:
-        """Align what stands still; None if little moves along, or the rest does not fit."""
-        some = self._compared(thinned(cells, SEARCH_CELLS), before, levels, starts)
-        if not moving_along(*some).any():
-            return None
-        moving = moving_along(*self._compared(cells, before, levels, starts))
-        if moving.all():  # nothing stands
-            return None
-        found = self._descend(np.ascontiguousarray(cells[~moving]), levels, starts[0], deviation_m)
-        if not (found.converged and self.fits(found)):
-            return None
-        return replace(found, moving_along=float(moving.mean()))
+    def seen_through(
+        self, cells: npt.NDArray[np.float64], surfel_map: SurfelMap, T_map_sensor: Transform
+    ) -> float:
+        """Return the share of the surfaces of a map that a scan at a pose sees through."""
+        surfaces = PlaneLevels(self.config, surfel_map, cells, [T_map_sensor]).surfaces
+        return ScanView(cells).seen_through(surfaces, T_map_sensor, self._voxel_size_m)
 
-    def _compared(
-        self,
-        cells: npt.NDArray[np.float64],
-        before: npt.NDArray[np.float64],
-        levels: PlaneLevels,
-        starts: Sequence[Transform],
-    ) -> tuple[Any, ...]:
-        """Return the arguments of ``moving_along`` for some cells."""
-        motion_m = compose(inverse(starts[1]), starts[0])[:3, 3]
-        normals = levels.planes(0).normals(cells, starts[0]) @ starts[0][:3, :3]
-        return cells, before, motion_m, normals, self.cell_m
+    def _is_near(self, found: RegistrationResult, pose: Transform) -> bool:
+        """Return whether a result is at the same place as a pose, within a voxel."""
+        return is_near(found.T_map_sensor, pose, self._voxel_size_m)
+
+    def _viewed(
+        self, found: RegistrationResult, view: ScanView, levels: PlaneLevels
+    ) -> RegistrationResult:
+        """Return a result with the share of the map that its scan sees through."""
+        share = view.seen_through(levels.surfaces, found.T_map_sensor, self._voxel_size_m)
+        return replace(found, seen_through=share)
 
     def _chosen(
         self, places: Sequence[RegistrationResult], starts: Sequence[Transform], is_lost: bool
@@ -279,22 +248,21 @@ class Registration:
 
         If the scan is lost, the best one.
         """
-        best = max(places, key=lambda place: (place.converged, place.support))
-        if not (best.converged and best.support > 0.0):
+        best = max(places, key=lambda place: (place.converged, place.score))
+        if not (best.converged and best.score > 0.0):
             return best
 
         def motion_m(place: RegistrationResult) -> float:
             off = [compose(inverse(start), place.T_map_sensor) for start in starts]
             return min(math.hypot(*T[:3, 3], best.radius_m * rotation_angle(T)) for T in off)
 
-        equal = [p for p in places if p.converged and p.support >= AMBIGUOUS * best.support]
+        equal = [p for p in places if p.converged and p.score >= AMBIGUOUS * best.score]
         nearest = best if is_lost else min(equal, key=motion_m)
         reach_m = math.inf if is_lost else FARTHER * motion_m(nearest)
         rivals = [
             place.support
             for place in equal
-            if motion_m(place) < reach_m
-            and not is_near(place.T_map_sensor, nearest.T_map_sensor, self._voxel_size_m)
+            if motion_m(place) < reach_m and not self._is_near(place, nearest.T_map_sensor)
         ]
         return replace(nearest, rival=max(rivals, default=0.0))
 
@@ -322,7 +290,8 @@ class Registration:
             width_m = min(deviation_m, 0.5 * size_m)
             tolerance_m = COARSE_TOLERANCE * size_m if level else TOLERANCE_M
             some = thinned(cells, COARSE_CELLS) if level else cells
-            finer = self._converge(some, levels.planes(level), pose, width_m, tolerance_m)
+            most = self.config.max_iterations
+            finer = self._converge(some, levels.planes(level), pose, width_m, tolerance_m, most)
             iterations += finer.iterations
             # the first scans of few beams may only fill the larger voxels
             if found is None or finer.overlap >= self.config.min_overlap_ratio:
@@ -337,6 +306,7 @@ class Registration:
         start: Transform,
         width_m: float,
         tolerance_m: float,
+        max_iterations: int,
     ) -> RegistrationResult:
         """Iterate Gauss-Newton steps until they are below the tolerance."""
         pose, iteration, moved_m = start, 0, math.inf
@@ -346,7 +316,7 @@ class Registration:
             if placed_m > SAME_VOXELS * planes.voxel_size_m:
                 place, placed_m = planes.place(cells, pose), 0.0
             hessian, gradient, overlap, fit = planes.equations(cells, pose, width_m, place)
-            if moved_m < tolerance_m or iteration == self.config.max_iterations:
+            if moved_m < tolerance_m or iteration == max_iterations:
                 break
             step, degenerate, radius_m = solve(hessian, gradient, least)
             pose = moved(pose, step)
@@ -371,33 +341,36 @@ class Registration:
         """
         Return the best places that a coarse alignment of some cells finds.
 
-        Every start is turned in steps, aligned to the largest voxels, and kept unless it arrives
-        at a place that is already known. Comparing headings without aligning them would compare
-        errors of position: a hall of two symmetries then takes the wrong corner.
+        Every start is turned in steps and aligned to the largest voxels. Comparing headings
+        without aligning them would compare errors of position: a hall of two symmetries then
+        takes the wrong corner.
         """
-        num = int(self.config.search_deg / SEARCH_STEP_DEG)
-        level = self.config.coarse_levels
-        some = thinned(cells, SEARCH_CELLS)
-        size_m = levels.voxel_size_m(level)
-        found = [
-            self._converge(some, levels.planes(level), start, size_m, COARSE_TOLERANCE * size_m)
-            for start in turned(starts, num)
-        ]
+        planes = levels.planes(self.config.coarse_levels)
+        size_m = planes.voxel_size_m
+        poses = turned(starts, int(self.config.search_deg / SEARCH_STEP_DEG))
+        stages = (
+            (ROUGH_CELLS, ROUGH_STEPS, ROUGH_PLACES),
+            (SEARCH_CELLS, self.config.max_iterations, SEARCH_STARTS),
+        )
+        for num_cells, num_steps, num_places in stages:
+            some = thinned(cells, num_cells)
+            found = [
+                self._converge(some, planes, pose, size_m, COARSE_TOLERANCE * size_m, num_steps)
+                for pose in poses
+            ]
+            poses = self._best_places(found, num_places)
+        return poses
+
+    def _best_places(self, found: list[RegistrationResult], num: int) -> list[Transform]:
+        """Return the poses of the best supported results at different places."""
         places: list[Transform] = []
-        for each in sorted(found, key=lambda other: other.support, reverse=True):
-            pose = each.T_map_sensor
+        for result in sorted(found, key=lambda result: result.support, reverse=True):
+            pose = result.T_map_sensor
             if not any(is_near(pose, place, self._voxel_size_m) for place in places):
                 places.append(pose)
-            if len(places) == SEARCH_STARTS:
+            if len(places) == num:
                 break
         return places
-
-
-def determines(found: RegistrationResult, starts: Sequence[Transform]) -> bool:
-    """Return whether a scan tells its position along the way between the first two starts."""
-    way_m = starts[0][:3, 3] - starts[1][:3, 3]
-    along = found.degenerate[:, :3] @ (way_m / np.linalg.norm(way_m))
-    return bool((np.abs(along) < ALONG).all())
 
 
 def thinned(cells: npt.NDArray[np.float64], num: int) -> npt.NDArray[np.float64]:
@@ -420,13 +393,6 @@ def is_near(T_a: Transform, T_b: Transform, distance_m: float) -> bool:
     off = compose(inverse(T_a), T_b)
     is_close = math.dist(T_a[:3, 3], T_b[:3, 3]) < distance_m
     return is_close and rotation_angle(off) < math.radians(SAME_PLACE_DEG)
-
-
-def means(moments: ScanMoments) -> npt.NDArray[np.float64]:
-    """Return the mean of the points of every voxel, (K, 3) float64, m."""
-    inside = moments.total / moments.count[:, None] + (HALF + 0.5)
-    places = (moments.voxel_index + inside / (1 << BITS)) * moments.voxel_size_m
-    return np.ascontiguousarray(places, np.float64)
 
 
 def solve(

@@ -23,6 +23,7 @@ Source: Kanatani 1996 (Statistical Optimization for Geometric Computation) for t
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cached_property
 import math
 
 import numpy as np
@@ -31,19 +32,16 @@ import numpy.typing as npt
 from surfel_mapper.alignment.kernels.planes import continuation_keys, fill_planes
 from surfel_mapper.alignment.kernels.registration import (
     cell_keys,
-    NORMAL,
     number_rows,
     PLANE,
     sum_equations,
-    VARIANCE,
 )
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import Transform
-from surfel_mapper.kernels.layout import BITS
+from surfel_mapper.kernels.layout import BITS, HALF
+from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
-
-NORMALS = slice(NORMAL, NORMAL + 3)
 
 NOISE_IN_PLANE = 3.0
 """Upper bound of the variance across a ring of a lidar, along the beam, in variances of a
@@ -54,6 +52,9 @@ MAX_TILT_SQ = 0.1
 
 SIGMAS = 3.0
 """Distance in standard deviations within which a face may cut a surface."""
+
+MAX_SURFACES = 5000
+"""At most this many surfaces are compared with the view of a scan, an even selection of them."""
 
 ALIKE = 0.9
 """Minimum cosine between the normals of two surfels to be merged."""
@@ -146,16 +147,6 @@ class SurfelPlanes:
             self._planes = np.concatenate([self._planes, self._as_planes(new)])
         return found
 
-    def normals(
-        self, cells: npt.NDArray[np.float64], T_map_sensor: Transform
-    ) -> npt.NDArray[np.float64]:
-        """Return the unit normal (K, 3), in the map, of the plane that each cell hits, or NaN."""
-        place = self.place(cells, T_map_sensor)
-        is_usable = np.isfinite(self._planes[:, VARIANCE, None])
-        known = np.where(is_usable, self._planes[:, NORMALS], np.nan)
-        found: npt.NDArray[np.float64] = np.concatenate([known, np.full((1, 3), np.nan)])[place]
-        return found
-
     def _as_planes(self, surfels: Surfels) -> npt.NDArray[np.float64]:
         """
         Return surfels as rows of planes; unusable surfels get an infinite variance.
@@ -237,6 +228,13 @@ class PlaneLevels:
             )
         return self._planes[level]
 
+    @cached_property
+    def surfaces(self) -> npt.NDArray[np.float64]:
+        """Mean positions of voxels within reach of the scan, (S, 3) m, about MAX_SURFACES."""
+        keys = self._map.keys_within(*self._box())
+        step = -(-len(keys) // MAX_SURFACES) or 1
+        return means(self._map.moments(unpack_keys(keys[::step])))
+
     def _level(self, level: int) -> SurfelMap:
         """Return the map of a level, made of the level below it, which is needed next."""
         if level not in self._maps:
@@ -252,3 +250,10 @@ class PlaneLevels:
         low = np.floor((at.min(axis=0) - reach_m) / self._map.voxel_size_m)
         high = np.floor((at.max(axis=0) + reach_m) / self._map.voxel_size_m)
         return low.astype(np.int64), high.astype(np.int64)
+
+
+def means(moments: ScanMoments) -> npt.NDArray[np.float64]:
+    """Return the mean of the points of every voxel, (K, 3) float64, m."""
+    inside = moments.total / moments.count[:, None] + (HALF + 0.5)
+    places = (moments.voxel_index + inside / (1 << BITS)) * moments.voxel_size_m
+    return np.ascontiguousarray(places, np.float64)

@@ -20,11 +20,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.registration import (
-    determines,
-    Registration,
-    RegistrationResult,
-)
+from surfel_mapper.alignment.registration import Registration, RegistrationResult
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.geometry import (
     compose,
@@ -48,16 +44,12 @@ POOR_SUPPORT = 0.6
 CLEAR_FIT = 0.8
 """A scan of small overlap that fits so well sees a new place: .97 there, .78 at wrong places."""
 
+MORE_SEEN_THROUGH = 0.08
+"""A scan contradicts the map if it sees through more of it than the scan before, by this share."""
+
 FIRST_SUPPORT = 0.35
 """Minimum support before there are recent scans: real scans of a hall that a hand turned by 90 deg
 fit the scan before to 0.5."""
-
-MAX_DECELERATION = 10.0
-"""Deceleration of a vehicle that brakes as hard as it can, m/s^2."""
-
-LONGEST_UNTOLD_S = 5.0
-"""Time for which the velocity alone may tell the motion while much of a scan moves along, s:
-the stretches among nine trucks are shorter, and errors reach 1 m in them."""
 
 FLOOR_NOISES = 3.0
 """Minimum expected deviation, in standard deviations of a range."""
@@ -107,17 +99,20 @@ class Tracker:
         self._stamp_ns, self.twist = stamp_ns, twist
 
     def resume(
-        self, T_fixed_body: Transform, stamp_ns: int, twist: npt.NDArray[np.float64]
+        self,
+        T_fixed_body: Transform,
+        stamp_ns: int,
+        twist: npt.NDArray[np.float64],
+        cells: npt.NDArray[np.float64],
     ) -> None:
-        """Continue from a pose at a stamp with a velocity (6,), m/s and rad/s."""
-        self.pose = T_fixed_body
+        """Continue from the pose of a scan with its cells and a velocity (6,), m/s and rad/s."""
+        self.pose, self._cells = T_fixed_body, cells
         self._clear_history()
         self.begin(stamp_ns, twist)
 
     def _clear_history(self) -> None:
         self._deviations: deque[float] = deque(maxlen=REMEMBERED)
         self._supports: deque[float] = deque(maxlen=REMEMBERED)
-        self._told_ns: int | None = None
 
     @property
     def is_new(self) -> bool:
@@ -164,54 +159,33 @@ class Tracker:
         Raises
         ------
         AlignmentError
-            If the scan does not fit the map, fits it at two places about equally well, needs a
-            motion faster than ``max_speed_m_s``, fits too poorly to be accepted at
-            once (see ``doubtful``), or if much of it moves along and for LONGEST_UNTOLD_S
-            nothing else has told the motion. The predicted velocity is halved then.
+            If the scan does not fit the map, fits it at two places about equally well, or fits
+            too poorly to be accepted at once (see ``doubtful``). The predicted velocity is halved
+            then.
 
         """
         starts = [compose(T_map_fixed, self.predict(stamp_ns))]
         if self._stamp_ns is not None:
             starts.append(compose(T_map_fixed, self.pose))
         expected = self.expected_support
-        before = self._cells if self._surely_moves(stamp_ns) else None
-        self._cells = cells
-        found = self._registration.align(
-            cells, surfel_map, starts, self.deviation_m, expected, before=before
-        )
+        found = self._registration.align(cells, surfel_map, starts, self.deviation_m, expected)
         is_usual = bool(self._supports) and found.support >= expected > 0.0
         is_steady = found.converged or is_usual
         is_ambiguous = found.rival > 0.0
         self.num_ambiguous += is_ambiguous and is_steady
         pose = compose(inverse(T_map_fixed), found.T_map_sensor)
-        refusal = self._refusal(found, is_steady, self.speed_m_s(pose, stamp_ns))
-        refusal = refusal or self._untold(found, starts, stamp_ns)
+        refusal = self._refusal(found, is_steady)
         self.doubtful = None
-        is_poor = bool(self._supports) and found.support < POOR_SUPPORT * expected
-        is_poor = is_poor and found.fit < CLEAR_FIT  # a new place has a small overlap, but fits
-        if not refusal and (is_poor or (found.is_found and found.support < expected)):
-            self.doubtful = found.T_map_sensor
-            refusal = (
-                f'{self._shares(found)}, usually {expected / EXPECTED_SUPPORT:.0%} in all: '
-                'the next scans have to agree'
-            )
+        if not refusal:
+            refusal = self._doubt(found, surfel_map, T_map_fixed)
         if refusal:
             self._deviations.clear()
             self.twist = 0.5 * self.twist  # after several failures the prediction is at rest
             raise AlignmentError(refusal)
         self._supports.append(found.support)
+        self._cells = cells
         self.advance(pose, stamp_ns, math.sqrt(float((cells**2).sum()) / max(len(cells), 1)))
-        if found.has_stopped:
-            self.twist = np.zeros(6)
         return found
-
-    def _surely_moves(self, stamp_ns: int) -> bool:
-        """Return whether the body moves on by a cell at least: it cannot have stopped."""
-        if self._stamp_ns is None:
-            return False
-        since_s = (stamp_ns - self._stamp_ns) / 1e9
-        least_m = max(self._registration.cell_m, MAX_DECELERATION * since_s**2)
-        return float(np.linalg.norm(self.twist[:3])) * since_s >= least_m
 
     @property
     def expected_support(self) -> float:
@@ -220,12 +194,13 @@ class Tracker:
             return FIRST_SUPPORT
         return EXPECTED_SUPPORT * sorted(self._supports)[len(self._supports) // 2]
 
-    def speed_m_s(self, T_fixed_body: Transform, stamp_ns: int) -> float:
-        """Return the speed that a pose requires since the last scan; 0 without one."""
-        if self._stamp_ns is None or stamp_ns <= self._stamp_ns:
-            return 0.0
-        distance_m = math.dist(T_fixed_body[:3, 3], self.pose[:3, 3])
-        return distance_m / ((stamp_ns - self._stamp_ns) / 1e9)
+    def max_seen_through(self, surfel_map: SurfelMap, T_map_fixed: Transform) -> float:
+        """Return the share of the map that the last scan sees through, and MORE_SEEN_THROUGH."""
+        if self._cells is None:
+            return MORE_SEEN_THROUGH
+        T_map_body = compose(T_map_fixed, self.pose)
+        share = self._registration.seen_through(self._cells, surfel_map, T_map_body)
+        return share + MORE_SEEN_THROUGH
 
     def _shares(self, found: RegistrationResult) -> str:
         """Return the quality of the fit of a scan, in words."""
@@ -234,7 +209,7 @@ class Tracker:
             f'{found.fit:.0%} of these fit it'
         )
 
-    def _refusal(self, found: RegistrationResult, is_steady: bool, speed_m_s: float) -> str:
+    def _refusal(self, found: RegistrationResult, is_steady: bool) -> str:
         """Return the reason why a scan is rejected; empty if it is not."""
         config = self._registration.config
         said = self._shares(found)
@@ -249,25 +224,26 @@ class Tracker:
             )
         if not is_steady:
             return f'{said}, but its pose has not settled'
-        if speed_m_s > config.max_speed_m_s:
-            return (
-                f'{said}, but {speed_m_s:.0f} m/s lead there, expected at most '
-                f'{config.max_speed_m_s:g}'
-            )
         return ''
 
-    def _untold(self, found: RegistrationResult, starts: list[Transform], stamp_ns: int) -> str:
-        """Return since when nothing has told the motion, as a reason; empty if not for long."""
-        is_told = not found.moving_along or determines(found, starts)
-        if is_told or self._told_ns is None:
-            self._told_ns = stamp_ns
-        since_s = (stamp_ns - self._told_ns) / 1e9
-        if since_s <= LONGEST_UNTOLD_S:
+    def _doubt(
+        self, found: RegistrationResult, surfel_map: SurfelMap, T_map_fixed: Transform
+    ) -> str:
+        """Return why the next scans have to agree with a place; empty if they need not."""
+        expected = self.expected_support
+        is_clear = found.fit >= CLEAR_FIT  # a new place has a small overlap, but fits
+        is_poor = bool(self._supports) and found.support < POOR_SUPPORT * expected
+        is_unusual = found.is_found and found.support < expected
+        doubt = ''
+        share = found.seen_through
+        if share > MORE_SEEN_THROUGH and share > self.max_seen_through(surfel_map, T_map_fixed):
+            doubt = f'it sees through {share:.0%} of the map in view'
+        elif (is_poor or is_unusual) and not is_clear:
+            doubt = f'usually {expected / EXPECTED_SUPPORT:.0%} in all'
+        if not doubt:
             return ''
-        return (
-            f'{found.moving_along:.0%} of it moves along, and for {since_s:.1f} s nothing that '
-            'stands has told the motion'
-        )
+        self.doubtful = found.T_map_sensor
+        return f'{self._shares(found)}, {doubt}: the next scans have to agree'
 
     def advance(self, T_fixed_body: Transform, stamp_ns: int, reach_m: float = 0.0) -> None:
         """

@@ -64,11 +64,8 @@ class RegistrationConfig(Stage):
     min_fit_ratio: float = 0.6
     """A scan is dropped unless this share of the matched cells fit."""
 
-    search_deg: float = 60.0
+    search_deg: float = 180.0
     """If a scan fits worse than usual, headings up to this to both sides are tried, deg."""
-
-    max_speed_m_s: ClassVar[float] = 70.0
-    """A pose that implies a higher speed since the last scan is rejected, m/s."""
 
     min_information_ratio: ClassVar[float] = 0.003
     """A direction of motion with less than this share of the total information is degenerate: the

@@ -308,6 +308,12 @@ class MomentMap:
         """Return the keys (K,) of the voxels of at least min_points points, in any order."""
         return self._table.keys(self._table.occupied(as_whole('min_points', min_points)))
 
+    def keys_within(
+        self, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.int64]:
+        """Return the keys (K,) of the voxels with indices from low to high (3,), in any order."""
+        return self._table.keys_in_box(low, high)
+
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key (K,), -1 if not found; valid until the map changes."""
         return self._table.find(whole_keys(key))

@@ -98,7 +98,7 @@ class ScanMoments:
     num_reduced: int | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Default to zero channels for every voxel; a map tests the arrays when it takes them."""
+        """Set missing channels to zero; a map tests the arrays when it takes them."""
         if not isinstance(self.key, np.ndarray):
             raise ValueError(f'key: a {type(self.key).__name__}, expected an array (K,)')
         if self.channels is None:

@@ -121,8 +121,8 @@ class MapPart:
         All settings.
     T_map_part : (4, 4) float64
         Guess of the place of the part on the map: the prediction for its first scan.
-    expected_support : float
-        Minimum support of a place on the map.
+    limits : (float, float)
+        Usual support of a scan on the map, and the largest share of it that a scan sees through.
     reason : str
         Why its first scan was not mapped.
 
@@ -133,6 +133,8 @@ class MapPart:
         Tracks the scans on the part.
     guess : (4, 4) float64
         The guess of its place.
+    limits : (float, float)
+        As given.
     reason : str
         Why its first scan was not mapped.
 
@@ -143,12 +145,12 @@ class MapPart:
         registration: Registration,
         config: Config,
         T_map_part: Transform,
-        expected_support: float,
+        limits: tuple[float, float],
         reason: str,
     ) -> None:
         self._registration = registration
         self.guess = T_map_part
-        self._expected_support = SHARE_OF_USUAL * expected_support
+        self.limits = limits
         self.reason = reason
         self._config = config
         self._map = SurfelMap(config.map.voxel_size_m)
@@ -219,7 +221,9 @@ class MapPart:
             cells, surfel_map, [start], settings.max_deviation_m, is_lost=self._place is None
         )
         fits = found.converged and self._registration.fits(found)
-        if not fits or found.rival > 0.0 or found.support < self._expected_support:
+        usual_support, max_seen_through = self.limits
+        fits &= found.support >= SHARE_OF_USUAL * usual_support
+        if not fits or found.rival > 0.0 or found.seen_through > max_seen_through:
             self._place = None
             return None
         if self._place is None:

@@ -40,17 +40,8 @@ from surfel_mapper.scan import PointTimes, Scan
 MOST_PARTS = 20
 """Number of parts whose maps are kept; of more, the oldest are forgotten."""
 
-STATES = (
-    'lost',
-    'unconfirmed',
-    'ambiguous',
-    'degenerate',
-    'accompanied',
-    'surrounded',
-    'stopped',
-)
-"""States of tracking; accompanied: much of what is seen moves along, and the rest decides;
-surrounded: most of it seems to, and the pose may be wrong; stopped: harder than by braking."""
+STATES = ('lost', 'unconfirmed', 'ambiguous', 'degenerate', 'surrounded')
+"""States of tracking; surrounded: most of a scan seems to move along, its pose may be wrong."""
 
 MAX_STEP_S = 10.0
 """Longest time between two scans that counts for a state, s; more is a gap of the recording."""
@@ -287,7 +278,11 @@ class RegisteredPoses:
         try:
             found = self._tracker.track(seen.cells, seen.stamp_ns, surfel_map, T_map_fixed)
         except AlignmentError as error:
-            part = self._begin_part(seen, T_map_middle, twist, str(error))
+            limits = (
+                self._tracker.expected_support,
+                self._tracker.max_seen_through(surfel_map, T_map_fixed),
+            )
+            part = self._begin_part(seen, T_map_middle, twist, limits, str(error))
             if self._tracker.doubtful is not None:
                 part.set_place(self._tracker.doubtful, np.eye(4))
             return []
@@ -298,11 +293,11 @@ class RegisteredPoses:
         seen: Sighting,
         T_map_middle: Transform,
         twist: npt.NDArray[np.float64],
+        limits: tuple[float, float],
         reason: str,
     ) -> MapPart:
-        """Begin a part with a scan, predicted at a pose with a velocity."""
-        expected = self._tracker.expected_support
-        part = MapPart(self._registration, self._config, T_map_middle, expected, reason)
+        """Begin a part with a scan, predicted at a pose with a velocity; see MapPart."""
+        part = MapPart(self._registration, self._config, T_map_middle, limits, reason)
         part.tracker.begin(seen.stamp_ns, twist)
         part.add(seen)
         self._part = part
@@ -328,9 +323,8 @@ class RegisteredPoses:
         T_map_part, found = confirmed
         T_fixed_part = compose(inverse(T_map_fixed), T_map_part)
         self._part = None
-        self._tracker.resume(
-            compose(T_fixed_part, T_part_middle), seen.stamp_ns, part.tracker.twist
-        )
+        T_fixed_middle = compose(T_fixed_part, T_part_middle)
+        self._tracker.resume(T_fixed_middle, seen.stamp_ns, part.tracker.twist, seen.cells)
         self._num_aligned += len(part.scans)
         self._fits.append(found.fit)
         return [
@@ -354,7 +348,7 @@ class RegisteredPoses:
         self.finish()
         if len(part.scans) > 1:
             guess = compose(part.guess, part.tracker.predict(seen.stamp_ns))
-            self._begin_part(seen, guess, twist, part.reason)
+            self._begin_part(seen, guess, twist, part.limits, part.reason)
             return []
         return self._track(seen, surfel_map, T_map_fixed)
 
@@ -366,12 +360,6 @@ class RegisteredPoses:
     ) -> Prepared:
         """Return a scan at the pose of the track, and count its registration."""
         if registration is not None:
-            if registration.has_stopped:
-                self._drops.warn(
-                    'stopped',
-                    f'scan at {prepared.scan.stamp_ns / 1e9:.6f} s: the sensor seems to have '
-                    'stopped harder than by braking (a collision, or a repeated scan)',
-                )
             self._num_aligned += 1
             self._num_degenerate += len(registration.degenerate) > 0
             self._fits.append(registration.fit)
@@ -420,8 +408,6 @@ class RegisteredPoses:
         elif placed and placed[-1].registration is not None:
             found = placed[-1].registration
             states += ['degenerate'] if len(found.degenerate) else []
-            states += ['accompanied'] if found.moving_along else []
-            states += ['stopped'] if found.has_stopped else []
         self._states.add(stamp_ns, states)
 
     def _cells(self, scan: Scan) -> npt.NDArray[np.float64]:

@@ -177,7 +177,8 @@ def tracking_table(registration: Mapping[str, Any]) -> str:
     if 'tracking' not in registration:
         return ''
     states = ''.join(
-        f'<tr><td>{as_html(state)}</td><td>{spent["scans"]}</td><td>{spent["seconds"]:.1f}</td></tr>'
+        f'<tr><td>{as_html(state)}</td><td>{spent["scans"]}</td>'
+        f'<td>{spent["seconds"]:.1f}</td></tr>'
         for state, spent in registration['tracking'].items()
     )
     paragraphs = ''.join(

@@ -91,12 +91,6 @@ def scenarios() -> list[Scenario]:
             course=street_course(street, 8.0),
             movers=lambda time_s: trucks(street, NINE, 8.0, time_s),
         ),
-        Scenario(
-            name='9 trucks that come',
-            world=street,
-            course=street_course(street, 8.0),
-            movers=lambda time_s: trucks(street, NINE, 8.0, time_s, behind_m=coming_m(time_s)),
-        ),
     ]
 
 
@@ -106,29 +100,17 @@ def street_course(street: World, speed_m_s: float) -> Callable[[float], Transfor
     return lambda time_s: drive.T_odom_sensor(round(1e9 * time_s))
 
 
-def coming_m(time_s: float) -> float:
-    """Return how far trucks are still away that come within 2 s, m."""
-    return max(30.0 - 15.0 * time_s, 0.0)
-
-
 def trucks(
     street: World,
     places: tuple[tuple[float, float], ...],
     speed_m_s: float,
     time_s: float,
-    behind_m: float = 0.0,
 ) -> list[Primitive]:
-    """
-    Return trucks that move along with a vehicle, each with a sway of 0.3 m of its own.
-
-    Those of the next lanes, and of the vehicle's own behind it, are further behind by a distance,
-    those ahead of it further ahead.
-    """
+    """Return trucks that move along with a vehicle, each with a sway of 0.3 m of its own."""
     found = []
     for number, (x, y) in enumerate(places):
         sway = 0.3 * math.sin(0.7 * time_s + 1.9 * number)
-        away_m = behind_m if y == 0.0 < x else -behind_m
-        xyz = (speed_m_s * time_s + 0.85 + x + sway + away_m, y, 0.5 * TRUCK_M[2] + 0.4)
+        xyz = (speed_m_s * time_s + 0.85 + x + sway, y, 0.5 * TRUCK_M[2] + 0.4)
         pose = compose(street.T_world_start, pose_matrix(xyz, (0.0, 0.0, 0.0, 1.0)))
         found.append(
             Primitive(

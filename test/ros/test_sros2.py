@@ -5,35 +5,45 @@
 from __future__ import annotations
 
 from pathlib import Path
-import time
 from xml.etree import ElementTree
 
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
-from rclpy.node import NodeNameNonExistentError
-
-from test.ros.conftest import starting
+from surfel_mapper.ros import bond
+from surfel_mapper.ros.context import context
+from surfel_mapper.ros.node import MapperNode
+from surfel_mapper.ros.pose_inputs import STATIC_TOPIC, TREE_TOPIC
 from test.ros.driving import ARGUMENTS
-from test.ros.live import NODE, Peer
+from test.ros.live import NODE
 
 POLICY = Path(__file__).parents[2] / 'launch_configs' / 'sros2_policy.xml'
 
-EVERYTHING = [
-    *('-p', 'window.keep_points:=true', '-p', 'align.every_scans:=5'),
-    *('-p', 'layers.tsdf.enabled:=true', '-p', 'layers.models.enabled:=true'),
-    *('-p', 'map.origin:=auto'),
-]
+EVERYTHING = {
+    'window.keep_points': 'true',
+    'align.every_scans': 5,
+    'layers.tsdf.enabled': 'true',
+    'layers.models.enabled': 'true',
+    'map.origin': 'auto',
+    'publish.levels': 8,
+    'use_sim_time': 'true',
+}
 
-SOURCES = {'pose', 'depth', 'camera_info', 'tf', 'tf_static', 'clock', 'initialpose'}
-"""Subscriptions of other configurations than that of the test."""
+CONFIGURATIONS = (
+    EVERYTHING,
+    {'pose.source': 'registration'},
+    {'pose.source': 'auto'},
+    {'input.kind': 'depth'},
+)
+"""Together these create all topics and services, but those of packages that PyPI lacks."""
 
-OUTPUTS = {'tf', '~/odometry', '~/track', *(f'~/level_{n}/normals' for n in (1, 2, 3))}
-"""Publishers of other configurations."""
-
-NOT_SERVED = {'~/get_type_description'}
-"""Services that not every version of rclpy has."""
+OF_PACKAGES = {
+    'publish': {f'/{bond.TOPIC}', TREE_TOPIC},
+    'subscribe': {STATIC_TOPIC, TREE_TOPIC},
+    'reply': set(),
+}
+"""Topics of the packages bond and tf2_msgs."""
 
 
 def allowed(kind, how):
@@ -46,53 +56,31 @@ def full(name):
     return name.replace('~', NODE) if name.startswith('~') else f'/{name}'
 
 
-def shown(find):
-    """Return the names that the graph has for the node."""
-    try:
-        return {name for name, _ in find('surfel_mapper', '/')}
-    except NodeNameNonExistentError:
-        return set()
+@pytest.fixture(scope='module')
+def used(domain):
+    """Return the names that nodes of all configurations publish, subscribe and serve."""
+    names = {how: set(of_packages) for how, of_packages in OF_PACKAGES.items()}
+    for configuration in CONFIGURATIONS:
+        pairs = [('-p', f'{name}:={value}') for name, value in configuration.items()]
+        with context([*ARGUMENTS, *(item for pair in pairs for item in pair)]):
+            node = MapperNode()
+            node.start()
+            for how, find in (
+                ('publish', node.get_publisher_names_and_types_by_node),
+                ('subscribe', node.get_subscriber_names_and_types_by_node),
+                ('reply', node.get_service_names_and_types_by_node),
+            ):
+                names[how] |= {name for name, _ in find('surfel_mapper', '/')}
+            node.end()
+            node.destroy_node()
+    return names
 
 
 @pytest.mark.parametrize(
-    ('find', 'policy', 'missing'),
-    [
-        ('get_publisher_names_and_types_by_node', ('topic', 'publish'), OUTPUTS),
-        ('get_subscriber_names_and_types_by_node', ('topic', 'subscribe'), SOURCES),
-        ('get_service_names_and_types_by_node', ('service', 'reply'), NOT_SERVED),
-    ],
+    ('kind', 'how'), [('topic', 'publish'), ('topic', 'subscribe'), ('service', 'reply')]
 )
-def test_the_policy_allows_exactly_the_topics_and_services_of_the_node(
-    node, find, policy, missing
-):
-    needed = allowed(*policy) - {full(name) for name in missing}
-    names = set()
-    # A participant that lost a part of the graph may never get it; a new one asks anew.
-    for _ in range(6):
-        if not needed <= names:
-            names = seen_anew(find, needed)
-    assert needed <= names <= allowed(*policy)
-
-
-@pytest.fixture(scope='module')
-def node(prefork, tmp_path_factory):
-    with starting(tmp_path_factory.mktemp('policy'), prefork) as start:
-        running = start('node', *ARGUMENTS, *EVERYTHING)
-        running.wait_for_output('ready:')
-        yield running
-
-
-def seen_anew(find, needed, wait_s=20.0):
-    """Return the names that a new participant has for the node, soon or after some time."""
-    peer, end_s = Peer(), time.monotonic() + wait_s
-    try:
-        while not needed <= (names := shown(getattr(peer.node, find))):
-            if time.monotonic() > end_s:
-                break
-            peer.spin_for(0.05)
-        return names
-    finally:
-        peer.close()
+def test_the_policy_allows_exactly_the_topics_and_services_of_the_node(used, kind, how):
+    assert used[how] == allowed(kind, how)
 
 
 ENCLAVE = (
