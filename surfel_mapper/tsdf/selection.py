@@ -24,7 +24,7 @@ from surfel_mapper.tsdf.kernels.block_marks import (
 )
 from surfel_mapper.tsdf.kernels.point_fusion import mark_corners
 from surfel_mapper.tsdf.range_image import LEAST_COSINE, RangeImage
-from surfel_mapper.tsdf.sensors import Ranging
+from surfel_mapper.tsdf.sensors import Sensor
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
@@ -139,7 +139,7 @@ class BlockSelection:
         return marks
 
     def _about(
-        self, thin: Float64, sensor: Ranging, T_map_sensor: Float64, low: Int64, side: int
+        self, thin: Float64, sensor: Sensor, T_map_sensor: Float64, low: Int64, side: int
     ) -> Int64:
         """Mark the blocks of the voxels about points, as touched and near; return them."""
         config = self._config

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cached_property
 import itertools
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,26 +32,6 @@ MAX_PIXELS = 1 << 26
 """Limit of rows * columns: a range image of 256 MB."""
 
 
-class Ranging(Protocol):
-    """Properties that all sensor models have."""
-
-    @property
-    def rows(self) -> int:
-        """Rows of its images."""
-
-    @property
-    def columns(self) -> int:
-        """Columns of its images."""
-
-    @property
-    def min_range_m(self) -> float:
-        """Nearer returns are ignored, m."""
-
-    @property
-    def max_range_m(self) -> float:
-        """Farther returns only free the space up to here, m."""
-
-
 def refuse_unless(sensor: object, checks: Iterable[Check]) -> None:
     """Raise ConfigError for the first property that is not valid."""
     for name, holds, expected in checks:
@@ -60,7 +40,7 @@ def refuse_unless(sensor: object, checks: Iterable[Check]) -> None:
             raise ConfigError(f'{kind}.{name}: {getattr(sensor, name)}, expected {expected}')
 
 
-def range_checks(sensor: Ranging) -> list[Check]:
+def range_checks(sensor: Sensor) -> list[Check]:
     """Return the checks of the properties that all sensor models have."""
     return [
         ('rows', sensor.rows >= 1, 'at least 1'),
