@@ -14,7 +14,6 @@ from surfel_mapper.files.parquet import read_map
 from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test import extras
-from test.cli.small_disk import run_on_small_disk
 from test.cluster.bags import written
 
 pytestmark = [pytest.mark.usefixtures('undrawn'), extras.needs('pyarrow', 'distributed')]
@@ -174,29 +173,3 @@ def test_an_invalid_number_of_workers_is_refused(bags, number):
     with pytest.raises(SystemExit) as exit_info:
         main(['replay', bags[0], '--workers', number])
     assert exit_info.value.code == 2
-
-
-ON_A_SMALL_DISK = """
-import sys
-from pathlib import Path
-from surfel_mapper.cli.main import main
-from surfel_mapper.mapping.surfel_map import SurfelMap
-from test.cli.small_disk import filled
-
-disk, bag = Path(sys.argv[1]), sys.argv[2]
-arguments = ['replay', bag, bag, '--pose-topic', '/tf', '--output', str(disk / 'out'), '--json']
-arguments.append('--overwrite')
-assert main([*arguments, '--duration', '0.5']) == 0
-before = SurfelMap.load(disk / 'out').digest()
-free = len(list((disk / 'out').iterdir()))
-with filled(disk):
-    code = main(arguments)
-same = SurfelMap.load(disk / 'out').digest() == before
-print('found', code, same, len(list((disk / 'out').iterdir())) == free)
-"""
-
-
-def test_a_full_disk_leaves_the_earlier_map_whole(bags, tmp_path):
-    done = run_on_small_disk(ON_A_SMALL_DISK, tmp_path, bags[0], size='16m')
-    assert done.stdout.splitlines()[-1] == 'found 1 True True', done.stderr
-    assert 'No space left on device' in done.stderr
