@@ -200,7 +200,7 @@ setup(
         'lint': LINT,
         'docs': DOCS,
     },
-    entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.main:main']},
+    entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.start:main']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
