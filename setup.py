@@ -64,6 +64,11 @@ LAS = [
     'pyproj>=3.6',  # units of coordinate systems in them; MIT
 ]
 
+CLOUDS = [
+    'pye57>=0.4.11',  # scans in E57 files; MIT
+    'vtk>=9.2',  # points in VTK files, 140 MB; BSD
+]
+
 OUSTER = [
     # captures of Ouster lidars; BSD-3-Clause, a part under a licence of Ouster's own. Later ones
     # pin a rosbags older than ours; this one is for Python 3.10 to 3.12, and takes numpy 1.26
@@ -116,6 +121,7 @@ FULL = [
     *TEST,
     *FORMATS,
     *CLUSTER,
+    *CLOUDS,
     *ALIGN,
     *VIEWER,
     *NOTEBOOKS,
@@ -181,6 +187,7 @@ setup(
         'formats': FORMATS,
         'cluster': CLUSTER,
         'las': LAS,
+        'clouds': CLOUDS,
         'ouster': OUSTER,
         'align': ALIGN,
         'loops': LOOPS,
@@ -193,7 +200,7 @@ setup(
         'lint': LINT,
         'docs': DOCS,
     },
-    entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.main:main']},
+    entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.start:main']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

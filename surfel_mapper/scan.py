@@ -117,6 +117,8 @@ class Scan:
         The depth image that has exactly these points; None as soon as a scan has others.
     free : (K, 3) float, optional
         Unit vectors along which the sensor reports no return within its range.
+    topic : str
+        The topic that it came from. Stamps of one topic and frame are not repeated.
     msg : sensor_msgs/PointCloud2, optional
         The cloud of the scan, if it has the same points in the same order.
 
@@ -140,6 +142,7 @@ class Scan:
     camera: tuple[float, ...] = ()
     depth: DepthImage | None = None
     free: npt.NDArray[Any] | None = None
+    topic: str = ''
     msg: Any = None
     _lazy: LazyPoints | None = field(default=None, init=False, repr=False, compare=False)
 
@@ -214,6 +217,10 @@ class Scan:
     def with_times(self, times: PointTimes) -> Scan:
         """Return the scan with the times of its points, which are not decoded for that."""
         return self._changed(times=times)
+
+    def of_topic(self, topic: str) -> Scan:
+        """Return the scan with its topic."""
+        return self if topic == self.topic else self._changed(topic=topic)
 
     def moved_in_time(self, offset_ns: int) -> Scan:
         """Return the scan with an offset added to its stamp and the times of its points."""

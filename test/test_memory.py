@@ -23,24 +23,6 @@ for _ in range(5):
 print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) // 5)
 """
 
-THREADS = """
-import resource, sys, threading
-from surfel_mapper.memory import keep_freed_memory, share_freed_memory
-keep_freed_memory()
-if sys.argv[1] == 'shared':
-    share_freed_memory()
-made = []
-def make():
-    made.extend(bytes([n]) * (1 << 20) for n in range(40))  # 10,240 pages of 4 KiB
-thread = threading.Thread(target=make)
-thread.start()
-thread.join()
-made.clear()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-make()
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-"""
-
 
 def faults_of(program, how):
     """Return the page faults that a program prints."""
@@ -55,9 +37,3 @@ def test_blocks_are_used_again_once_memory_is_kept():
     kept, given_back = (faults_of(FAULTS, how) for how in ('kept', 'given back'))
     assert kept < 100
     assert kept < 0.1 * given_back
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != 'glibc', reason='concerns glibc only')
-def test_memory_freed_by_one_thread_is_used_by_another_once_it_is_shared():
-    shared, apart = (faults_of(THREADS, how) for how in ('shared', 'apart'))
-    assert shared < 0.1 * apart

@@ -16,7 +16,6 @@ import pytest
 from surfel_mapper import threads as threads_module
 from surfel_mapper.threads import (
     BACKGROUND_NICE,
-    real_time_threads,
     share,
     split,
     usable_cores,
@@ -79,39 +78,8 @@ def test_background_thread_has_a_lower_priority_than_the_others():
         assert background.submit(nice).result() == min(nice() + BACKGROUND_NICE, 19)
 
 
-def policies():
-    """Return the scheduling of a thread started in the with-block, and of the caller after it."""
-    found = []
-    with real_time_threads():
-        thread = threading.Thread(target=lambda: found.append(os.sched_getscheduler(0)))
-        thread.start()
-        thread.join()
-    return [*found, os.sched_getscheduler(0)]
-
-
 def may_run_in_real_time():
     """Return whether the system permits this process real-time priority."""
     test = 'import os; os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))'
     command = [sys.executable, '-c', test]
     return not subprocess.run(command, stderr=subprocess.DEVNULL).returncode
-
-
-@pytest.mark.skipif(sys.platform != 'linux', reason='threads have no priority of their own')
-def test_threads_get_real_time_priority_if_permitted_and_their_starter_loses_it():
-    expected = os.SCHED_RR if may_run_in_real_time() else os.SCHED_OTHER
-    assert policies() == [expected, os.SCHED_OTHER]
-
-
-WITHOUT_PERMISSION = """
-import os, resource
-from test.test_threads import policies
-resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
-if os.getuid() == 0:
-    os.setuid(65_534)
-assert policies() == [os.SCHED_OTHER, os.SCHED_OTHER]
-"""
-
-
-@pytest.mark.skipif(sys.platform != 'linux', reason='threads have no priority of their own')
-def test_threads_stay_ordinary_without_permission():
-    subprocess.run([sys.executable, '-c', WITHOUT_PERMISSION], cwd=ROOT, check=True)

@@ -64,12 +64,12 @@ def files_of(path: Path) -> list[Path]:
 
 def is_ros1(path: Path) -> bool:
     """Return whether a path is a ROS 1 bag, closed or not, by its name."""
-    return path.name.endswith(ROS1_SUFFIXES)
+    return path.name.lower().endswith(ROS1_SUFFIXES)
 
 
 def is_storage(path: Path) -> bool:
     """Return whether a path is a file of a rosbag2, packed or not, by its name."""
-    return unpacked_name(path).endswith(STORAGE_SUFFIXES)
+    return unpacked_name(path).lower().endswith(STORAGE_SUFFIXES)
 
 
 def is_packed(path: Path) -> bool:

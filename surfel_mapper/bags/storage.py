@@ -134,7 +134,7 @@ def damaged(path: Path, problem: str, error: Exception) -> BagError:
 
 def suffix(path: Path) -> str:
     """Return the kind of a file: .mcap, .db3 or .bag."""
-    return '.bag' if is_ros1(path) else Path(unpacked_name(path)).suffix
+    return '.bag' if is_ros1(path) else Path(unpacked_name(path)).suffix.lower()
 
 
 def described(error: Exception) -> str:

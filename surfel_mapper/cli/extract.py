@@ -19,7 +19,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.cli._arguments import add_formats, add_overwrite, real
+from surfel_mapper.cli._arguments import add_bin_columns, add_formats, add_overwrite, real
 from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._settings import add_settings, configured_stage
@@ -59,11 +59,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'cloud',
         type=Path,
         metavar='CLOUD|MAP',
-        help='.ply, .pcd, .bin, .las, .laz; or a map: .npz, .parquet, output of a replay',
+        help='points in a file, as of `replay`; or a map: .npz, .parquet, output of a replay',
     )
     parser.add_argument(
         '-o', '--output', type=Path, required=True, metavar='DIR', help='directory to write to'
     )
+    add_bin_columns(parser)
     add_overwrite(parser)
     add_formats(parser, FORMATS, DEFAULT)
     add_settings(
@@ -84,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=real,
         nargs=3,
         metavar=('X', 'Y', 'Z'),
-        help='position of the sensor; default: the origin, or above the middle of a map',
+        help='position of the sensor; default: VIEWPOINT of a PCD, the origin, or above a map',
     )
     add_open(parser, 'models.png')
     parser.add_argument('--json', action='store_true', help='print the figures as JSON')
@@ -129,32 +130,29 @@ def read(
     """Return points (N, 3), default voxel size, viewpoint (3,) and origin (3,) of the map, m."""
     from surfel_mapper.config import ModelsConfig
     from surfel_mapper.errors import FileFormatError
-    from surfel_mapper.files import map_state, parquet, parquet_tiles
-    from surfel_mapper.files.scan_files import read_scan, SUFFIXES
+    from surfel_mapper.files.arrays import is_cloud
+    from surfel_mapper.files.pcd import read_viewpoint
+    from surfel_mapper.files.scan_files import scan_reader, SUFFIXES
+    from surfel_mapper.mapping.surfel_map import SurfelMap
     from surfel_mapper.models.fitting import above, surfel_points
 
     args.cloud = exact_map(args.cloud)
-    is_tiles = args.cloud.is_dir()
+    suffix = args.cloud.suffix.lower()
     if not args.cloud.exists():
         raise FileFormatError(f'{args.cloud}: no such file')
-    if not is_tiles and args.cloud.suffix not in (*MAPS, *SUFFIXES):
+    if not args.cloud.is_dir() and suffix not in (*MAPS, *SUFFIXES):
         raise FileFormatError(
             f'{args.cloud}: expected a cloud ending in {", ".join(SUFFIXES)}, or a map ending in '
             f'{", ".join(MAPS)}'
         )
     origin_m: npt.NDArray[np.float64] = np.zeros(3)
-    if is_tiles or args.cloud.suffix in MAPS:
-        if is_tiles:
-            surfel_map = parquet_tiles.read_tiles(args.cloud)
-        elif args.cloud.suffix == '.npz':
-            surfel_map, _ = map_state.load_map(args.cloud)
-        else:
-            surfel_map = parquet.read_map(args.cloud)
+    if args.cloud.is_dir() or (suffix in MAPS and not is_cloud(args.cloud)):
+        surfel_map = SurfelMap.load(args.cloud)
         surfels, origin_m = surfel_map.surfels(), surfel_map.origin_m
         points: npt.NDArray[Any] = surfel_points(surfels, surfel_map.voxel_size_m)
         voxel_size_m, viewpoint = 0.5 * surfel_map.voxel_size_m, above(surfels)
     else:
-        points, columns = read_scan(args.cloud)
+        points, columns = scan_reader([args.cloud], args.bin_columns)(args.cloud)
         if {'planarity', 'curvature', 'num_points'} <= set(columns):
             raise FileFormatError(
                 f'{args.cloud}: surfels of a map, not points of a cloud; expected its map.npz or '
@@ -162,6 +160,8 @@ def read(
             )
         points = np.ascontiguousarray(points)
         voxel_size_m, viewpoint = ModelsConfig().voxel_size_m, np.zeros(3)
+        if suffix == '.pcd':
+            viewpoint = np.array(read_viewpoint(args.cloud)[:3])
     if args.viewpoint is not None:
         viewpoint = np.array(args.viewpoint) - origin_m
     return points, voxel_size_m, viewpoint, origin_m

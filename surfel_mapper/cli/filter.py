@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs='+',
         type=Path,
         metavar='IN',
-        help='clouds (.ply, .pcd, .bin), folders of them, or bags',
+        help='clouds in files as of `replay`, folders of them, or bags',
     )
     parser.add_argument(
         '-o',

@@ -133,12 +133,13 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
             lines += offered(offer, is_choice) if offer.clouds == clouds else []
     if not made:
         lines += ['', 'no poses; if the clouds are in a fixed frame, use --poses-from identity']
-    lines += ['', replay_line(content['replay'])] if content['replay'] else []
-    return '\n'.join(lines)
+    return '\n'.join([*lines, '', replay_line(content['replay'])])
 
 
 def replay_line(replay: dict[str, Any]) -> str:
-    """Return the source of poses that a replay takes, and why."""
+    """Return the source of poses that a replay takes, and why, or why it is refused."""
+    if 'refused' in replay:
+        return f'a replay without options is refused: {replay["refused"]}'
     deskewed = ', deskewed' if replay['deskewed'] else ''
     why = f': {replay["poses_reason"]}' if replay['poses_reason'] else ''
     line = f'replay takes poses from {replay["poses_from"]}{deskewed}{why}'
@@ -147,7 +148,7 @@ def replay_line(replay: dict[str, Any]) -> str:
 
 
 def chosen(path: Path) -> dict[str, Any]:
-    """Return the source of poses for a replay without settings; empty if that is refused."""
+    """Return the source of poses for a replay without settings, or why that is refused."""
     from surfel_mapper.config import Config
     from surfel_mapper.errors import BagError
     from surfel_mapper.offline.recording import open_recording
@@ -156,8 +157,8 @@ def chosen(path: Path) -> dict[str, Any]:
     try:
         with open_recording(Request(path=path), Config()) as recording:
             description = recording.describe()
-    except BagError:  # several topics of clouds, or none: a topic has to be named
-        return {}
+    except BagError as error:  # several topics of clouds, or none: a topic has to be named
+        return {'refused': str(error)}
     return {name: description[name] for name in CHOICE}
 
 

@@ -72,8 +72,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs='+',
         type=Path,
         metavar='BAG',
-        help='rosbag2 directory, .mcap, .db3, ROS 1 .bag; directory or file of .ply, .pcd, .bin, '
-        '.las, .laz scans; .pcap of an Ouster lidar',
+        help='rosbag2 directory, .mcap, .db3, ROS 1 .bag; directory or file of scans: .ply, .pcd, '
+        '.bin, .las, text, .npy, .e57, ... (docs/formats.md); .pcap of an Ouster lidar',
     )
     add_settings(parser, 'YAML file of settings')
     add(

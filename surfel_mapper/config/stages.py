@@ -281,8 +281,8 @@ class InputConfig(Stage):
     )
     reset_after_s: float = setting(
         1.0,
-        'A stamp that goes back by more than this clears the map, s; '
-        'by less, the scan is dropped.',
+        'Time that goes back by more than this clears the map, s; a scan older by less than the '
+        'one before it is sorted in.',
         low=0.0,
         high=1e9,
     )

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import map_state, parquet
+from surfel_mapper.files.arrays import is_cloud
 from surfel_mapper.files.latest_map import DRAWABLE, map_in, TILES
 from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.files.scan_files import scan_reader, SUFFIXES
@@ -85,9 +86,9 @@ def load_discs(path: str | Path, min_points: int, bin_columns: int | None = None
         )
     if file.is_dir():
         return of_map(read_tiles(file), min_points)
-    if file.suffix == '.parquet':
+    if file.suffix.lower() == '.parquet':
         return of_map(parquet.read_map(file), min_points)
-    if file.suffix == '.npz':
+    if file.suffix.lower() == '.npz' and not is_cloud(file):
         return of_map(map_state.load_map(file)[0], min_points)
     if file.suffix.lower() not in SUFFIXES:
         raise FileFormatError(

@@ -22,14 +22,15 @@ SURFELS = ('.ply', '.pcd', *las.SUFFIXES)
 
 def save_surfel_map(path: Path, surfel_map: SurfelMap) -> str:
     """Write a map; see SurfelMap.save."""
-    if path.suffix == '.npz':
+    suffix = path.suffix.lower()
+    if suffix == '.npz':
         return map_state.save_map(path, surfel_map)
-    if path.suffix == '.parquet':
+    if suffix == '.parquet':
         return parquet.write_map(path, surfel_map)
-    if path.suffix not in SURFELS:
+    if suffix not in SURFELS:
         raise FileFormatError(f'{path}: expected a file ending in {", ".join(EXACT + SURFELS)}')
     writers = {'.ply': ply.write_surfels, '.pcd': pcd.write_surfels}
-    write = writers.get(path.suffix, las.write_surfels)
+    write = writers.get(suffix, las.write_surfels)
     write(path, surfel_map.surfels(), surfel_map.origin_m)
     return surfel_map.digest()
 
@@ -40,9 +41,9 @@ def load_surfel_map(path: Path) -> SurfelMap:
         path = latest_map.map_in(path, latest_map.EXACT) or path / map_state.FILE
     if path.is_dir():
         return parquet_tiles.read_tiles(path)
-    if path.suffix == '.parquet':
+    if path.suffix.lower() == '.parquet':
         return parquet.read_map(path)
-    if path.suffix in SURFELS:
+    if path.suffix.lower() in SURFELS:
         raise FileFormatError(
             f'{path}: surfels without their moments, from which no map can be made; expected a '
             f'file ending in {" or ".join(EXACT)}'

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files import las, pcd, ply
+from surfel_mapper.files import arrays, foreign_points, las, pcd, ply, text_points
 from surfel_mapper.files.atomic import by_number
 from surfel_mapper.files.point_columns import Columns, named_columns, with_one_colour
 from surfel_mapper.files.raw import raw_layout, RawLayout, read_raw
@@ -27,12 +27,21 @@ READERS: dict[str, Callable[[Path], Columns]] = {
     '.ply': ply.read_points,
     '.pcd': pcd.read_points,
     **dict.fromkeys(las.SUFFIXES, las.read_points),
+    **dict.fromkeys(text_points.SUFFIXES, text_points.read_points),
+    **dict.fromkeys(arrays.SUFFIXES, arrays.read_points),
+    '.e57': foreign_points.read_e57,
+    **dict.fromkeys(('.vtk', '.vtp', '.vtu'), foreign_points.read_vtk),
+    '.obj': foreign_points.read_obj,
+    '.feather': foreign_points.read_feather,
 }
 """The reader of each format but .bin, which takes a layout, by the ending in lower case."""
 
 RAW = '.bin'
 
 SUFFIXES = ('.ply', '.pcd', RAW, *list(READERS)[2:])
+
+SHARED = ('.txt', '.csv', *arrays.SUFFIXES, '.obj')
+"""Endings of other files too: times, poses, maps, meshes."""
 
 CLOUDCOMPARE = 'scalar_'
 """Prefix of the columns in files of CloudCompare."""
@@ -47,11 +56,25 @@ def scan_files(directory: Path) -> list[Path]:
     Return the files of scans in a directory, scan2 before scan10.
 
     Links that lead nowhere are among them, so that their readers report them as damaged. Hidden
-    files are not: macOS writes a ._ file beside each.
+    files are not: macOS writes a ._ file beside each. Tables, arrays and OBJ files are scans if
+    there are no others and they look like points.
     """
     candidates = (file for file in directory.iterdir() if scan_suffix(file) in SUFFIXES)
     files = [file for file in candidates if file.is_file() or not file.exists()]
-    return sorted(files, key=by_number)
+    scans = [file for file in files if scan_suffix(file) not in SHARED]
+    return sorted(scans or filter(looks_like_points, files), key=by_number)
+
+
+def looks_like_points(path: Path) -> bool:
+    """Return whether a table, an array or an OBJ file may be points, by its beginning or end."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix in text_points.SUFFIXES:
+            layout = text_points.text_layout(path)
+            return layout is not None and layout.is_points
+        return not (arrays.is_map(path) if suffix == '.npz' else foreign_points.has_faces(path))
+    except OSError:
+        return False
 
 
 def scan_suffix(path: Path) -> str:
@@ -99,6 +122,11 @@ def read_scan(path: str | Path, layout: RawLayout | None = None) -> Points:
         columns = READERS[suffix](path)
     else:
         raise FileFormatError(f'{path}: expected a scan ending in {", ".join(SUFFIXES)}')
+    return scan_of(path, columns)
+
+
+def scan_of(path: Path, columns: Columns) -> Points:
+    """Return the points and the other columns of a file, named as elsewhere."""
     missing = [name for name in 'xyz' if name not in columns]
     if missing:
         raise FileFormatError(

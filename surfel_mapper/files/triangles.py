@@ -59,7 +59,7 @@ def read_triangles(path: Path) -> Mesh:
         raise FileFormatError(f'{path}: no {path.suffix[1:]} file: {error}') from error
     if not len(found.faces):
         raise FileFormatError(f'{path}: no triangles')
-    if path.suffix in GLTF:
+    if path.suffix.lower() in GLTF:
         found.apply_transform(Y_UP.T)
     return Mesh(
         vertices=np.asarray(found.vertices, np.float64),

@@ -117,7 +117,8 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
     frame_id = frame_name(msg.header.frame_id)
     data = checked_data(msg, topic)
     if int(msg.height) * int(msg.width) == 0:
-        return Scan(points=np.empty((0, 3), np.float32), stamp_ns=stamp_ns, frame_id=frame_id)
+        nothing = np.empty((0, 3), np.float32)
+        return Scan(points=nothing, stamp_ns=stamp_ns, frame_id=frame_id, topic=topic)
     budget = Budget(topic, len(data), CloudFormatError)
     fields = checked_fields(msg, topic, budget)
     xyz = [checked_coordinate(fields, name, topic) for name in 'xyz']
@@ -130,6 +131,7 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
         stamp_ns=stamp_ns,
         frame_id=frame_id,
         columns=MessageColumns(points, others, budget),
+        topic=topic,
         msg=msg,
     )
 

@@ -3,10 +3,11 @@
 """
 Folders of public data sets, recognised by their layout: scans, times, poses, calibration.
 
-``find_dataset`` tries the layouts of KITTI odometry and raw, nuScenes, MulRan, HeLiPR, Newer
-College, NCLT and Boreas. Poses are returned as poses of the lidar, if the folder has them and the
-calibration they need; without, the scans are registered. Of a KITTI drive, a part of the scans may
-have been copied: their names are the numbers of their rows.
+``find_dataset`` tries the layouts of KITTI odometry and raw, nuScenes, Argoverse 2, MulRan,
+HeLiPR, Newer College, NCLT and Boreas. An E57 file has scans with poses too. Poses are returned as
+poses of the lidar, if the folder has them and the calibration they need; without, the scans are
+registered. Of a KITTI drive, a part of the scans may have been copied: their names are the numbers
+of their rows.
 
 Sources: development kits and papers of the data sets. Poses of Newer College, NCLT and Boreas are
 not read, because the folders do not contain the calibration of the lidar.
@@ -27,6 +28,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import ConfigError, FileFormatError
 from surfel_mapper.files.atomic import by_number
+from surfel_mapper.files.foreign_points import e57_poses, read_e57, read_feather
 from surfel_mapper.files.pose_rows import (
     matrix_rows,
     MAX_SKEW,
@@ -35,7 +37,7 @@ from surfel_mapper.files.pose_rows import (
     warn_of_skew,
 )
 from surfel_mapper.files.raw import FLOATS
-from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.files.scan_files import read_scan, scan_of
 from surfel_mapper.files.stamps import column_ns, read_dates, read_times
 from surfel_mapper.files.text_table import finite, read_lines, table_rows
 from surfel_mapper.files.trajectory import read_trajectory, stamped_poses, Trajectory
@@ -233,6 +235,70 @@ def nuscenes_poses(tables: Path, files: Sequence[Path]) -> list[Floats]:
     return poses
 
 
+def argoverse2(path: Path) -> Dataset | None:
+    """Recognise sensors/lidar/NS.feather, whose points are in the vehicle, and its poses."""
+    files = scans_in(path / 'sensors' / 'lidar', '.feather')
+    if not files:
+        return None
+    stamps_ns = [stamp_in_name(file, 1) for file in files]
+    poses_path = path / 'city_SE3_egovehicle.feather'
+    if not poses_path.is_file():
+        return Dataset('Argoverse 2', files, stamps_ns, read=read_argoverse2)
+    table = read_feather(poses_path)
+    names = ('tx_m', 'ty_m', 'tz_m', 'qx', 'qy', 'qz', 'qw')
+    missing = [name for name in ('timestamp_ns', *names) if name not in table]
+    if missing:
+        raise FileFormatError(f'{poses_path}: no {missing[0]} among {", ".join(table)}')
+    order = np.argsort(table['timestamp_ns'])
+    xyz, q_xyzw = (np.stack([table[n][order] for n in part], 1) for part in (names[:3], names[3:]))
+    found = Trajectory(table['timestamp_ns'][order], xyz, q_xyzw)
+    return Dataset('Argoverse 2', files, stamps_ns, found, poses_path, read_argoverse2)
+
+
+def read_argoverse2(path: Path) -> tuple[npt.NDArray[Any], Columns]:
+    """Return the points of a sweep, which are those at its stamp: their times are left out."""
+    points, columns = read_scan(path)
+    return points, {name: values for name, values in columns.items() if name != 'offset_ns'}
+
+
+class E57Scans:
+    """
+    The scans of an E57 file, in the frames of the scanner, with their poses.
+
+    They have no times that are used: they follow each other 0.1 s apart.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, or has no scans.
+    DependencyError
+        If pye57 is not installed.
+
+    """
+
+    format = 'E57'
+
+    def __init__(self, path: Path) -> None:
+        self._poses = e57_poses(path)
+        if not len(self._poses):
+            raise FileFormatError(f'{path}: no scans in it')
+        self.files = [path] * len(self._poses)
+        self.stamps_ns = [10**8 * number for number in range(len(self.files))]
+        is_placed = (self._poses != np.eye(4)).any()
+        try:
+            self.trajectory = Trajectory.from_matrices(self._poses) if is_placed else None
+        except ValueError as error:
+            raise FileFormatError(f'{path}: poses of its scans: {error}') from error
+        self.poses_path = path
+
+    def scan(self, number: int) -> tuple[npt.NDArray[Any], Columns]:
+        """Return points (N, 3), m, and columns of a scan."""
+        columns = read_e57(self.files[number], number)
+        points, columns = scan_of(self.files[number], columns)
+        pose = self._poses[number]
+        return np.asfortranarray((points - pose[:3, 3]) @ pose[:3, :3]), columns
+
+
 def mulran(path: Path) -> Dataset | None:
     """Recognise Ouster/ or sensor_data/Ouster/ with names in ns, and global_pose.csv."""
     folders = (path / 'Ouster', path / 'sensor_data' / 'Ouster')
@@ -301,7 +367,17 @@ def boreas(path: Path) -> Dataset | None:
     return Dataset('Boreas', files, stamps_ns, read=structured(BOREAS_POINT))
 
 
-LAYOUTS = (kitti_odometry, kitti_raw, nuscenes, mulran, helipr, newer_college, nclt, boreas)
+LAYOUTS = (
+    kitti_odometry,
+    kitti_raw,
+    nuscenes,
+    argoverse2,
+    mulran,
+    helipr,
+    newer_college,
+    nclt,
+    boreas,
+)
 
 
 def scans_in(folder: Path, suffix: str) -> list[Path]:

@@ -249,7 +249,15 @@ class ScanTrajectory:
         """Write the poses in the fixed frame as TUM text."""
         from surfel_mapper.files.trajectory import write_tum
 
-        write_tum(path, self.stamps_ns, self.in_fixed)
+        write_tum(path, *self.by_time)
+
+    @property
+    def by_time(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Ascending stamps, (S,), and T_fixed_sensor, (S, 4, 4); the first scan of each stamp."""
+        import numpy as np
+
+        stamps_ns, rows = np.unique(np.array(self.stamps_ns, np.int64), return_index=True)
+        return stamps_ns, self.in_fixed[rows]
 
     @property
     def in_fixed(self) -> npt.NDArray[np.float64]:

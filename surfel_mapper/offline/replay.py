@@ -445,16 +445,14 @@ def pose_errors(truth: Path | None, trajectory: ScanTrajectory) -> dict[str, Any
     """Return the errors of the poses for the summary; empty without truth."""
     if truth is None:
         return {}
-    import numpy as np
-
     from surfel_mapper.evaluation.trajectory_errors import compare  # 0.2 s, only with truth
     from surfel_mapper.evaluation.truth import true_poses
 
-    stamps_ns = np.array(trajectory.stamps_ns, np.int64)
+    stamps_ns, poses = trajectory.by_time
     try:
         errors = compare(
             stamps_ns,
-            trajectory.in_fixed,
+            poses,
             *true_poses(truth, stamps_ns),
             max_difference_ns=SAME_TIME_NS,
         )

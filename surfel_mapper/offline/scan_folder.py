@@ -25,7 +25,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError, FileFormatError
 from surfel_mapper.files.scan_files import scan_files, scan_reader, SUFFIXES
 from surfel_mapper.offline import ouster_pcap
-from surfel_mapper.offline.datasets import Dataset, find_dataset
+from surfel_mapper.offline.datasets import Dataset, E57Scans, find_dataset
 from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.offline.pose_choice import (
     choose_for_folder,
@@ -99,8 +99,12 @@ class ScanFolder:
 
     def __init__(self, request: Request, config: Config, poses: PosePath | None) -> None:
         self.path = request.path
-        is_packets = self.path.suffix.lower() == ouster_pcap.SUFFIX
-        self.dataset = OusterPcap(self.path) if is_packets else find_dataset(self.path)
+        suffix = self.path.suffix.lower()
+        self.dataset: Dataset | OusterPcap | E57Scans | None
+        if suffix == ouster_pcap.SUFFIX:
+            self.dataset = OusterPcap(self.path)
+        else:
+            self.dataset = (E57Scans if suffix == '.e57' else find_dataset)(self.path)
         if self.dataset is not None:
             self.files, self.format = self.dataset.files, self.dataset.format
         else:

@@ -26,9 +26,6 @@ WARN_EVERY_S = 1.0
 MAX_CAUSES = 200
 """Causes whose last warning is kept; some name a frame."""
 
-MAX_TOPICS = 64
-"""Frames whose topics are kept; frame names may change without end."""
-
 INTERNAL = 'internal_error'
 """Cause of drops by errors that no stage expects, out of memory among them."""
 
@@ -56,7 +53,7 @@ REMEDIES = {
     'pose.source; a sensor without a transform needs frames.base_to_sensor; '
     'pose.max_wait_s waits longer',
     'no_valid_points': 'compare input.min_range_m and input.max_range_m with the sensor',
-    'odd_stamp': 'is the clock of this sensor right?',
+    'odd_stamp': 'is the clock of this sensor right? input.time_offset_s corrects an offset',
     'overload': 'larger voxels (map.voxel_size_m) or a shorter range (input.max_range_m) map '
     'faster',
     'queue_full': 'poses come late; pose.max_waiting_scans lets more scans wait',
@@ -82,8 +79,6 @@ class Drops:
         The counters.
     is_silent : bool
         Count without warnings.
-    topics : dict of str to str
-        Topic of the scans of each frame, for the log.
 
     """
 
@@ -91,23 +86,16 @@ class Drops:
 
     def __init__(self, counters: Counters) -> None:
         self.counters = counters
-        self.topics: dict[str, str] = {}
         self._warned_s: dict[str, float] = {}
-
-    def name_topic(self, frame_id: str, topic: str) -> None:
-        """Keep the topic of the scans of a frame, for the log; the oldest of many are dropped."""
-        if frame_id not in self.topics and len(self.topics) >= MAX_TOPICS:
-            del self.topics[next(iter(self.topics))]
-        self.topics[frame_id] = topic
 
     def scan(self, scan: Scan, cause: str, reason: str) -> None:
         """Count a scan as dropped for a cause."""
         counters = self.counters
         counters.drop(cause, scan.frame_id)
-        topic, remedy = self.topics.get(scan.frame_id), REMEDIES.get(cause)
+        remedy = REMEDIES.get(cause)
         self.warn(
             cause,
-            f'scan {f"on {topic} " if topic else ""}at {scan.stamp_ns / 1e9:.6f} s '
+            f'scan {f"on {scan.topic} " if scan.topic else ""}at {scan.stamp_ns / 1e9:.6f} s '
             f'in frame {scan.frame_id!r} dropped: {reason} '
             f'({counters.dropped[cause]} dropped for this cause)'
             f'{f"; {remedy}" if remedy else ""}',

@@ -198,18 +198,16 @@ class Mapper:
         """
         Queue a scan until its pose is there; ``insert_ready`` maps it.
 
-        A scan without points or frame, or with a stamp that is not newer than the last of its
-        frame, is dropped and counted. A stamp that goes back by more than
-        ``input.reset_after_s`` clears the map, if the next message agrees; else the scan is
-        dropped. The topic is for the log. Raises TypeError for anything but a Scan.
+        A scan without points or frame, or with the stamp of an earlier one of its topic and frame,
+        is dropped and counted. So is one older than the last, if its pose comes from registration.
+        A stamp that goes back by more than ``input.reset_after_s`` clears the map, if other
+        messages agree (see StampGuard); else the scan is dropped. ``input.time_offset_s`` is added
+        to the stamp. The topic is for the log too. Raises TypeError for anything but a Scan.
         """
         check_kind('scan', scan, Scan, hint='Scan(points=..., stamp_ns=..., frame_id=...)')
         check_kind('topic', topic, str)
         self.counters.received += 1
-        drops = self._pipeline.drops
-        if topic and drops.topics.get(scan.frame_id) != topic:
-            drops.name_topic(scan.frame_id, topic)
-        self._pipeline.add_scan(scan)
+        self._pipeline.add_scan(scan.of_topic(topic or scan.topic))
 
     def refuse_clouds(
         self, cause: str, topic: str, reason: str, number: int = 1, frame_id: str = ''

@@ -231,7 +231,7 @@ class ScanPipeline:
 
     def _enqueue(self, scan: Scan) -> None:
         """Queue a scan unless it is out of order; clear the map if time was set back."""
-        order = self.guard.order(scan)
+        order = self.guard.order(scan, takes_late=self.poses.registered is None)
         if order.cause:
             self.drops.scan(scan, order.cause, order.reason)
             return
@@ -283,8 +283,7 @@ class ScanPipeline:
             self._clear_map()
         ahead = int(self._looks_ahead)
         keeps = ahead if more_follows else 0
-        newest_ns = self.guard.newest_scan_ns
-        if self.queue.fill_posed(1 + ahead, newest_ns, self.config.pose) > keeps:
+        if self.queue.fill_posed(1 + ahead, self.guard.newest_of, self.config.pose) > keeps:
             return posed.popleft()
         if posed:
             start = clock()

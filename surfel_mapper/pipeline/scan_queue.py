@@ -3,6 +3,8 @@
 """
 ScanQueue: scans that wait for their poses and images, in the order in which they came in.
 
+A scan older than the one before it of its topic and frame is put before that, if it still waits.
+
 Time is the stamps of the data alone, never the clock: a bag replayed at any speed waits and drops
 alike. A scan whose pose cannot come any more, or did not within ``pose.max_wait_s`` of the newest
 data, is dropped and counted. The wait is longer, ``pose.max_delay_s``, while the scan is newer
@@ -12,6 +14,7 @@ than all poses: these are on the way.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 from surfel_mapper.config import PoseConfig
 from surfel_mapper.errors import PoseError, PoseNotYetError, PosesLateError
@@ -19,6 +22,7 @@ from surfel_mapper.geometry import Transform
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
+from surfel_mapper.pipeline.stamp_guard import source_of
 from surfel_mapper.scan import Scan
 
 PosedScan = tuple[Scan, Transform]
@@ -68,8 +72,13 @@ class ScanQueue:
         self.is_open = True
 
     def push(self, scan: Scan) -> None:
-        """Add a scan; beyond the limit the oldest is dropped."""
-        self.waiting.append(scan)
+        """Add a scan, before newer ones of its source; beyond the limit the first is dropped."""
+        newer = (
+            row
+            for row, other in enumerate(self.waiting)
+            if other.stamp_ns > scan.stamp_ns and source_of(other) == source_of(scan)
+        )
+        self.waiting.insert(next(newer, len(self.waiting)), scan)
         if len(self.waiting) > self.max_scans:
             reason = f'{self.max_scans} newer scans wait for their poses'
             self._drops.scan(self.waiting.popleft(), 'queue_full', reason)
@@ -78,18 +87,32 @@ class ScanQueue:
         """Drop the scan of a stamp ahead of the next one of its frame, if it still waits."""
         reason = f'its stamp is {(odd_ns - scan.stamp_ns) / 1e9:.3f} s ahead of the next scan'
         for row, other in enumerate(self.waiting):
-            if (other.frame_id, other.stamp_ns) == (scan.frame_id, odd_ns):
+            if (source_of(other), other.stamp_ns) == (source_of(scan), odd_ns):
                 del self.waiting[row]
                 self._drops.scan(other, 'odd_stamp', reason)
                 return
         at = f'scan at {odd_ns / 1e9:.6f} s in frame {scan.frame_id!r}'
         self._drops.warn('odd_stamp', f'{at}: {reason}, but it is mapped')
 
-    def fill_posed(self, number: int, newest_scan_ns: int | None, config: PoseConfig) -> int:
-        """Fill ``posed`` to a number of scans, if their poses are there; return its length."""
+    def fill_posed(
+        self, number: int, newest_of: Callable[[Scan], int | None], config: PoseConfig
+    ) -> int:
+        """
+        Fill ``posed`` to a number of scans, if their poses are there; return its length.
+
+        Parameters
+        ----------
+        number : int
+            Length to fill it to.
+        newest_of : callable
+            Returns the newest stamp of scans that tells how long a scan has waited.
+        config : PoseConfig
+            Longest waits.
+
+        """
         while self.is_open and self.waiting and len(self.posed) < number:
             scan = self.waiting[0]
-            pose_or_reason = self._pose_of(scan, newest_scan_ns, config)
+            pose_or_reason = self._pose_of(scan, newest_of(scan), config)
             if pose_or_reason is None:
                 break
             self.waiting.popleft()

@@ -20,10 +20,13 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files import map_state, parquet, ply
+from surfel_mapper.files.arrays import is_cloud
+from surfel_mapper.files.foreign_points import has_faces
 from surfel_mapper.files.latest_map import DRAWABLE, map_in
 from surfel_mapper.files.parquet_tiles import tiles_in
-from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.files.scan_files import looks_like_points, read_scan
 from surfel_mapper.files.scan_files import SUFFIXES as CLOUDS
+from surfel_mapper.files.text_points import SUFFIXES as TABLES
 from surfel_mapper.files.trajectory import read_trajectory, Trajectory
 from surfel_mapper.files.trajectory import SUFFIXES as TRAJECTORIES
 from surfel_mapper.files.triangles import read_triangles
@@ -109,7 +112,7 @@ def is_shown(path: Path) -> bool:
     if path.is_dir():
         named = any((path / name).is_file() for name in BESIDE)
         return named or map_in(path, DRAWABLE) is not None
-    return path.suffix in (*EXACT, *TRIANGLES, *TRAJECTORIES, *CLOUDS)
+    return path.suffix.lower() in (*EXACT, *TRIANGLES, *TRAJECTORIES, *CLOUDS)
 
 
 def contents(path: Path, name: str = '') -> Iterator[Content]:
@@ -136,20 +139,23 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
         return
     if not path.exists():
         raise FileFormatError(f'{path}: no such file or directory')
-    name = name or path.stem
-    if path.suffix == '.npz':
+    name, suffix = name or path.stem, path.suffix.lower()
+    is_table = suffix in TABLES and looks_like_points(path)
+    if is_table or is_cloud(path) or (suffix == '.obj' and not has_faces(path)):
+        yield cloud(path, name)
+    elif suffix == '.npz':
         moments, empty, scans = map_state.load_moments(path)
         yield ExactMap(name, moments, empty.origin_m, scans)
-    elif path.suffix == '.parquet':
+    elif suffix == '.parquet':
         moments, empty = parquet.read_moments(path)
         yield ExactMap(name, moments, empty.origin_m)
-    elif path.suffix in TRIANGLES:
+    elif suffix in TRIANGLES:
         yield ShownMesh(name, read_triangles(path))
-    elif path.suffix in TRAJECTORIES:
+    elif suffix in TRAJECTORIES:
         yield Way(name, read_trajectory(path))
-    elif path.suffix == '.ply' and (mesh := ply.read_mesh(path)) is not None:
+    elif suffix == '.ply' and (mesh := ply.read_mesh(path)) is not None:
         yield ShownMesh(name, mesh)
-    elif path.suffix in CLOUDS:
+    elif suffix in CLOUDS:
         yield cloud(path, name)
     else:
         raise FileFormatError(

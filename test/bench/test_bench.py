@@ -17,7 +17,6 @@ from test.bench.machine import one_core
 from test.bench.options import Options
 from test.bench.peers import PeerSpec
 from test.bench.peers.run import PeerError, run_odometry
-from test.bench.report import spread, table
 from test.bench.street import Street
 
 SCANS, WINDOW = 3, 4
@@ -53,15 +52,6 @@ def test_the_voxel_grid_is_timed_and_others_beside_it(options, monkeypatch):
         'not measured: no small_gicp here',
         'not measured: no Open3D here',
     ]
-
-
-def test_normals_and_outliers_are_timed_beside_those_of_peers(options, monkeypatch):
-    points = np.random.default_rng(3).uniform(-5.0, 5.0, (500, 3)).astype(np.float32)
-    monkeypatch.setattr(filters, 'run_peer', lambda *_: '{"normals 10": [1.0, 3.0, 2.0]}')
-    rows = list(filters.searches('cube', points, replace(options, peers=True)))
-    names = ['normals 10', 'small_gicp normals 10', 'Open3D normals 10']
-    assert [row['filter'] for row in rows] == [*names, 'normals 30', 'outliers 20']
-    assert rows[1]['x_ours'] == pytest.approx(2.0 / rows[0]['median_ms'])
 
 
 def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_path):
@@ -135,13 +125,3 @@ def test_a_number_of_scans_that_is_not_positive_is_refused(capsys):
         bench.main(['--scans', '0'])
     assert exit_info.value.code == 2
     assert '--scans: 0, expected one or more' in capsys.readouterr().err
-
-
-def test_spread_is_of_the_times_given():
-    figures = spread([float(value) for value in range(101)])
-    assert figures == {'median_ms': 50.0, 'p10_ms': 10.0, 'p99_ms': 99.0, 'slowest_ms': 100.0}
-
-
-def test_a_table_is_aligned_and_leaves_missing_values_empty():
-    rows = [{'who': 'a', 'ms': 0.12345}, {'who': 'bcd', 'less': 'no normals'}]
-    assert table(rows) == 'who     ms  less\na    0.123\nbcd         no normals'

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from surfel_mapper.alignment import LUM
-from test.bench.lum import Case, CASES, chain, loops, ours, pcl, points
+from test.bench.lum import Case, CASES, chain, loops, ours, points
 
 
 def test_graphs_are_connected_and_have_the_edges_they_are_named_for():
@@ -33,8 +33,3 @@ def test_a_case_is_timed_and_aligned():
     for ends in case.ends:
         lum.set_correspondences(*ends, pairs)
     assert max(lum.compute().residuals.values()) < 0.1
-
-
-def test_without_pcl_its_stated_figures_are_marked_so():
-    assert pcl(CASES[0], points(CASES[0]), None)['pcl'] == 'as stated, not measured'
-    assert pcl(CASES[2], points(CASES[2]), None) == {}

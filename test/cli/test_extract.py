@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.cli.main import main
-from surfel_mapper.files import ply
+from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test import extras
@@ -72,9 +72,9 @@ def test_an_empty_cloud_becomes_empty_models(tmp_path, capsys):
     assert found['precision_rms_m'] is None
 
 
-@pytest.mark.parametrize('name', ['room.txt', 'missing.ply', 'missing.npz'])
+@pytest.mark.parametrize('name', ['room.json', 'missing.ply', 'missing.npz'])
 def test_a_file_that_is_no_cloud_is_refused_by_name(tmp_path, capsys, name):
-    if name == 'room.txt':
+    if name == 'room.json':
         (tmp_path / name).write_text('1 2 3\n')
     assert main(['extract', str(tmp_path / name), '--output', str(tmp_path / 'out')]) == 1
     assert name in capsys.readouterr().err
@@ -107,3 +107,35 @@ def test_settings_are_checked_before_anything_is_read(tmp_path, capsys, setting,
 def test_a_file_that_does_not_exist_is_named_so(tmp_path, capsys):
     assert main(['extract', str(tmp_path / 'nothere'), '--output', str(tmp_path)]) == 1
     assert f'{tmp_path / "nothere"}: no such file' in capsys.readouterr().err
+
+
+def plane(tmp_path):
+    rng = np.random.default_rng(1)
+    points = np.column_stack([*rng.uniform(0.0, 0.4, (2, 20_000)), np.ones(20_000)])
+    return points.astype(np.float32)
+
+
+def normals_of(path, output, *options):
+    assert main(['extract', str(path), '-o', str(output), *options]) == 0
+    models = json.loads((output / 'models.json').read_text())
+    return [primitive['normal'][2] for primitive in models['planes']]
+
+
+def test_normals_face_the_viewpoint_of_a_pcd(tmp_path):
+    columns = dict(zip('xyz', plane(tmp_path).T, strict=True))
+    for z, sign in ((0.0, -1.0), (3.0, 1.0)):
+        pcd.write_points(tmp_path / 'a.pcd', columns, (0.0, 0.0, z, 1.0, 0.0, 0.0, 0.0))
+        normals = normals_of(tmp_path / 'a.pcd', tmp_path / f'out_{z}')
+        assert normals
+        np.testing.assert_allclose(normals, sign, atol=1e-3)
+
+
+def test_points_of_every_format_become_models(tmp_path):
+    points = plane(tmp_path)
+    np.savez(tmp_path / 'a.npz', points=points)
+    np.savetxt(tmp_path / 'a.XYZ', points)
+    points.tofile(tmp_path / 'a.bin')
+
+    for name, options in (('a.npz', []), ('a.XYZ', []), ('a.bin', ['--bin-columns', '3'])):
+        normals = normals_of(tmp_path / name, tmp_path / f'out_{name}', *options)
+        np.testing.assert_allclose(normals, -1.0, atol=1e-3)

@@ -29,13 +29,6 @@ from surfel_mapper.cli import _progress, main
 _progress.EVERY_S = 0.02
 sys.exit(main.main())
 """
-ALONE = """
-import sys
-from surfel_mapper.cli import main
-sys.exit(main.main())
-"""
-"""As the installed script; with ``python -m`` an interrupt within an import ends Python (3.11) by
-SIGINT, also if it was caught."""
 
 
 def test_lines_state_progress_rate_and_time_left(monkeypatch, capsys):
@@ -68,18 +61,6 @@ def test_the_first_interrupt_is_reported_and_the_second_interrupts():
             signal.raise_signal(signal.SIGINT)
 
     assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_sigterm_sent_twice_ends_early_and_ctrl_c_then_interrupts():
-    before = signal.getsignal(signal.SIGTERM)
-    with stopped_by_interrupt() as stopped:
-        signal.raise_signal(signal.SIGTERM)
-        signal.raise_signal(signal.SIGTERM)
-        assert stopped()
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-
-    assert signal.getsignal(signal.SIGTERM) is before
 
 
 @pytest.mark.drawn
@@ -139,34 +120,6 @@ def test_sigterm_ends_a_replay_early_and_the_map_is_written(command, tmp_path):
     assert summary['interrupted']
     assert 0 < summary['scans']['mapped'] < MANY
     assert load_map(tmp_path / 'out')[0].digest() == summary['digest']
-
-
-def interrupted_simulation(program, output):
-    """Send SIGTERM to a simulation; return its exit code, stderr, and the hidden directory."""
-    options = ['--scans', '1000000', '--speed', '0', '--columns', '64', '--output', str(output)]
-    command = [*program, 'simulate', 'street', *options]
-    with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
-        until_s = time.monotonic() + WAIT_S
-        while not list(output.parent.rglob('*.mcap')) and time.monotonic() < until_s:
-            time.sleep(0.01)
-        (hidden,) = output.parent.iterdir()
-        process.send_signal(signal.SIGTERM)
-        _, said = process.communicate(timeout=WAIT_S)
-    return process.returncode, said, hidden
-
-
-@pytest.mark.parametrize('with_timeout', [False, True])
-def test_sigterm_of_another_verb_leaves_no_hidden_directory(tmp_path, with_timeout):
-    program = [sys.executable, '-c', ALONE]
-    if with_timeout:
-        program = ['timeout', '--preserve-status', str(WAIT_S), *program]
-
-    code, said, hidden = interrupted_simulation(program, tmp_path / 'street')
-
-    assert code == 130
-    assert said.endswith(b'surfel-mapper simulate: interrupted\n')
-    assert hidden.name.startswith('.')
-    assert list(tmp_path.iterdir()) == []
 
 
 def is_underway(shown):

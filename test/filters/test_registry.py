@@ -45,10 +45,6 @@ def entry_points(monkeypatch, **values):
     monkeypatch.setattr(registry, 'entry_points', found)
 
 
-def test_a_filter_is_found_by_our_name_and_by_theirs():
-    assert find('voxel_grid') is find('VoxelGridDataPointsFilter') is VoxelGrid
-
-
 def test_an_unknown_name_is_refused_with_the_nearest():
     with pytest.raises(ConfigError, match=r'voxelgrid: no such filter, .*did you mean voxel_grid'):
         find('voxelgrid')
@@ -83,18 +79,6 @@ def test_the_package_exports_every_filter():
     exported = {name: getattr(filters, name) for name in filters.__all__}
     built_in = [c for c in all_filters() if c.__module__.startswith('surfel_mapper.filters.')]
     assert [cls.__name__ for cls in built_in if exported.get(cls.__name__) is not cls] == []
-
-
-def test_a_name_that_the_package_has_not_is_an_attribute_error():
-    assert set(filters.__all__) <= set(dir(filters))
-    with pytest.raises(AttributeError, match="no attribute 'Typo'"):
-        _ = filters.Typo
-
-
-def test_an_entry_point_is_found_by_its_name(monkeypatch):
-    entry_points(monkeypatch, every_second=f'{__name__}:OddRows')
-    assert find('every_second') is OddRows
-    assert OddRows in all_filters()
 
 
 def test_a_broken_entry_point_affects_only_chains_that_use_it(monkeypatch, caplog):

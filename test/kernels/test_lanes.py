@@ -7,15 +7,10 @@ import numpy as np
 import pytest
 
 from surfel_mapper.kernels.lanes import (
-    FLOATS,
     FULL,
     highest_match,
     load_sums,
-    num_below,
-    num_used,
-    NUMBERS,
     place_of_half,
-    place_of_least,
     plus_place,
     store_sums,
     sum_unless,
@@ -104,22 +99,8 @@ def test_the_highest_match_is_that_of_python(call, first, upper):
 
 
 @njit
-def count(entries, first):
-    return num_used(entries, first)
-
-
-@njit
 def locate(entries, first, lower):
     return place_of_half(entries, first, lower)
-
-
-@both
-@pytest.mark.parametrize('first', [0, 8, 24])
-def test_used_words_are_counted_whatever_their_bits(call, first):
-    rng = np.random.default_rng(first)
-    for _ in range(100):
-        entries = rng.choice(np.array([0, 0, 1, -1, 1 << 32, -(1 << 63)]), 4 * WORDS)
-        assert call(count, entries, first) == sum(map(bool, entries[first : first + WORDS]))
 
 
 @both
@@ -135,44 +116,3 @@ def test_the_first_word_with_a_lower_half_is_found(call, lower):
         assert place == [*lows[WORDS : 2 * WORDS].tolist(), lower].index(lower)
         found.add(int(place))
     assert found > {0, WORDS}
-
-
-@njit
-def count_below(floats, limit):
-    return num_below(floats, limit)
-
-
-@both
-def test_floats_below_a_limit_are_counted_wherever_they_are(call):
-    rng = np.random.default_rng(5)
-    for _ in range(50):
-        floats = np.full(FLOATS + 8, -1.0, np.float32)  # those past the last are not counted
-        floats[:FLOATS] = rng.choice(np.float32([0.0, 0.5, 1.0, 1e30, np.inf]), FLOATS)
-        for limit in np.float32([0.0, 0.25, 1.0, np.inf]):
-            expected = sum(value < limit for value in floats[:FLOATS].tolist())
-            assert call(count_below, floats, limit) == expected
-    for place in range(FLOATS):
-        floats = np.ones(FLOATS, np.float32)
-        floats[place] = 0.0
-        assert call(count_below, floats, np.float32(1.0)) == 1
-
-
-@njit
-def least_of(numbers, passed):
-    return place_of_least(numbers, passed)
-
-
-@both
-def test_the_least_number_not_passed_over_is_found_wherever_it_is(call):
-    rng = np.random.default_rng(6)
-    for _ in range(200):
-        numbers = np.zeros(NUMBERS + 8)  # those past the last do not count
-        numbers[:NUMBERS] = rng.choice([0.0, 1e-300, 0.25, 0.5, 7.0, 1e300, np.inf], NUMBERS)
-        passed = int(rng.integers(0, 2**NUMBERS - 1))
-        left = [i for i in range(NUMBERS) if not passed >> i & 1]
-        expected = min(left, key=lambda i: numbers[i])
-        assert call(least_of, numbers, np.uint64(passed)) == expected
-    for place in range(NUMBERS):
-        only = np.uint64(2**NUMBERS - 1 - 2**place)
-        assert call(least_of, np.full(NUMBERS, np.inf), only) == place
-    assert call(least_of, np.zeros(NUMBERS), np.uint64(2**NUMBERS - 1)) == NUMBERS - 1

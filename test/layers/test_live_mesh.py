@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.layers.distance_field import live_mesh
-from surfel_mapper.layers.distance_field.live_mesh import LiveMesh, WholeMesh
+from surfel_mapper.layers.distance_field.live_mesh import LiveMesh
 from surfel_mapper.layers.layer import Moment
 from surfel_mapper.tsdf.blocks import BlockMap, VISIBLE_VOXELS
 from surfel_mapper.tsdf.integrator import Integrator
@@ -78,26 +77,3 @@ def test_vertices_of_the_live_mesh_are_those_of_the_exact_one_within_its_toleran
     assert off_m[known].max() <= VISIBLE_VOXELS * VOXEL_M + 1e-5
     moved = [not np.array_equal(shown[edge], exact[edge]) for edge in exact]
     assert 0.0 < np.mean(moved) < 0.9
-
-
-def test_mesh_copied_in_steps_between_scans_is_that_of_the_last_state(integrator, monkeypatch):
-    monkeypatch.setattr(live_mesh, 'PORTION', 40)
-    whole, exact = WholeMesh(integrator.blocks), Mesher(integrator.blocks)
-    steps = 0
-    for image, stamp_ns in scans(6):
-        integrator.integrate(image, np.eye(4), stamp_ns)
-        for _ in range(3):  # a scan comes between the steps
-            steps += not whole.prepare()
-        if stamp_ns == 2 * 10**8:
-            integrator.blocks.remove(integrator.blocks.rows()[::7])
-        if stamp_ns == 4 * 10**8:
-            list(whole.messages(Moment(stamp_ns=stamp_ns, frame_id='map')))
-    list(whole.messages(Moment(frame_id='map')))  # that of the steps since, and the rest
-    list(whole.messages(Moment(frame_id='map')))  # blocks that changed after their step
-    exact.update()
-    shown, expected = (vertices_by_edge(mesher) for mesher in (whole._mesher, exact))
-    assert steps > 5
-    assert shown.keys() == expected.keys()
-    assert len(expected) > 2000
-    off = np.array([np.abs(shown[edge] - place).max() for edge, place in expected.items()])
-    assert np.median(off) <= VISIBLE_VOXELS * VOXEL_M

@@ -16,7 +16,6 @@ import pytest
 
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.mapping.moments import pack_keys, unpack_keys
 from surfel_mapper.mapping.reducer import Reducer
 from test.reference import as_twin, scan_moments
 
@@ -95,16 +94,6 @@ def test_the_order_of_points_does_not_matter():
     assert as_twin(reducer.reduce(points[np.lexsort(points.T)])) == expected
 
 
-def test_a_reducer_used_before_gives_what_a_new_one_gives():
-    rng = np.random.default_rng(2)
-    reducer = Reducer(0.5)
-    for num, spread_m in [(20_000, 40.0), (10, 1.0), (9000, 900.0), (0, 1.0), (500, 400.0)]:
-        points = rng.uniform(-spread_m, spread_m, (num, 3))
-        moments, expected = reducer.reduce(points), Reducer(0.5).reduce(points)
-        assert as_twin(moments) == as_twin(expected)
-        assert moments.num_points == num
-
-
 def test_moments_do_not_change_when_the_reducer_goes_on():
     rng = np.random.default_rng(3)
     reducer, points = Reducer(0.5), rng.uniform(-5.0, 5.0, (1000, 3))
@@ -112,15 +101,6 @@ def test_moments_do_not_change_when_the_reducer_goes_on():
     before = as_twin(moments)
     reducer.reduce(rng.uniform(-5.0, 5.0, (1000, 3)))
     assert as_twin(moments) == before
-
-
-@pytest.mark.parametrize('columns', [4, 8])
-def test_a_slice_of_wider_rows_is_as_good_as_an_array_of_its_own(columns):
-    wide = np.random.default_rng(5).uniform(-5.0, 5.0, (400, columns)).astype(np.float32)
-    points = wide[:, 1:4]
-    for same in (points, np.asfortranarray(points), points[:].copy(), points[::-1][::-1]):
-        same.setflags(write=False)
-        assert as_twin(Reducer(0.5).reduce(same)) == scan_moments(points, 0.5)
 
 
 @pytest.mark.parametrize('dtype', [np.int16, np.int64, np.uint8, np.float16, '>f4', '>f8'])
@@ -284,12 +264,3 @@ def test_an_invalid_pose_or_origin_is_refused():
     for origin in ([0.0, 1.0], [0.0, math.nan, 0.0], [[0.0, 0.0, 0.0]]):
         with pytest.raises(ValueError, match='origin'):
             reducer.reduce(points, origin=origin)
-
-
-@given(st.lists(st.tuples(*[st.integers(-(2**20), 2**20 - 1)] * 3), max_size=20))
-def test_packed_keys_sort_as_voxel_indices_and_unpack_again(indices):
-    index = np.array(indices, np.int64).reshape(-1, 3)
-    keys = pack_keys(index)
-    assert unpack_keys(keys).tolist() == index.tolist()
-    assert (keys >= 0).all()
-    assert [tuple(row) for row in unpack_keys(np.sort(keys)).tolist()] == sorted(indices)

@@ -187,23 +187,6 @@ def test_equal_points_have_no_normal(point, count):
         np.testing.assert_array_equal(surfel.mean(), points[0])
 
 
-@given(POINT.filter(np.any), POINTS, st.integers(2, 9))
-def test_a_line_and_a_repeated_point_are_known_after_others_were_removed(direction, others, count):
-    line = np.arange(count)[:, None] * direction / 3
-    surfel = Surfel.from_points(line)
-    surfel.add(others)
-    surfel.remove(others)
-    assert surfel.eigenvalues()[:2].tolist() == [0.0, 0.0]
-    assert surfel.planarity() == 0.0
-
-    surfel = Surfel.from_points(np.tile(direction / 3, (count, 1)))
-    for other in others:
-        surfel.add(other)
-    for other in others:
-        surfel.remove(other)
-    assert np.isnan(surfel.normal()).all()
-
-
 @pytest.mark.parametrize('scale', [1e99, 1e50, 1e-50, 1e-150])
 def test_very_large_and_very_small_shapes_are_shapes(scale):
     surfel = Surfel.from_points(grid([[2, 2, 1], [-2, 1, 2]]) * scale / 20)

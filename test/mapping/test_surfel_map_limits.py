@@ -3,10 +3,6 @@
 """SurfelMap: its limits; refused calls change nothing."""
 
 import math
-import os
-from pathlib import Path
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -127,61 +123,3 @@ def test_a_coarser_map_holds_a_quarter_of_that_with_each_level():
     assert_unchanged_by(
         surfel_map, MapLimitError, 'at most 134217728', surfel_map.merge, surfel_map
     )
-
-
-NO_MEMORY = """
-import resource
-import sys
-import numpy as np
-from surfel_mapper.errors import MapLimitError
-from surfel_mapper.mapping.surfel_map import SurfelMap
-
-rng, columns = np.random.default_rng(1), tuple(sys.argv[1:])
-surfel_map, alone = SurfelMap(0.5, columns=columns), SurfelMap(0.5, columns=columns)
-
-def reduced(num_points, reach_m):
-    points = rng.uniform(-reach_m, reach_m, (num_points, 3))
-    colors = rng.uniform(1.0, 255.0, (num_points, 3))
-    return surfel_map.reduce(points, columns={'intensity': colors[:, 0], 'rgb': colors})
-
-moments = reduced(100, 1.0)
-surfel_map.insert(moments)
-surfel_map.remove(moments)  # compiles
-few, many = reduced(1000, 5.0), reduced(400_000, 400.0)
-surfel_map.insert(few)
-alone.insert(many)  # compiles the growing
-before, num_points = surfel_map.digest(), surfel_map.num_points
-for left in (0, 5_000_000, 24_000_000):
-    used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + left, resource.RLIM_INFINITY))
-    try:
-        surfel_map.insert(many)
-    except (MapLimitError, MemoryError) as error:
-        print(type(error).__name__, error)
-    else:
-        print('not refused')
-    resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    print(surfel_map.digest() == before and surfel_map.num_points == num_points)
-surfel_map.insert(many)
-surfel_map.remove(few)
-print(surfel_map.digest() == alone.digest())
-"""
-
-
-@pytest.mark.parametrize('columns', [(), ('intensity', 'rgb')], ids=['plain', 'columns'])
-@pytest.mark.skipif(sys.platform != 'linux', reason='reads /proc')
-def test_a_map_that_gets_no_memory_says_so_and_is_unchanged(columns):
-    done = subprocess.run(
-        [sys.executable, '-c', NO_MEMORY, *columns],
-        cwd=Path(__file__).parents[2],
-        env=os.environ | {'MALLOC_MMAP_THRESHOLD_': '65536'},  # not from memory once freed
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
-    assert lines[1::2] == ['True', 'True', 'True']
-    assert all(line.startswith(('MapLimitError ', 'MemoryError ')) for line in lines[:4:2])
-    assert lines[4].startswith('MapLimitError no memory for a map of ')
-    assert lines[6] == 'True'

@@ -192,17 +192,3 @@ def test_a_window_of_ten_scans_is_the_same_after_100_000_cycles_at_10_km():
 
     assert surfel_map.digest() == before
     assert in_order(surfel_map.surfels()) == in_order(surfels)
-
-
-def test_points_added_and_removed_5000_times_at_10_km_change_nothing():
-    scans = scans_at_10_km(12)
-    surfel_map, expected = SurfelMap(0.2), SurfelMap(0.2)
-    live = [surfel_map.add(points, origin) for points, origin in scans]
-    for cycle in range(5000):
-        points, origin = scans[cycle % 12]
-        added = surfel_map.add(points[::-1], origin)
-        surfel_map.remove(live[cycle % 12])  # the earlier one: they are the same
-        live[cycle % 12] = added
-    for points, origin in scans:
-        expected.add(points, origin)
-    assert surfel_map.digest() == expected.digest()

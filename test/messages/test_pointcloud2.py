@@ -133,25 +133,6 @@ def test_a_layout_of_a_sensor_decodes(name, big):
     assert_decodes(replace(message(*LAYOUTS[name], width=7), is_bigendian=big))
 
 
-@pytest.mark.parametrize('width', [1, 2, 15, 16, 17, 100])
-@pytest.mark.parametrize('name', ['padded to 16', 'behind a word, 16 bytes', '32 bytes'])
-def test_any_number_of_points_of_whole_words_decodes(name, width):
-    msg = message(*LAYOUTS[name], width=width)
-    assert_decodes(replace(msg, data=bytes(msg.data)))
-    shifted = np.empty(len(msg.data) + 1, np.uint8)[1:]  # words of the message between words
-    shifted[:] = msg.data
-    assert_decodes(replace(msg, data=shifted))
-
-
-@pytest.mark.parametrize(
-    'kind', [bytes, bytearray, memoryview, lambda b: array.array('B', b), lambda b: b]
-)
-def test_data_may_be_any_buffer_of_bytes(kind):
-    msg = message(*LAYOUTS['22 bytes'])
-    data = kind(msg.data if kind is memoryview else msg.data.tobytes())
-    assert_decodes(replace(msg, data=data))
-
-
 def test_columns_are_read_only_views_into_the_message_and_points_are_not():
     msg = message(*LAYOUTS['48 bytes'])
     scan = to_scan(msg)

@@ -10,15 +10,10 @@ import numpy as np
 import pytest
 
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.kernels.grouping import build_table
-from surfel_mapper.mapping.kernels.queries import mark_seen
-from surfel_mapper.mapping.moments import point_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.messages.kernels.attach import attach_surfels
 from surfel_mapper.messages.pointcloud2 import Field, to_scan
 from surfel_mapper.messages.scan_normals import ADDED, scan_with_normals
 from surfel_mapper.scan import Scan
-from test.kernels.modes import both
 
 POSE = pose_matrix([100.0, -3.0, 2.0], [0.0, 0.28, 0.0, 0.96])
 MIN_POINTS = 4
@@ -140,18 +135,6 @@ def test_appended_fields_differ_from_those_that_have_their_prefix_already():
     ]
 
 
-def test_points_that_were_not_inserted_get_surfels_too():
-    message = cloud()
-    scan = to_scan(message)
-    surfel_map = mapped(scan.select(np.arange(0, len(scan), 2)))
-    found = to_scan(as_message(scan_with_normals(scan, POSE, surfel_map, 1), message))
-    there = np.isfinite(scan.points).all(axis=1)
-    keys = point_keys(scan.points, POSE, 0.5)
-    known = np.isin(keys, surfel_map.moments().key) & there
-    np.testing.assert_array_equal(found.columns['num_points'] > 0, known)
-    assert known[1::2].mean() > 0.5
-
-
 def test_an_empty_map_gives_nan():
     message = cloud()
     scan = to_scan(message)
@@ -171,34 +154,3 @@ def test_a_scan_without_a_message_becomes_a_cloud():
     np.testing.assert_array_equal(found.columns['score'], points[:, 0])
     for name, values in zip(ADDED, expected_of(scan, surfel_map).T, strict=True):
         np.testing.assert_allclose(found.columns[name], values, atol=1e-6)
-
-
-def table_of(keys):
-    table = np.empty(16, np.int32)
-    build_table(keys, table)
-    return table
-
-
-@both
-def test_the_kernel_agrees_with_a_loop_over_points(call):
-    points = np.array([[0.1, 0.2, 0.3], [1.1, 0.2, 0.3], [np.nan, 0, 0], [0.9, 0.9, 0.9]])
-    keys = point_keys(points[:1], np.eye(4), 1.0)
-    values = (np.array([[0.0, 0.6, 0.8]]), np.array([0.25]), np.array([7]))
-    quantisation = (np.eye(4)[:3].copy(), 65536.0, np.array([0.0, np.inf]))
-    added = np.empty((4, 5), np.float32)
-    counts = added.view(np.uint32)
-    xyz = np.asfortranarray(points).T
-    call(attach_surfels, xyz, quantisation, values, keys, table_of(keys), added, counts)
-    assert counts[:, 4].tolist() == [7, 0, 0, 7]
-    np.testing.assert_allclose(added[[0, 3], :4], [[0, 0.6, 0.8, 0.25]] * 2)
-    assert np.isnan(added[1:3, :4]).all()
-
-
-@both
-def test_the_first_mark_stays_and_is_not_computed_again(call):
-    keys, seen = np.array([5, 9, 2]), np.array([9, 2, 77])
-    marks, left = np.array([-1, 40, -1]), np.empty(3, np.int64)
-    limit = np.uint64(2**64 - 1)
-    assert call(mark_seen, seen, limit, keys, table_of(keys), marks, 30, left) == (1, 2)
-    assert marks.tolist() == [-1, 40, 30]
-    assert left[:2].tolist() == [2, 77]

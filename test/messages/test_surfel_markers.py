@@ -21,7 +21,6 @@ from surfel_mapper.messages.surfel_markers import (
     mesh_marker,
     normal_colors,
     SEGMENTS,
-    shade,
     shades,
     surfel_markers,
 )
@@ -185,17 +184,6 @@ def test_colours_of_vertices_are_those_of_the_corners():
 def test_without_colours_faces_upwards_are_brighter_than_faces_downwards():
     up, _, down, none = marker_of().colors.reshape(4, 3, 4)[:, 0, 0]
     assert 0.3 <= down < none < up <= 1.0
-
-
-def test_shading_equals_that_of_arrays():
-    rng = np.random.default_rng(2)
-    vertices = rng.uniform(-1e3, 1e3, (300, 3))
-    triangles = rng.integers(0, 300, (500, 3)).astype(np.int32)
-    mesh = Mesh(vertices=vertices, triangles=triangles, colors=NO_COLORS)
-    marker = mesh_marker(mesh, number=0, stamp_ns=0, frame_id='')
-    np.testing.assert_array_equal(marker.points, vertices[triangles].reshape(-1, 3))
-    grey = shade(vertices[triangles])
-    assert np.allclose(marker.colors[:, :3], np.repeat(grey, 3)[:, None], atol=1e-6)
 
 
 def test_an_empty_mesh_deletes_the_marker():

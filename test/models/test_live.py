@@ -355,16 +355,6 @@ def test_a_ramp_over_itself_is_cut(radius_m, middle_m):
             assert heights.max() - heights.min() < 0.9  # the next turn is 1.57 m higher
 
 
-def test_sparse_voxels_join_the_plane_that_they_lie_on():
-    rng = np.random.default_rng(1)
-    few = np.array([[1.26, 0.5, 0.002], [1.3, 0.55, 0.0]]) + 1e-3
-    _, models = of_points(np.concatenate([cells((0, 1.2), (0, 1.2)), few]))
-    assert id_at(models, few[0]) == models.model.planes[0].id
-    above = few + rng.uniform(0.04, 0.05)
-    _, models = of_points(np.concatenate([cells((0, 1.2), (0, 1.2)), above]))
-    assert id_at(models, above[0]) == -1
-
-
 def test_planes_grow_over_gaps_to_the_sparse_voxels_on_them():
     rng = np.random.default_rng(3)
     near, beyond = cells((0, 2.4), (0, 2.4)), cells((6.0, 7.2), (0, 2.4))
@@ -389,33 +379,6 @@ def test_small_curved_charts_are_patches_if_they_have_many_points(radius_m, spac
     _, models = of_points(points)
     assert len(models.model.patches) == patches
     assert len(models.model.gaussians) == 9 * (1 - patches)
-
-
-def test_models_across_blocks_equal_a_batch():
-    rng = np.random.default_rng(4)
-    settings = ModelsLayerConfig(min_points=4, noise_m=0.005)
-    half_m = VOXEL_M * 2 ** (BLOCK_BITS - 1)
-    floor = cells((half_m - 3.0, half_m + 3.0), (half_m - 1.0, half_m + 1.0), spacing=0.03)
-    floor[:, 2] += 3e-3 * rng.standard_normal(len(floor))
-    wall = cells((half_m - 3.0, half_m - 1.0), (0.1, 1.5), spacing=0.03)[:, [0, 2, 1]]
-    wall[:, 1] += half_m
-    points, held = np.concatenate([floor, wall]), []
-    surfel_map = SurfelMap(VOXEL_M)
-    models = LiveModels(settings, surfel_map)
-    for _ in range(8):
-        near = np.abs(points - points[rng.integers(len(points))]).max(axis=1) < 1.0
-        held.append(surfel_map.add(points[near | (rng.random(len(points)) < 0.1)], origin=VIEW))
-        if len(held) > 4:
-            surfel_map.remove(held.pop(0))
-        models.update()
-        assert groups(models) == groups(live(surfel_map.copy(), settings))
-    surfel_map.add(points, origin=VIEW)
-    models.update()
-    assert len(models.model.planes) == 2
-    counts = np.unique(
-        models.model.labels[models.surfels.position[:, 2] < 0.05], return_counts=True
-    )
-    assert counts[1].max() > 0.95 * counts[1].sum()
 
 
 def test_planes_hold_the_exact_moments_of_their_points():

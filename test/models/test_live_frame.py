@@ -15,8 +15,7 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.config import ModelsConfig, ModelsLayerConfig
-from surfel_mapper.models import fit
+from surfel_mapper.config import ModelsLayerConfig
 from test.models.live_scenes import groups, of_points
 from test.models.scenes import BALL, CYLINDER, room, VIEW
 
@@ -125,23 +124,3 @@ def test_map_of_one_scan_equals_the_twin_on_its_points(frame):
     assert kinds.count('patch') >= 6
     assert kinds.count('gaussian') > 50
     assert groups(models) == expected
-
-
-def test_large_planes_equal_the_single_cloud_fit():
-    points, _ = room(320, 240)
-    cloud = points.astype(np.float64)
-    _, models = of_points(cloud, VIEW, ModelsLayerConfig(), VOXEL_M)
-    single = fit(cloud, ModelsConfig(voxel_size_m=0.03), VIEW)
-    large = [plane for plane in single.planes if plane.grid.area_m2(2) > 0.3]
-    assert len(large) == 6
-    for plane in large:
-        twins = [
-            other
-            for other in models.model.planes
-            if other.normal @ plane.normal > 0.999
-            and abs(other.to_local(plane.mean[None])[0, 2]) < 5e-3
-            and other.grid.contains(other.to_local(plane.mean[None])[:, :2]).all()
-        ]
-        assert len(twins) == 1
-        if plane.grid.area_m2(2) > 1.0:
-            assert twins[0].grid.area_m2(4) == pytest.approx(plane.grid.area_m2(4), rel=0.15)

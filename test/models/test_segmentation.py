@@ -135,17 +135,6 @@ def gap_of(clusters, i, j):
     return gap(delta, np.linalg.norm(delta), value[i], frame[i], value[j], frame[j])
 
 
-def test_box_gap_is_symmetric_and_rejects_no_touching_pair():
-    points, _ = room(160, 120)
-    clusters, _ = clustered(points, VIEW)
-    for i, j in pairs(clusters):
-        found = gap_of(clusters, i, j)
-        assert found == pytest.approx(gap_of(clusters, j, i), abs=1e-12)
-        if found >= 5.0 * A:
-            one, other = (clusters.points[slice(*clusters.rows[k])] for k in (i, j))
-            assert cdist(one, other).min() >= 3.0 * A
-
-
 def test_merged_regions_equal_components_of_the_full_graph():
     points, _ = room(160, 120)
     clusters, config = clustered(points, VIEW, fold_angle_deg=89.0)
@@ -189,9 +178,6 @@ def test_two_sheets_that_meet_at_an_angle_are_two_planes(angle_deg):
     assert between == pytest.approx(angle_deg, abs=2.0)
 
 
-SIZE = 0.02
-
-
 def cloud(reach, dtype):
     """Return points near and far with repeated ones in a row, and some that are not finite."""
     rng = np.random.default_rng(2)
@@ -200,21 +186,3 @@ def cloud(reach, dtype):
     points[::97] = np.nan
     points[5], points[6, 1] = np.inf, -np.inf
     return points
-
-
-@pytest.mark.parametrize('dtype', [np.float32, np.float64])
-@pytest.mark.parametrize('reach', [1.0, 1e4])  # with 1e4 m keys have 60 bits
-def test_voxel_means_equal_numpy_sums_in_point_order(reach, dtype):
-    points = cloud(reach, dtype)
-    thinned = thin(points, SIZE)
-    finite = np.isfinite(points).all(axis=1)
-    index = np.floor(points[finite].astype(np.float64) / SIZE)
-    voxels, which = np.unique(index[:, ::-1], axis=0, return_inverse=True)
-    which = which.ravel()
-    counts = np.bincount(which)
-    expected = np.zeros((len(voxels), 3))
-    np.add.at(expected, which, points[finite])
-    np.testing.assert_array_equal(thinned.means, expected / counts[:, None])
-    labels = thinned.point_labels(np.arange(len(voxels), dtype=np.int32))
-    np.testing.assert_array_equal(labels[finite], which)
-    assert (labels[~finite] == -1).all()

@@ -101,16 +101,6 @@ def test_shapes_are_recomputed_for_new_versions_only():
     ]
 
 
-def test_shapes_can_be_computed_in_portions():
-    model = fit(room(160, 120)[0], ModelsConfig(voxel_size_m=A), VIEW)
-    shapes, versions = Shapes(), {patch.id: 1 for patch in model.patches}
-    steps = [shapes.make(model, versions, 2) for _ in range(-(-len(model.patches) // 2))]
-    assert steps == [False] * (len(steps) - 1) + [True]
-    found = shapes.of(model, versions)
-    assert [shape.patch.id for shape in found] == [patch.id for patch in model.patches]
-    assert all(a is b for a, b in zip(found, shapes.of(model, versions), strict=True))
-
-
 def gaussians(*covariances):
     number = len(covariances)
     return Gaussians(

@@ -9,6 +9,7 @@ import numpy as np
 from surfel_mapper.files import pcd
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.offline.datasets import EARTH_M, HELIPR_OUSTER, NCLT_POINT
+from test import extras
 
 US, NS = 1_700_000_000_000_000, 1_700_000_000_000_000_000
 POINTS = np.random.default_rng(1).uniform(-5.0, 5.0, (50, 3)).astype(np.float32)
@@ -128,5 +129,28 @@ def boreas(root):
     return root, 'Boreas', [(US + i) * 1000 for i in range(3)]
 
 
-WITH_POSES = (kitti_odometry, kitti_raw, nuscenes, helipr)
+def argoverse2(root):
+    arrow = extras.load('pyarrow')
+    extras.load('pyarrow.feather')
+    half = {axis: values.astype('f2') for axis, values in zip('xyz', POINTS.T, strict=True)}
+    folder = root / 'sensors' / 'lidar'
+    folder.mkdir(parents=True)
+    for i in range(3):
+        table = arrow.table({**half, 'offset_ns': np.arange(50, dtype='i4')})
+        arrow.feather.write_feather(table, str(folder / f'{NS + i}.feather'))
+    poses = np.array(lidar_poses())
+    turns = 0.05 * np.arange(3.0)
+    columns = {
+        'timestamp_ns': NS + np.arange(3),
+        'qw': np.cos(turns),
+        'qx': np.zeros(3),
+        'qy': np.zeros(3),
+        'qz': np.sin(turns),
+        **{f't{axis}_m': poses[:, at, 3] for at, axis in enumerate('xyz')},
+    }
+    arrow.feather.write_feather(arrow.table(columns), str(root / 'city_SE3_egovehicle.feather'))
+    return root, 'Argoverse 2', [NS, NS + 1, NS + 2]
+
+
+WITH_POSES = (kitti_odometry, kitti_raw, nuscenes, helipr, argoverse2)
 ALL = (*WITH_POSES, mulran, newer_college, nclt, boreas)

@@ -131,3 +131,19 @@ def test_an_offset_that_is_no_number_of_seconds_is_wrong_usage(tmp_path, capsys,
     with pytest.raises(SystemExit, match='2'):
         main(['replay', str(tmp_path), '--time-offset', option])
     assert 'expected seconds, or TOPIC=SECONDS' in capsys.readouterr().err
+
+
+def test_the_trajectory_is_written_in_the_order_of_time(tmp_path):
+    entries = drive()
+    clouds = [row for row in entries if row[1] == CLOUD]
+    swapped = [row for row in entries if row[1] != CLOUD]
+    for (*head, record_ns, _), (*_, message) in zip(
+        clouds, [*clouds[1::2], *clouds[::2]], strict=True
+    ):
+        swapped.append((*head, record_ns, message))
+    bag = write_rosbag2(tmp_path / 'bag', sorted(swapped, key=lambda row: row[2]))
+    _, right = replayed(tmp_path, write_rosbag2(tmp_path / 'right', entries))
+    expected = (tmp_path / 'out' / 'trajectory.tum').read_text()
+    code, summary = replayed(tmp_path, bag)
+    assert (code, summary['digest']) == (0, right['digest'])
+    assert (tmp_path / 'out' / 'trajectory.tum').read_text() == expected

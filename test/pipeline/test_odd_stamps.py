@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps far from all others: one message alone changes nothing, two in a row set time."""
+"""Stamps far from all others change nothing, unless scans and poses agree or one is alone."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_scan_with_a_stamp_ahead_is_found_among_others_that_wait():
 
 
 def test_time_is_set_back_after_two_scans_ahead_and_to_before_the_last_two():
-    for stamps_s in ([100.0, 105.0, 105.1, 100.1, 100.2], [100.0, 105.0, 99.0, 99.1]):
+    for stamps_s in ([100.0, 105.0, 105.1, 98.1, 100.2], [100.0, 105.0, 99.5, 100.1]):
         mapper = mapper_with(pose__source='identity')
         insert(mapper, *map(scan_at, stamps_s))
         assert mapper.counters.resets == 1
@@ -190,7 +190,7 @@ def test_a_lidar_is_mapped_after_many_frames_that_came_once():
     assert len(updates) == 5
     assert mapper.counters.dropped == {}
     insert(mapper, scan_at(102.3))
-    assert mapper.counters.dropped == {'stamp_back': 1}  # its order is kept
+    assert mapper.counters.dropped == {'stamp_repeated': 1}  # its stamps are kept
 
 
 def test_two_odd_messages_that_do_not_agree_are_both_dropped():
@@ -214,5 +214,78 @@ def test_a_scan_far_before_the_last_of_its_frame_is_judged_by_those_before_that(
     *_, set_back, after = orders(100.0, 105.0, 99.0, 99.1)
     assert (set_back.odd_ns, set_back.back_s, set_back.cause) == (None, 6.0, '')
     assert after == Order()
-    *_, late, repeated = orders(100.0, 100.2, 100.1, 100.2)
-    assert (late.cause, repeated.cause) == ('stamp_back', 'stamp_repeated')
+    *_, late, repeated = orders(100.0, 100.2, 100.1, 100.0)
+    assert (late.cause, repeated.cause) == ('', 'stamp_repeated')
+
+
+def test_a_late_scan_is_dropped_if_its_pose_comes_from_registration():
+    guard = StampGuard(1.0, TransformBuffer())
+    orders = [guard.order(scan_at(stamp_s), takes_late=False) for stamp_s in (100.0, 100.2, 100.1)]
+    assert [order.cause for order in orders] == ['', '', 'stamp_back']
+
+
+def drive_of_two(offsets_s, *, rear_hz=20, pose_hz=50, start_s=1.7e9):
+    """Drive for 3 s with a front lidar at 10 Hz and rear ones by other clocks."""
+    mapper = mapper_with()
+    events = [(k / pose_hz, 'pose') for k in range(-5, 3 * pose_hz + 5)]
+    events += [(0.001 + k / 10, '') for k in range(30)]
+    for number, offset_s in enumerate(offsets_s):
+        events += [(0.002 + k / rear_hz, (number, offset_s)) for k in range(3 * rear_hz)]
+    for time_s, kind in sorted(events, key=lambda event: event[0]):
+        if kind == 'pose':
+            add_pose(mapper, start_s + time_s, x=time_s)
+        elif kind:
+            number, offset_s = kind
+            mapper.add_scan(scan_at(start_s + time_s + offset_s, f'rear{number}'), f'/b{number}')
+        else:
+            mapper.add_scan(scan_at(start_s + time_s), '/a')
+        list(mapper.insert_ready())
+    mapper.end_scans()
+    list(mapper.insert_ready())
+    mapper.finish()
+    assert_counts_add_up(mapper)
+    return mapper
+
+
+@pytest.mark.parametrize('offset_s', [-1.7e9 + 614.0, -3600.0, -37.0, 37.0, 3600.0, 3e8])
+@pytest.mark.parametrize('rear_hz', [5, 20])
+def test_a_sensor_with_another_clock_leaves_the_map_of_the_first(offset_s, rear_hz, caplog):
+    mapper = drive_of_two([offset_s], rear_hz=rear_hz)
+    assert mapper.counters.resets == 0
+    assert mapper.counters.mapped == 30
+    assert mapper.map.digest() == drive_of_two([]).map.digest()
+    assert 'on /b0 at' in caplog.text
+
+
+def test_two_sensors_with_one_other_clock_do_not_outvote_the_poses():
+    mapper = drive_of_two([-1.7e9 + 614.0, -1.7e9 + 614.0])
+    assert mapper.counters.resets == 0
+    assert mapper.map.digest() == drive_of_two([]).map.digest()
+
+
+@pytest.mark.parametrize('source', ['tf', 'identity'])
+def test_a_lidar_that_counts_from_1970_for_a_second_costs_that_second(source):
+    mapper, expected = mapper_with(pose__source=source), mapper_with(pose__source=source)
+    for k in range(60):
+        stamp_s = 1.7e9 + 0.1 * k
+        is_reset = 20 <= k < 30
+        for each in (mapper, expected):
+            if source == 'tf':
+                add_pose(each, stamp_s, x=0.1 * k)
+        insert(mapper, scan_at(0.1 * (k - 20) if is_reset else stamp_s))
+        if not is_reset:
+            insert(expected, scan_at(stamp_s))
+    assert mapper.counters.dropped == {'odd_stamp': 10}
+    assert mapper.counters.resets == 0
+    assert mapper.counters.mapped == 50
+    assert mapper.map.digest() == expected.map.digest()
+
+
+def test_poses_that_begin_by_another_clock_than_the_scans_are_used():
+    mapper = mapper_with()
+    insert(mapper, scan_at(614.0), scan_at(614.1))
+    for k in range(20):
+        add_pose(mapper, 1.7e9 + 0.02 * k)
+        insert(mapper, scan_at(614.2 + 0.02 * k))
+    assert mapper.counters.messages_ignored == {}
+    assert mapper.transforms.newest_ns == round((1.7e9 + 0.38) * 1e9)

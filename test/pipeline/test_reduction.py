@@ -10,19 +10,14 @@ comes between two scans.
 from __future__ import annotations
 
 from pathlib import Path
-import threading
 
 import numpy as np
 import pytest
 
 from surfel_mapper.config import Config
-from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.pipeline.look_ahead import LookAhead
-from surfel_mapper.pipeline.prepared import FilteredScan
 from surfel_mapper.pipeline.regions import Ball
-from surfel_mapper.scan import LazyPoints, Scan
-from surfel_mapper.threads import share
+from surfel_mapper.scan import Scan
 
 S = 10**9
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -120,28 +115,6 @@ def test_every_update_is_that_of_one_thread(threads, way, settings_of):
     found += several.insert_ready()
     same(found, expected)
     assert without_times(several) == without_times(one)
-
-
-@pytest.mark.parametrize(('threads', 'is_here'), [(1, True), (2, False)])
-def test_points_are_decoded_by_the_thread_that_reduces_them(threads, is_here):
-    mapper, decoded_by = mapper_with(threads), []
-
-    def decode():
-        decoded_by.append(threading.get_ident())
-        return np.random.default_rng(0).uniform(-3.0, 3.0, (100, 3))
-
-    for number in range(3):
-        mapper.add_pose('odom', 'base_link', number * S, (0.0, 0.0, 0.0), LEVEL)
-        points = LazyPoints(100, decode)
-        mapper.add_scan(Scan(points=points, stamp_ns=number * S, frame_id='lidar'))
-    late = Scan(points=LazyPoints(100, decode), stamp_ns=3 * S, frame_id='lidar')
-    mapper.add_scan(late)  # without a pose it is dropped
-    assert len(list(mapper.insert_ready())) == 3
-    mapper.finish()
-
-    assert mapper.counters.dropped['no_pose'] == 1
-    assert [thread == threading.get_ident() for thread in decoded_by[1:]] == [is_here] * 2
-    assert len(decoded_by) == 3
 
 
 def test_scans_that_wait_together_are_mapped_together():
@@ -253,45 +226,3 @@ def test_no_scan_waits_if_scans_depend_on_the_ones_before(settings):
     mapper = mapper_with(2, **settings)
     add(mapper, 1)
     assert len(list(mapper.insert_ready(more_follows=True))) == 1
-
-
-def test_work_that_was_begun_is_used_for_the_same_scan_at_the_same_pose_only():
-    look_ahead, config = LookAhead(SurfelMap(0.5), 2), Config()
-    points = np.random.default_rng(1).uniform(-3.0, 3.0, (50, 3))
-    scan = Scan(points=points, stamp_ns=1, frame_id='lidar')
-    moved = np.eye(4)
-    moved[0, 3] = 0.25
-
-    def begin():
-        look_ahead.begin(scan, np.eye(4), config, lambda scan, _: lambda: FilteredScan(scan, scan))
-
-    begin()
-    assert look_ahead.take(scan, moved, config) is None
-    begin()
-    assert look_ahead.take(scan, np.eye(4), config.replace({'map.min_points': 2})) is None
-    begin()
-    found = look_ahead.take(scan, np.eye(4), config)().windowed.moments
-    expected = SurfelMap(0.5).reduce(points, np.eye(4), origin=np.zeros(3), min_range_m=0.1)
-    np.testing.assert_array_equal(found.key, expected.key)
-    np.testing.assert_array_equal(found.total, expected.total)
-    assert look_ahead.take(scan, np.eye(4), config) is None
-
-
-@pytest.mark.parametrize('threads', [1, 2, 3])
-@pytest.mark.parametrize('num_rows', [0, 1, 5, 1000])
-def test_shared_work_is_done_on_every_row_once(threads, num_rows):
-    done = np.zeros(num_rows, int)
-
-    def count(part):
-        done[part] += 1
-
-    share(count, num_rows, threads)
-    assert (done == 1).all()
-
-
-def test_an_error_in_shared_work_is_raised_to_the_caller():
-    def fail(part):
-        raise ValueError('row')
-
-    with pytest.raises(ValueError, match='row'):
-        share(fail, 100, 2)

@@ -244,7 +244,7 @@ def test_time_that_goes_back_starts_anew():
     mapper = mapper_with()
     feed(mapper, [scan_at(number) for number in range(20, 24)])
 
-    update, _ = feed(mapper, [scan_at(3), scan_at(4)])
+    update, *_ = feed(mapper, [scan_at(number) for number in range(3, 16)])
 
     assert mapper.counters.resets == 1
     np.testing.assert_array_equal(update.T_map_sensor, np.eye(4))

@@ -123,12 +123,12 @@ def test_at_the_end_of_the_input_scans_behind_a_gap_of_the_poses_are_mapped():
 # Time
 
 
-def test_stamps_that_repeat_or_go_back_a_little_are_dropped():
+def test_stamps_that_go_back_a_little_are_mapped_and_those_that_repeat_dropped():
     mapper = mapper_with(pose__source='identity', input__reset_after_s=1.0)
-    scans = [scan_at(stamp_s) for stamp_s in (5.0, 5.0, 4.9, 4.0, 5.1, 5.05)]
-    updates = insert(mapper, *scans)
-    assert [update.stamp_ns for update in updates] == [5 * S, 51 * S // 10]
-    assert dropped(mapper) == {'stamp_repeated': 1, 'stamp_back': 3}
+    stamps_s = [5.0, 5.0, 4.9, 4.0, 5.1, 4.9, 5.05]
+    updates = insert(mapper, *map(scan_at, stamps_s))
+    assert [update.stamp_ns / S for update in updates] == [5.0, 4.9, 4.0, 5.1, 5.05]
+    assert dropped(mapper) == {'stamp_repeated': 2}
     assert mapper.counters.resets == 0
     assert_counts_add_up(mapper)
 
@@ -137,8 +137,37 @@ def test_stamps_of_several_sensors_are_in_order_each_for_itself():
     mapper = mapper_with(pose__source='identity')
     scans = [(5.0, 'a'), (4.8, 'b'), (4.9, 'b'), (5.0, 'b'), (5.1, 'a'), (4.95, 'b')]
     updates = insert(mapper, *[scan_at(*scan) for scan in scans])
-    assert len(updates) == 5
-    assert dropped(mapper) == {'stamp_back': 1}
+    assert len(updates) == 6
+    assert dropped(mapper) == {}
+
+
+def test_scans_that_wait_are_sorted_by_their_stamps():
+    mapper, expected = mapper_with(window__max_scans=3), mapper_with(window__max_scans=3)
+    insert(mapper, *(scan_at(stamp_s) for stamp_s in (5.0, 5.2, 5.3, 5.1, 5.4)))
+    for each in (mapper, expected):
+        add_pose(each, 4.9, x=1.0)
+        add_pose(each, 5.45, x=2.0)
+    updates = list(mapper.insert_ready())
+    assert [update.stamp_ns / S for update in updates] == [5.0, 5.1, 5.2, 5.3, 5.4]
+    insert(expected, *(scan_at(stamp_s) for stamp_s in (5.0, 5.1, 5.2, 5.3, 5.4)))
+    assert mapper.map.digest() == expected.map.digest()
+
+
+def test_topics_with_one_frame_and_equal_stamps_are_both_mapped():
+    mapper = mapper_with(pose__source='identity')
+    for stamp_s in (5.0, 5.1):
+        for topic in ('/points', '/points2', '/points2'):
+            mapper.add_scan(scan_at(stamp_s), topic)
+    assert len(list(mapper.insert_ready())) == 4
+    assert dropped(mapper) == {'stamp_repeated': 2}
+
+
+def test_an_offset_of_the_clock_is_added_to_the_stamps_of_scans():
+    mapper = mapper_with(input__time_offset_s=-37.0)
+    add_pose(mapper, 4.0, x=0.0)
+    add_pose(mapper, 4.4, x=4.0)
+    (update,) = insert(mapper, scan_at(41.1))
+    assert (update.stamp_ns, update.T_map_sensor[0, 3]) == (4_100_000_000, pytest.approx(1.0))
 
 
 def test_a_stamp_that_goes_back_far_clears_the_map_and_says_so(caplog):
@@ -162,15 +191,15 @@ def test_a_stamp_that_goes_back_far_clears_the_map_and_says_so(caplog):
 
 def test_scans_that_wait_when_time_is_set_back_are_counted_as_cleared():
     mapper = mapper_with(pose__max_wait_s=100.0)
-    insert(mapper, scan_at(50.0), scan_at(51.0), scan_at(1.0), scan_at(1.1))
+    insert(mapper, *map(scan_at, (50.0, 51.0, 1.0, 2.0, 3.0)))
     assert dropped(mapper) == {'cleared': 2}
-    assert_counts_add_up(mapper, waiting=2)
+    assert_counts_add_up(mapper, waiting=3)
 
 
 @pytest.mark.parametrize('more_follows', [False, True])
 def test_scans_with_their_poses_are_mapped_before_time_is_set_back(more_follows):
     mapper = mapper_with(pose__source='identity', map__threads=2, map__min_points=1)
-    stamps_s = [100.0, 100.1, 100.2, 100.3, 1.0, 1.1, 1.2]
+    stamps_s = [100.0, 100.1, 100.2, 100.3, 1.0, 2.0, 3.0]
     updates = []
     for stamp_s in stamps_s:
         mapper.add_scan(scan_at(stamp_s))

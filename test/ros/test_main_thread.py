@@ -41,29 +41,6 @@ def test_only_the_first_signal_interrupts(number):
         signals.check()
 
 
-class Freed:
-    def __del__(self):
-        send(signal.SIGINT)
-
-
-def act_and_wait(action):
-    action()
-    threading.Event().wait(TIMEOUT_S)
-    raise TimeoutError('no signal came')
-
-
-def test_a_signal_in_a_destructor_interrupts_after_it():
-    with Signals(), pytest.raises(KeyboardInterrupt):
-        act_and_wait(Freed)
-
-
-def test_handlers_are_restored_without_a_signal():
-    before = {number: signal.getsignal(number) for number in HANDLED}
-    with Signals() as signals:
-        signals.check()
-    assert {number: signal.getsignal(number) for number in HANDLED} == before
-
-
 def nothing():
     return None
 

@@ -114,17 +114,6 @@ def test_a_full_queue_drops_and_counts_the_oldest_clouds(bench):
     assert bench.mapper.counters.dropped_by_frame == {'lidar': {'overload': 3}}
 
 
-def test_a_full_queue_drops_and_counts_the_oldest_poses(bench):
-    bench.hold()
-    pose = StampedPose('odom', 'base_link', START_NS, (0.0, 0.0, 0.0), UNTURNED)
-    later = [pose._replace(stamp_ns=START_NS + i) for i in range(1, MAX_POSES)]
-    bench.thread.put_poses([pose, pose, *later])
-    bench.release()
-    bench.thread.stop()
-
-    assert bench.mapper.counters.messages_ignored == {'overload': 1}
-
-
 def static_pose(child, x=0.0):
     return StampedPose('base_link', child, START_NS, (x, 0.0, 0.0), UNTURNED)
 

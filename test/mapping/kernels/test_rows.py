@@ -7,13 +7,12 @@ import pytest
 
 from surfel_mapper.kernels.layout import HALF, MAX_MAP_COUNT, ROW, VIEW_SCALE
 from surfel_mapper.mapping.kernels.rows import (
-    add_to_row,
     read_counts,
     read_rows,
     write_rows,
 )
 from test.kernels.modes import both
-from test.mapping.kernels.packed_rows import slab_of, unpacked
+from test.mapping.kernels.packed_rows import slab_of
 
 LARGEST = MAX_MAP_COUNT * HALF
 SEEN = MAX_MAP_COUNT * VIEW_SCALE
@@ -57,29 +56,3 @@ def test_moments_written_to_rows_are_read_again(call, moments):
     counts = np.full(len(moments) + 1, -9)
     call(read_counts, rows, np.append(order, np.int32(-1)), counts)
     assert counts.tolist() == [*expected[1][::-1].tolist(), 0]
-
-
-@both
-def test_sums_are_added_to_a_row_and_subtracted_again(call):
-    rng = np.random.default_rng(3)
-    rows = slab_of([5], [[3, 1, -2, 3, *range(6), -7, 8, -9]])
-    before, expected = rows.copy(), unpacked(rows[0])
-    added = []
-    for step in random_moments(200) // 256:  # their sums stay within the limits
-        n, total, view = int(step[0]), tuple(step[1:4].tolist()), tuple(step[10:].tolist())
-        call(add_to_row, rows.ravel(), np.uint64(0), n, total, view)
-        added.append((n, total, view))
-        for column, value in zip([0, 1, 2, 3, 10, 11, 12], [n, *total, *view], strict=True):
-            expected[column] += value
-        assert unpacked(rows[0]) == expected
-    for place in rng.permutation(len(added)):
-        n, total, view = added[place]
-        call(
-            add_to_row,
-            rows.ravel(),
-            np.uint64(0),
-            -n,
-            tuple(-t for t in total),
-            tuple(-v for v in view),
-        )
-    np.testing.assert_array_equal(rows, before)

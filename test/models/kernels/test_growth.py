@@ -18,10 +18,6 @@ from surfel_mapper.models.growth import free_surfels
 from surfel_mapper.models.kernels.growth import (
     find_facets,
 )
-from surfel_mapper.models.kernels.voxel_points import (
-    find_core,
-    owner_means,
-)
 from surfel_mapper.models.thinning import thin
 from test.kernels.modes import both
 
@@ -64,41 +60,6 @@ def test_neighbours_equal_brute_force(extent):
     for i in range(len(index)):
         near = np.abs(index - index[i]).max(axis=1) == 1
         assert sorted(rows[first[i] : first[i + 1]].tolist()) == np.flatnonzero(near).tolist()
-
-
-@both
-def test_means_by_voxel_and_owner_equal_numpy(call):
-    points, _ = corner()
-    _, voxels = by_voxel(points)
-    owner = np.random.default_rng(4).integers(-3, 4, len(points)).astype(np.int32)
-    owners, means = np.empty(len(points), np.int32), np.empty((len(points), 3))
-    counts, first = np.empty(len(points)), np.empty(len(voxels.starts), np.int64)
-    table = owners, means, counts, first
-    num = call(owner_means, voxels.points, voxels.starts, owner, *table)
-    which = np.repeat(np.arange(len(voxels.starts) - 1), np.diff(voxels.starts))
-    pairs = np.stack([which, owner], axis=1)
-    unique = np.unique(pairs, axis=0)
-    assert num == len(unique)
-    expected = {
-        (int(k), *np.round(voxels.points[(pairs == (v, k)).all(axis=1)].mean(axis=0), 9))
-        for v, k in unique
-    }
-    assert {(int(k), *np.round(m, 9)) for k, m in zip(owners[:num], means, strict=False)} == (
-        expected
-    )
-    assert counts[:num].sum() == len(points)
-    assert first[-1] == num
-
-
-@both
-def test_sparse_voxels_are_no_core(call):
-    dense = np.random.default_rng(5).uniform(0.0, 0.1, (200, 3))
-    row = [[x, 0.05, 0.05] for x in (0.15, 0.25, 0.35, 0.45, 0.95)]
-    _, voxels = by_voxel(np.concatenate([dense, row]))
-    core = np.empty(6, bool)
-    call(find_core, voxels.starts, voxels.adjacent, 0.1, 8, core)
-    # within three voxels of the dense one; the others have nothing denser near
-    assert core.tolist() == [True, False, False, False, True, True]
 
 
 @pytest.mark.parametrize(('radius', 'outliers'), [(0.6, 0), (1e3, 0), (1e3, 900)])

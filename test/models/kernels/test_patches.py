@@ -6,34 +6,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.distance import cdist
 
-from surfel_mapper.models.kernels.region_merging import touch
 from surfel_mapper.models.patches import (
     bend_height,
     described,
     PatchPoints,
-    weighted_fit,
 )
-from test.kernels.modes import both
 
 
 def bowl(radius_m, half_m=0.5, number=4000):
     """Return points on a paraboloid whose radius of curvature at its vertex is given."""
     xy = np.random.default_rng(1).uniform(-half_m, half_m, (number, 2))
     return np.column_stack([xy, 0.5 / radius_m * (xy**2).sum(axis=1)])
-
-
-def test_quadric_equals_weighted_least_squares():
-    rng = np.random.default_rng(2)
-    cells = np.column_stack([rng.normal(size=(50, 3)), rng.uniform(0.5, 2.0, 50)])
-    x, y, z, weight = cells.T
-    basis = np.stack([np.ones(50), x, y, x * x, x * y, y * y], axis=1)
-    for terms in (3, 6):
-        found = weighted_fit(basis[:, :terms], z, weight)
-        root = np.sqrt(weight)[:, None]
-        expected = np.linalg.lstsq(root * basis[:, :terms], root[:, 0] * z, rcond=None)[0]
-        np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_bend_of_a_paraboloid_is_its_rise_and_that_of_a_plane_is_zero():
@@ -59,15 +43,3 @@ def test_kind_and_moments_of_patches():
         np.testing.assert_allclose(covariances[k], np.cov(own.T), atol=1e-12)
         np.testing.assert_allclose(frames[k] @ frames[k].T, np.eye(3), atol=1e-9)
         assert frames[k, 2, 2] > 0.999
-
-
-@both
-@pytest.mark.parametrize('seed', range(8))
-def test_touch_equals_the_least_of_all_distances(call, seed):
-    rng = np.random.default_rng(seed)
-    one, other = rng.uniform(0.0, 1.0, (2, 40, 3)) + np.array([[[0.0]], [[0.9]]])
-    points = np.concatenate([one, other])
-    boxes = [np.stack([part.min(axis=0), part.max(axis=0)]) for part in (one, other)]
-    for near in (0.05, 0.2, 0.4, 0.8):
-        found = call(touch, points, np.array([0, 40]), np.array([40, 80]), *boxes, near)
-        assert found == (cdist(one, other).min() < near)

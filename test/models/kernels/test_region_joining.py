@@ -23,8 +23,6 @@ from surfel_mapper.models.kernels.region_joining import (
     join_layers,
     join_pair,
     join_smooth,
-    REACH,
-    rows_near,
 )
 from surfel_mapper.models.thinning import thin
 from test.kernels.modes import both, interpreted
@@ -93,24 +91,6 @@ def test_layers_of_a_noisy_wall_join_the_largest(call):
     call(join_layers, order, given.means, given.weights, given.starts, regions)
     assert regions.root.tolist() == [1, 1, 1]
     np.testing.assert_array_equal(regions.patch_normal[0], regions.patch_normal[1])
-
-
-@both
-def test_rows_near_a_small_region_are_all_within_reach(call):
-    given = pieces(*scene(0.005))
-    regions = single_regions(given, VIEW, (0.005, 0.0), SIZE_M)
-    call(join_pair, 7, 6, regions)  # two tiles of the floor, far from the wall
-    call(join_pair, 8, 6, regions)
-    regions.extent[9] = 0.3
-    state = given.means, given.weights, given.starts, chunk_boxes(given.means), 0.0
-    rows = np.empty(len(given.means), np.int64)
-    found = rows[: call(rows_near, 6, 9, state, regions, rows)]
-    floor = np.arange(given.starts[6], given.starts[9])
-    away = np.linalg.norm(given.means[floor] - regions.mean[9], axis=1)
-    near = floor[away < REACH * 0.3]
-    assert 0 < len(near) < 0.5 * len(floor)
-    assert sorted(found.tolist()) == near.tolist()
-    assert call(rows_near, 9, 9, state, regions, rows) == given.starts[10] - given.starts[9]
 
 
 @both

@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Points as text: a row each, columns separated by spaces, tabs, commas or semicolons.
+
+Names come from a header (CSV, ASC of CloudCompare), else from what columns look like: XYZ, XYZRGB,
+XYZN, and PTS, which begins with the number of its points.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from surfel_mapper.budget import open_regular
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.point_columns import Columns, named_columns
+
+ALWAYS = ('.xyz', '.xyzrgb', '.xyzn', '.pts', '.asc')
+"""Endings of points; files of other content end in .txt and .csv too."""
+
+SUFFIXES = (*ALWAYS, '.txt', '.csv')
+
+HEAD_BYTES, HEAD_LINES = 16384, 40
+"""Beginning of a file in which the first row of numbers has to be."""
+
+UNNAMED = (3, 4, 6, 7)
+"""Numbers of columns of points without a header; others are poses, times or calibrations."""
+
+MARKS = ('#', '//', '%')
+
+QUATERNION = re.compile(r'(q|orientation|rotation)[_.]?\w*[wxyz]\b|q[wxyz]')
+"""Names in a header of poses."""
+
+
+class TextLayout(NamedTuple):
+    """The separator (None: spaces), the number of lines before the first row, and the names."""
+
+    separator: str | None
+    skipped: int
+    width: int
+    names: list[str]
+
+    @property
+    def is_points(self) -> bool:
+        """Whether the rows have coordinates, and are no poses."""
+        if self.names:
+            return {*'xyz'} <= {*self.names} and not any(map(QUATERNION.match, self.names))
+        return self.width in UNNAMED
+
+
+def text_layout(path: Path) -> TextLayout | None:
+    """Return the layout of a text; None if it has no row of three numbers at its beginning."""
+    with open_regular(path) as file:
+        head = file.read(HEAD_BYTES).decode('utf-8-sig', 'replace')
+    names: list[str] = []
+    for number, line in enumerate(head.splitlines()[:HEAD_LINES]):
+        separator = next((mark for mark in ',;' if mark in line), None)
+        words = [word.strip() for word in line.split(separator)]
+        if line.lstrip().startswith(MARKS) or not all(map(is_number, words)):
+            title = line.strip().lstrip('#/% ').split(separator)
+            names = [word.strip(' "').lower() for word in title]
+        elif len(words) >= 3:
+            has_names = len(names) == len(words)
+            return TextLayout(separator, number, len(words), names if has_names else [])
+    return None
+
+
+def is_number(word: str) -> bool:
+    """Return whether a word is a number; the last column of a row may be empty."""
+    try:
+        return word == '' or bool(float(word) or True)
+    except ValueError:
+        return False
+
+
+def read_points(path: str | Path) -> Columns:
+    """
+    Return the columns of a text, float64.
+
+    Raises
+    ------
+    FileFormatError
+        If it cannot be read, has no row of three numbers, rows of several lengths, or poses.
+
+    """
+    try:
+        layout = text_layout(Path(path))
+        if layout is None or not layout.is_points:
+            seen = '' if layout is None else f'{layout.width} columns {", ".join(layout.names)}'
+            raise FileFormatError(
+                f'{path}: {seen or "no row of numbers"}, expected a header with x, y, z, or '
+                'rows x y z, x y z intensity, x y z r g b, or x y z intensity r g b'
+            )
+        with open_regular(path) as file:
+            table = np.loadtxt(
+                file,
+                delimiter=layout.separator,
+                skiprows=layout.skipped,
+                comments=MARKS,
+                ndmin=2,
+                usecols=range(layout.width),
+                encoding='utf-8-sig',
+            )
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    except (ValueError, MemoryError) as error:
+        raise FileFormatError(f'{path}: {error}') from error
+    if layout.names:
+        return dict(zip(layout.names, np.ascontiguousarray(table.T), strict=True))
+    columns = named_columns(table)
+    if Path(path).suffix.lower() == '.pts' and 'column_3' in columns:  # Leica's are negative
+        columns['intensity'] = columns.pop('column_3')
+    return columns
