@@ -46,9 +46,6 @@ MAX_LIDARS = 64
 MAX_CAMERAS = 8
 """Cameras whose tables of rays are kept, 5 MB each at 640 x 480."""
 
-NO_DEPTH_MM = 65535
-"""Value of pixels without depth in images of mm of some cameras."""
-
 
 @dataclass(slots=True)
 class FrameModel:
@@ -331,8 +328,7 @@ def range_image(
             scan, sensor.max_range_m, has_color=has_color, has_label=has_label
         )
         return from_points(sensor, points, **channels)
-    unknown = NO_DEPTH_MM if depth.depth.dtype.kind == 'u' else None
-    return from_depth(sensor, depth.depth, unknown=unknown).with_images(
+    return from_depth(sensor, depth.depth).with_images(
         color=depth.color if has_color else None, label=depth.label if has_label else None
     )
 

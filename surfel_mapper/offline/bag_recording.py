@@ -42,6 +42,7 @@ from surfel_mapper.offline.pose_sources import (
     static_transforms,
 )
 from surfel_mapper.offline.request import part, Request, Span, WHOLE
+from surfel_mapper.offline.survey import depth_topics
 
 if TYPE_CHECKING:  # they load the compiler, which `info` does not need
     from surfel_mapper.offline.image_feeds import Decode, DepthFeed, SceneFeed
@@ -80,6 +81,7 @@ class BagRecording:
     ) -> None:
         self.reader = reader
         self.cuts = reader.cuts
+        config = with_depth(reader, request, config)
         self.topics = chosen_topics(reader, request, config)
         check_mounts(request, self.topics, config)
         offsets_ns = {
@@ -190,6 +192,29 @@ class BagRecording:
         for topic in sorted(self.poses.unstamped):
             _log.warning('%s: header.stamp is 0, not set: the record times are used', topic)
         return feed(self.reader, mapper, self.topics, self.poses, span=self.span, stopped=stopped)
+
+
+def with_depth(reader: BagReader, request: Request, config: Config) -> Config:
+    """
+    Return the settings of depth images for a bag that has them and no clouds.
+
+    Raises
+    ------
+    BagError
+        If there are several topics of them and none is named.
+
+    """
+    topics = depth_topics(reader) if config.input.kind == 'cloud' else []
+    if not topics:
+        return config
+    if request.topics or request.mounts or config.input.topics:
+        return config.replace({'input.kind': 'depth'})
+    if len(topics) > 1:
+        raise BagError(
+            f'{reader.path}: several topics of depth images, name one with --topic: '
+            f'{", ".join(topics)}'
+        )
+    return config.replace({'input.kind': 'depth', 'input.topics': topics})
 
 
 def chosen_topics(reader: BagReader, request: Request, config: Config) -> list[str]:

@@ -19,7 +19,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.offline.pose_sources import DEFAULTS, source_topics, TYPES
-from surfel_mapper.offline.survey import mounting, Offer, offers, Survey, survey
+from surfel_mapper.offline.survey import depth_topics, mounting, Offer, offers, Survey, survey
 from surfel_mapper.poses import AUTO, choose_source, has_chain, PoseCandidate, without_chain
 from surfel_mapper.sensors.time_fields import time_fields
 
@@ -99,7 +99,7 @@ def choose_for_bag(
     asked = config.replace({'pose.source': wanted or AUTO})
     has_poses = any(reader.topics.of_type(*types) for types in TYPES.values())
     is_framed = config.frames != DEFAULT.frames or request.mounts or request.pose_topic
-    if has_poses and not is_depth and not is_framed:
+    if has_poses and not is_framed and (not is_depth or depth_topics(reader)):
         return choose_by_sample(reader, topics, wanted, asked, sample())
     if wanted is not None:
         return PoseChoice(asked)

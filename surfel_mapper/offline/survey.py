@@ -18,7 +18,7 @@ import math
 from typing import Any
 
 from surfel_mapper.bags.reader import BagMessage, BagReader
-from surfel_mapper.bags.topics import Topic, Topics
+from surfel_mapper.bags.topics import IMAGE, PACKED_IMAGE, Topic, Topics
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.geometry import pose_matrix, q_xyzw
@@ -29,6 +29,8 @@ from surfel_mapper.poses import TransformBuffer
 
 SOURCES = {type_: source for source, types in TYPES.items() for type_ in types}
 """The pose.source that reads each type."""
+
+IMAGES = (IMAGE, PACKED_IMAGE)
 
 ALL_TIME_S = 1e9
 """Buffer length of a survey, s: it holds every transform of a bag."""
@@ -186,8 +188,33 @@ def survey(
 
 
 def surveyed_topics(reader: BagReader) -> list[str]:
-    """Return the topics of clouds and poses."""
-    return reader.topics.of_type(*reader.topics.clouds, *SOURCES)
+    """Return the topics of clouds, or of depth images without any, and of poses."""
+    return [*reader.topics.of_type(*reader.topics.clouds, *SOURCES), *depth_topics(reader)]
+
+
+def depth_topics(reader: BagReader) -> list[str]:
+    """Return the topics of depth images of a bag without clouds, the unpacked ones if any."""
+    if reader.topics.of_type(*reader.topics.clouds):
+        return []
+    for type_ in IMAGES:
+        names = [name for name in reader.topics.of_type(type_) if is_depth(reader, name)]
+        if names:
+            return names
+    return []
+
+
+def is_depth(reader: BagReader, topic: str) -> bool:
+    """Return whether the first image of a topic is one of depth; infrared may be mono16 too."""
+    try:
+        message = next(iter(reader.messages([topic])), None)
+        image = None if message is None else reader.decode(message)
+    except (BagError, CloudFormatError):
+        return False
+    encoding = str(getattr(image, 'encoding', getattr(image, 'format', '')))
+    is_named = 'depth' in topic.lower()
+    return encoding.startswith(('16UC1', '32FC1')) or (
+        is_named and ('compressedDepth' in encoding or encoding == 'mono16')
+    )
 
 
 def note_message(
@@ -198,7 +225,7 @@ def note_message(
     offset_ns: int = 0,
 ) -> list[str]:
     """Add a message to a survey and return the frames that it names."""
-    if message.type in reader.topics.clouds:
+    if message.type in (*reader.topics.clouds, *IMAGES):
         decoded = reader.decode(message)
         frame = frame_name(decoded.header.frame_id)
         stamp = (stamp_ns(decoded.header) or message.record_ns) + offset_ns

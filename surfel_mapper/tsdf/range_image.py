@@ -30,6 +30,10 @@ CLEARING_M = 2e3
 """A clearing pixel holds max_range_m plus this, which is more than any truncation."""
 
 
+NO_DEPTH_MM = 65535.0
+"""Value of pixels without depth in images of mm of some cameras."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RangeImage:
     """
@@ -150,12 +154,7 @@ class RangeImage:
         return repeated(image) if self.sensor.wraps else np.ascontiguousarray(image)
 
 
-def from_depth(
-    sensor: CameraModel,
-    depth: npt.NDArray[Any],
-    *,
-    unknown: float | None = None,
-) -> RangeImage:
+def from_depth(sensor: CameraModel, depth: npt.NDArray[Any]) -> RangeImage:
     """
     Return the range image of a depth image.
 
@@ -165,9 +164,7 @@ def from_depth(
         Model of the camera.
     depth : (rows, columns) float32, float64 or uint16
         Depth along z. Floats are in m; 0, negative and nan mean unknown, inf free up to
-        max_range_m. uint16 is in mm; 0 means unknown.
-    unknown : float, optional
-        A further value that means unknown: 65535 with some cameras.
+        max_range_m. uint16 is in mm; 0 and 65535, which Kinects write, mean unknown.
 
     Raises
     ------
@@ -186,7 +183,7 @@ def from_depth(
     scale = 1e-3 if native_type == np.uint16 else 1.0
     image = np.empty((sensor.rows, sensor.columns), np.float32)
     native = np.ascontiguousarray(depth, native_type)
-    absent = np.nan if unknown is None else float(unknown)
+    absent = NO_DEPTH_MM if native_type == np.uint16 else np.nan
     largest, used = kernels.from_depth(
         native, np.float32(scale), absent, sensor.ray_length, limits(sensor), image
     )

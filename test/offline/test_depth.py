@@ -150,3 +150,56 @@ def test_the_topics_of_the_configuration_are_those_of_the_bag(tmp_path):
     mapper, recording = replayed(write_rosbag2(tmp_path / 'bag', entries), settings)
     assert recording.topics == ['/front/points', '/rear/points']
     assert mapper.counters.mapped == 2
+
+
+def depth_bag(path, *, moves=True, second=''):
+    """Write four depth images of a moving camera, each with an image of colours."""
+    entries = Entries()
+    camera_info(entries, START_NS - 10)
+    for number in range(4):
+        image(entries, number)
+        stamp_ns = START_NS + number * PERIOD_NS
+        colour = entries.make(
+            IMAGE,
+            header=entries.header(stamp_ns, 'optical'),
+            height=1,
+            width=1,
+            encoding='rgb8',
+            is_bigendian=0,
+            step=3,
+            data=np.zeros(3, np.uint8),
+        )
+        entries.append(('/camera/color/image', IMAGE, stamp_ns + 1, colour))
+        if second:
+            entries.append((second, IMAGE, stamp_ns + 2, entries[-2][3]))
+        if moves:
+            entries.transform('/tf', stamp_ns, 'world', 'optical', (0.1 * number, 0.0, 0.0))
+    return write_rosbag2(path, entries)
+
+
+def test_a_bag_of_depth_images_alone_needs_no_settings(tmp_path):
+    mapper, recording = replayed(depth_bag(tmp_path / 'bag'), {'map.min_points': 1})
+
+    assert recording.topics == [TOPIC]
+    assert recording.config.pose.source == 'tf'
+    assert recording.config.frames.fixed == 'world'
+    assert mapper.counters.mapped == 4
+    settings = {**SETTINGS, 'pose.source': 'tf', 'frames.fixed': 'world', 'input.topics': [TOPIC]}
+    expected, _ = replayed(tmp_path / 'bag', settings)
+    assert mapper.map.digest() == expected.map.digest()
+
+
+def test_a_bag_of_depth_images_without_poses_is_registered(tmp_path):
+    _, recording = replayed(depth_bag(tmp_path / 'bag', moves=False), {})
+
+    assert recording.config.input.kind == 'depth'
+    assert recording.config.pose.source == 'registration'
+
+
+def test_one_of_several_topics_of_depth_images_has_to_be_named(tmp_path):
+    bag = depth_bag(tmp_path / 'bag', second='/other/depth/image')
+
+    with pytest.raises(BagError, match=f'name one with --topic: {TOPIC}, /other/depth/image'):
+        replayed(bag, {})
+    _, recording = replayed(bag, {}, topics=(TOPIC,))
+    assert recording.topics == [TOPIC]

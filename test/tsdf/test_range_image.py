@@ -103,6 +103,14 @@ def test_depths_become_ranges_and_say_what_they_know():
     assert image.range_m[59, 0] == pytest.approx(expected, rel=1e-6)
 
 
+def test_65535_mm_is_no_depth_and_no_free_space():
+    depth = np.full((60, 80), 2000, np.uint16)
+    depth[0, :2] = [65535, 0]
+    image = from_depth(SMALL, depth)
+    assert image.range_m[0, :2].tolist() == [0.0, 0.0]
+    assert image.num_used == 60 * 80 - 2
+
+
 @pytest.mark.parametrize(
     ('make', 'message'),
     [

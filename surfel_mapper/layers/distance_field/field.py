@@ -131,7 +131,7 @@ class DistanceField:
         Parameters
         ----------
         depth : (rows, columns) float32, float64 in m, or uint16 in mm
-            Depth along z; 0 and nan mean unknown, inf free up to max_range_m.
+            Depth along z; 0, nan and 65535 mm mean unknown, inf free up to max_range_m.
         camera : CameraModel
             Model of the camera, z ahead.
         T_map_camera : (4, 4) float64
