@@ -11,6 +11,7 @@ from here.
 
 from __future__ import annotations
 
+from functools import partial
 from importlib import import_module
 from typing import Any, TYPE_CHECKING
 
@@ -83,12 +84,14 @@ def __getattr__(name: str) -> Any:
     return value
 
 
-def _map_formats() -> Any:
-    """Load the file formats of maps, for SurfelMap.save and SurfelMap.load."""
-    return import_module(f'{__name__}.files.maps')
+_FORMATS = {'files': 'files.maps', 'messages': 'messages.map_cloud'}
+"""The modules that save maps and read messages; see map_formats."""
 
 
-import_module(f'{__name__}.map_formats').register(_map_formats)
+for _kind, _module in _FORMATS.items():
+    import_module(f'{__name__}.map_formats').register(
+        _kind, partial(import_module, f'{__name__}.{_module}')
+    )
 
 
 def __dir__() -> list[str]:

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Registration of the file formats that SurfelMap.save and SurfelMap.load use.
+Registration of the file formats of SurfelMap.save and load, and of the messages of Surfels.
 
-Formats are on a higher level than the map, which does not import them. The package registers
-them.
+Files and messages are on a higher level than the map, which does not import them. The package
+registers their modules.
 """
 
 from __future__ import annotations
@@ -12,14 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-_loaders: list[Callable[[], Any]] = []
+_loaders: dict[str, Callable[[], Any]] = {}
 
 
-def register(load: Callable[[], Any]) -> None:
-    """Register a function that loads the module of the formats when a map is saved or loaded."""
-    _loaders[:] = [load]
+def register(kind: str, load: Callable[[], Any]) -> None:
+    """Register the function that loads the module of ``files`` or ``messages`` when needed."""
+    _loaders[kind] = load
 
 
-def registered() -> Any:
-    """Return the module that is registered: load_surfel_map(path), save_surfel_map(path, map)."""
-    return _loaders[0]()
+def registered(kind: str) -> Any:
+    """
+    Return a module that is registered.
+
+    ``files`` has load_surfel_map(path) and save_surfel_map(path, map), ``messages`` has
+    surfels_in(msg).
+    """
+    return _loaders[kind]()

@@ -366,7 +366,7 @@ class SurfelMap(MomentMap):
             If the file cannot be read, is damaged or not exact.
 
         """
-        found: SurfelMap = map_formats.registered().load_surfel_map(as_path(path))
+        found: SurfelMap = map_formats.registered('files').load_surfel_map(as_path(path))
         return found
 
     def save(self, path: str | Path) -> str:
@@ -385,7 +385,7 @@ class SurfelMap(MomentMap):
             If the suffix is another, or the file cannot be written.
 
         """
-        digest: str = map_formats.registered().save_surfel_map(as_path(path), self)
+        digest: str = map_formats.registered('files').save_surfel_map(as_path(path), self)
         return digest
 
     def __reduce__(self) -> Any:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper import map_formats
 from surfel_mapper.arguments import as_array, made_array
 from surfel_mapper.errors import DependencyError
 from surfel_mapper.mapping.kernels.surfels import derive_surfels
@@ -72,6 +73,32 @@ class Surfels:
     num_points: npt.NDArray[np.int64]
     voxel_index: npt.NDArray[np.int32]
     channels: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
+
+    @classmethod
+    def from_message(cls, msg: Any) -> Surfels:
+        """
+        Return the surfels of a message of a node, of its topics ~/normals or ~/changed.
+
+        Parameters
+        ----------
+        msg : sensor_msgs/PointCloud2
+            From rclpy or rosbags, or any object with these attributes. Rows without points, which
+            ~/changed has with ``publish.moments``, are left out.
+
+        Returns
+        -------
+        Surfels
+            float32 values as float64. The message has no eigenvalues: they are nan. Without
+            ``publish.moments`` it has no ``voxel_index`` either, which is -2^31 then.
+
+        Raises
+        ------
+        CloudFormatError
+            If it is no PointCloud2, or lacks a field of ~/normals.
+
+        """
+        surfels: Surfels = map_formats.registered('messages').surfels_in(msg)
+        return surfels
 
     def __len__(self) -> int:
         """Return the number of surfels."""

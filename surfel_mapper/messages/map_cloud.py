@@ -16,6 +16,7 @@ full map: it starts a copy, and repairs one that has missed a change. Both carry
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from itertools import dropwhile
 from typing import Any
 
@@ -43,6 +44,11 @@ TOTAL = ('sum_x', 'sum_y', 'sum_z')
 PRODUCT = ('sum_xx', 'sum_xy', 'sum_xz', 'sum_yy', 'sum_yz', 'sum_zz')
 
 VIEW = ('view_x', 'view_y', 'view_z')
+
+NORMAL = ('normal_x', 'normal_y', 'normal_z')
+
+FIELDS = ('x', 'y', 'z', *NORMAL, 'curvature', 'planarity', 'num_points')
+"""Fields that each message of surfels has."""
 
 Columns = dict[str, npt.NDArray[Any]]
 
@@ -83,6 +89,46 @@ def moment_cloud(
     np.concatenate(arrays, axis=1, out=sums[: len(moments)])
     fields = [(name, UINT32, 2) for name in names]
     return append_fields(from_columns(columns), halves(sums), fields)
+
+
+def surfels_in(msg: Any) -> Surfels:
+    """Return the surfels of a message of ~/normals or ~/changed; see Surfels.from_message."""
+    scan = to_scan(msg, 'surfels')
+    columns: Columns = dict(zip('xyz', scan.points.T, strict=True)) | dict(scan.columns)
+    if not len(scan):
+        columns = dict.fromkeys(FIELDS, np.empty(0))
+    if missing := [name for name in FIELDS if name not in columns]:
+        raise CloudFormatError(f'no field {", ".join(missing)}, expected a cloud of ~/normals')
+    kept = columns['num_points'] > 0
+    columns = {name: values[kept] for name, values in columns.items()}
+    count = columns['num_points'].astype(np.int64)
+    unknown = np.full(len(count), np.iinfo(np.int32).min, np.int32)
+
+    def stacked(names: Iterable[str]) -> npt.NDArray[np.float64]:
+        return np.stack([columns[name] for name in names], axis=1).astype(np.float64)
+
+    return Surfels(
+        position=stacked('xyz'),
+        normal=stacked(NORMAL),
+        planarity=columns['planarity'].astype(np.float64),
+        curvature=columns['curvature'].astype(np.float64),
+        eigenvalues=np.full((len(count), 3), np.nan),
+        num_points=count,
+        voxel_index=np.stack([columns.get(name, unknown) for name in VOXEL], axis=1),
+        channels=means_in(columns),
+    )
+
+
+def means_in(columns: Columns) -> dict[str, npt.NDArray[np.float64]]:
+    """Return the means of the channels of a map: ``intensity``; ``red``, ``green``, ``blue``."""
+    found = {}
+    if 'intensity' in columns:
+        found['intensity'] = columns['intensity'].astype(np.float64)
+    if 'rgb' in columns:
+        packed = np.ascontiguousarray(columns['rgb'], np.float32).view(np.uint32)
+        for shift, name in ((16, 'red'), (8, 'green'), (0, 'blue')):
+            found[name] = ((packed >> shift) & 255).astype(np.float64)
+    return found
 
 
 def moments_in(columns: Columns, voxel_size_m: float, channels: tuple[str, ...]) -> ScanMoments:
