@@ -38,6 +38,8 @@ class Progress:
     ----------
     num_kernels : int
         Number of kernels compiled so far, those loaded from the cache not included.
+    ended_s : float
+        Time during which any thread compiled, until the last time that none did, s.
     stage : str
         The stage that the caller is in, such as ``2 of 5 (removing scans)``; empty without.
 
@@ -47,7 +49,7 @@ class Progress:
         self.num_kernels = 0
         self.stage = ''
         self._announced: str | None = None
-        self._seconds = 0.0
+        self.ended_s = 0.0
         self._start = 0.0
         self._depth = 0
         self._collects_garbage = True
@@ -81,7 +83,7 @@ class Progress:
             if self._depth == 0:
                 if self._collects_garbage:
                     gc.enable()
-                self._seconds += perf_counter() - self._start
+                self.ended_s += perf_counter() - self._start
 
     @property
     def is_active(self) -> bool:
@@ -97,7 +99,7 @@ class Progress:
     def seconds(self) -> float:
         """Time during which any thread compiled, s."""
         with self._lock:
-            return self._seconds + (perf_counter() - self._start if self._depth else 0.0)
+            return self.ended_s + (perf_counter() - self._start if self._depth else 0.0)
 
 
 PROGRESS = Progress()

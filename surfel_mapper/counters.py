@@ -13,11 +13,12 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from surfel_mapper.compilation import clock
+from surfel_mapper.compilation import clock, PROGRESS
 
 STAGES = (
     'read',
@@ -136,7 +137,7 @@ class Counters:
         """Add the times of a scan by stage."""
         for stage, time_ms in milliseconds.items():
             self.milliseconds.setdefault(stage, deque(maxlen=LATEST)).append(time_ms)
-            self.add_seconds(stage, 1e-3 * time_ms)
+            self.stage_s[stage] = self.stage_s.get(stage, 0.0) + 1e-3 * time_ms
 
     def add_filter(
         self,
@@ -187,22 +188,22 @@ class Counters:
 
 
 class Laps:
-    """Times of consecutive stages."""
+    """Times of consecutive stages, without the time of kernels that were compiled meanwhile."""
 
     def __init__(self) -> None:
-        self._start = self._lap = clock()
+        self._start = self._lap = perf_counter() - PROGRESS.ended_s
         self._stages: dict[str, float] = {}
 
     def end(self, stage: str) -> None:
         """End a stage and start the next."""
-        stop = clock()
-        self._stages[stage] = (stop - self._lap) * 1e3
+        stop = perf_counter() - PROGRESS.ended_s
+        self._stages[stage] = max(stop - self._lap, 0.0) * 1e3
         self._lap = stop
 
     @property
     def milliseconds(self) -> dict[str, float]:
         """Return the time of every ended stage, and their ``total``."""
-        return {**self._stages, 'total': (self._lap - self._start) * 1e3}
+        return {**self._stages, 'total': max(self._lap - self._start, 0.0) * 1e3}
 
 
 def percentiles(milliseconds: deque[float]) -> dict[str, float]:

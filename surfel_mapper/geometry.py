@@ -115,7 +115,9 @@ def compose(T_a_b: Transform, T_b_c: Transform) -> Transform:
     (a, b) = T_a_b.tolist(), T_b_c.tolist()
     rows = []
     for x, y, z, t in a[:3]:
-        row = [(x * b[0][k] + y * b[1][k]) + z * b[2][k] for k in range(4)]
+        row = []
+        for k in range(4):
+            row.append((x * b[0][k] + y * b[1][k]) + z * b[2][k])
         row[3] += t
         rows.append(row)
     rows.append([0.0, 0.0, 0.0, 1.0])
@@ -147,7 +149,7 @@ def check_rigid(name: str, T_a_b: npt.ArrayLike) -> None:
         0 0 0 1. So a transposed transform is refused.
 
     """
-    matrix = as_array(name, T_a_b)
+    matrix = T_a_b if type(T_a_b) is np.ndarray else as_array(name, T_a_b)
     if matrix.shape != (4, 4) or matrix.dtype.kind not in 'fiu':
         raise ValueError(f'{name}: {matrix.dtype} {matrix.shape}, expected float (4, 4)')
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = matrix.tolist()

@@ -176,7 +176,8 @@ class Scan:
             raise ValueError(f'free: shape {np.shape(self.free)}, expected directions (K, 3)')
         if self.depth is not None and self.depth.points is not points:
             object.__setattr__(self, 'depth', None)
-        if getattr(self.columns, 'num_rows', None) == len(points):
+        num_points = len(self)
+        if getattr(self.columns, 'num_rows', None) == num_points:
             return  # columns of filters are lazy: measuring would compute each
         check_kind('columns', self.columns, Mapping)
         for name, column in self.columns.items():
@@ -200,7 +201,7 @@ class Scan:
 
     def __len__(self) -> int:
         """Return the number of points."""
-        return len(self.points if self._lazy is None else self._lazy)
+        return len(self.points) if self._lazy is None else self._lazy.num_points
 
     @property
     def xyz(self) -> tuple[npt.NDArray[Any], ...]:
@@ -220,7 +221,7 @@ class Scan:
 
     def of_topic(self, topic: str) -> Scan:
         """Return the scan with its topic."""
-        return self if topic == self.topic else self._changed(topic=topic)
+        return self._changed(topic=topic)
 
     def moved_in_time(self, offset_ns: int) -> Scan:
         """Return the scan with an offset added to its stamp and the times of its points."""

@@ -278,7 +278,7 @@ FORBIDDEN = (
     ('errors.py', 'numpy.linalg'),
     ('mapping/surfel_map.py', 'surfel_mapper.pipeline.Mapper'),
     ('mapping/window.py', 'surfel_mapper.filters.chain'),
-    ('poses/pose_track.py', 'surfel_mapper.sensors.deskew'),
+    ('poses/buffer.py', 'surfel_mapper.sensors.deskew'),
     ('filters/chain.py', 'surfel_mapper.config._fields.setting'),
     ('pipeline/mapper.py', 'numba'),
     ('files/ply.py', 'rosbags.highlevel'),

@@ -33,7 +33,7 @@ from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import check_names, replace_file
 from surfel_mapper.files.point_columns import Columns, RGB
 from surfel_mapper.files.text_table import read_table
-from surfel_mapper.mapping.surfel_columns import file_positions, packed_rgb, surfel_columns
+from surfel_mapper.mapping.surfels import file_positions, packed_rgb, surfel_columns
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels

@@ -31,7 +31,7 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import check_names, replace_file
 from surfel_mapper.files.point_columns import Columns, RGB
 from surfel_mapper.files.text_table import read_table
-from surfel_mapper.mapping.surfel_columns import file_positions
+from surfel_mapper.mapping.surfels import file_positions
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels

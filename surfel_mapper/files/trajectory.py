@@ -32,7 +32,7 @@ from surfel_mapper.files.pose_rows import matrix_rows, quaternion_rows, warn_of_
 from surfel_mapper.files.stamps import column_ns, read_times, unit_by_digits, UNITS_NS
 from surfel_mapper.files.text_table import read_lines, Rows, table_rows, TextLines
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw, quaternions
-from surfel_mapper.poses.pose_track import seconds
+from surfel_mapper.poses.buffer import seconds
 
 SUFFIXES = ('.tum', '.txt', '.csv', '.kitti', '.g2o', '.log')
 """Endings of trajectories."""

@@ -176,7 +176,10 @@ class Reducer:
         num_points, size = xyz.shape[1], WIDEST
         if num_points <= WIDEST:
             num = scratch.fill(xyz, quantisation)
-            left_out = scratch.left_out.tolist()
+            left_out: dict[str, int] = {}
+            for cause, row in CAUSES.items():
+                if scratch.left_out[row]:
+                    left_out[cause] = int(scratch.left_out[row])
             moments = ScanMoments(
                 voxel_size_m=self.voxel_size_m,
                 key=np.empty(num, np.int64),
@@ -184,7 +187,7 @@ class Reducer:
                 total=np.empty((num, 3), np.int32),
                 product=np.empty((num, 6), np.int64),
                 view=np.empty((num, 3), np.int16),
-                left_out={cause: left_out[row] for cause, row in CAUSES.items() if left_out[row]},
+                left_out=left_out,
             )
             keys, sums = scratch.keys[2 : num + 2], scratch.sums[1 : num + 1]
             largest = pack_moments(keys, sums, origin, self.voxel_size_m, moments.arrays)
@@ -254,6 +257,8 @@ def squared_limits(min_range_m: float, max_range_m: float) -> npt.NDArray[np.flo
     """Return the squares of the limits of the range; ValueError unless they are zero or more."""
     if min_range_m == 0.0 and max_range_m == math.inf:
         return NO_LIMITS
+    if type(min_range_m) is float is type(max_range_m) and min_range_m >= 0.0 <= max_range_m:
+        return np.array([min_range_m * min_range_m, max_range_m * max_range_m])  # the usual case
     limits = as_numbers('min_range_m, max_range_m', (min_range_m, max_range_m)).tolist()
     if not all(isinstance(limit, float) and limit >= 0.0 for limit in limits):  # also nan
         raise ValueError(
@@ -264,7 +269,8 @@ def squared_limits(min_range_m: float, max_range_m: float) -> npt.NDArray[np.flo
 
 def as_origin(origin: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return the position of the sensor as the kernels take it; ValueError if it is none."""
-    position = np.ascontiguousarray(as_numbers('origin', origin))
+    is_usual = type(origin) is np.ndarray and origin.dtype == np.float64
+    position = np.ascontiguousarray(origin if is_usual else as_numbers('origin', origin))
     if position.shape != (3,) or not all(map(math.isfinite, position.tolist())):
         raise ValueError('origin: expected the finite position of the sensor, x y z')
     return position

@@ -53,19 +53,12 @@ class Slab:
         self._shape = num_rows, width
         self._dtype = np.dtype(dtype)
         self._memory = _anonymous(num_rows * self.row_bytes)
-        self._array: npt.NDArray[Any] | None = None
+        self.array = self._view()
 
     @property
     def row_bytes(self) -> int:
         """Size of a row, bytes."""
         return self._shape[1] * self._dtype.itemsize
-
-    @property
-    def array(self) -> npt.NDArray[Any]:
-        """The rows; made again after growing, also if there was no memory for it then."""
-        if self._array is None:
-            self._array = self._view()
-        return self._array
 
     def grow(self, num_rows: int) -> None:
         """
@@ -78,16 +71,23 @@ class Slab:
 
         """
         num_bytes = num_rows * self.row_bytes
-        self._array = None  # a view would pin the memory
+        self.array = np.empty((0, self._shape[1]), self._dtype)  # a view would pin the memory
+        try:
+            self._enlarge(num_bytes)
+            self._shape = num_rows, self._shape[1]
+        finally:
+            self.array = self._view()
+        if num_bytes >= HUGE_FROM and hasattr(mmap, 'MADV_HUGEPAGE'):
+            with contextlib.suppress(OSError):  # only a hint
+                self._memory.madvise(mmap.MADV_HUGEPAGE)
+
+    def _enlarge(self, num_bytes: int) -> None:
+        """Enlarge the memory map in place, or copy it."""
         try:
             self._memory.resize(num_bytes)
         except (BufferError, SystemError, OSError, ValueError):
             # a view is held elsewhere, the system has no mremap, or memory is exhausted
             self._memory = self._copied(num_bytes)
-        self._shape = num_rows, self._shape[1]
-        if num_bytes >= HUGE_FROM and hasattr(mmap, 'MADV_HUGEPAGE'):
-            with contextlib.suppress(OSError):  # only a hint
-                self._memory.madvise(mmap.MADV_HUGEPAGE)
 
     def _copied(self, num_bytes: int) -> mmap.mmap:
         """Return a larger memory map with the content of this one."""
@@ -129,6 +129,8 @@ class HashTable:
     ----------
     state : (S,) int64
         The scalars that kernels write; see kernels/hashing.py.
+    arrays : tuple of array
+        Directory, buckets, rows of each segment and local depth; replaced when the table grows.
 
     """
 
@@ -141,12 +143,13 @@ class HashTable:
         self.state = np.zeros(hashing.STATE, np.int64)
         self.state[hashing.FREE_ROW] = -1
         self.state[hashing.NEXT_SEGMENT] = 1
+        self.arrays: tuple[npt.NDArray[Any], ...] = ()
+        self._set_arrays()
 
-    @property
-    def arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """Directory, buckets, rows of each segment, local_depth, as the kernels take them."""
+    def _set_arrays(self) -> None:
+        """Enter the arrays as the kernels take them, after one was replaced."""
         buckets = self._buckets.array.reshape(-1)
-        return self._directory, buckets, self._num_rows, self._local_depth
+        self.arrays = self._directory, buckets, self._num_rows, self._local_depth
 
     @property
     def num_keys(self) -> int:
@@ -179,12 +182,16 @@ class HashTable:
 
         """
         num_segments = len(self._num_rows)
-        if self.state[hashing.NEXT_SEGMENT] < num_segments:
-            self._double_directory()
-            return
-        self._buckets.grow(2 * num_segments)
-        self._num_rows = np.append(self._num_rows, np.zeros_like(self._num_rows))
-        self._local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
+        self.arrays = ()  # a view would pin the memory of the buckets
+        try:
+            if self.state[hashing.NEXT_SEGMENT] < num_segments:
+                self._double_directory()
+                return
+            self._buckets.grow(2 * num_segments)
+            self._num_rows = np.append(self._num_rows, np.zeros_like(self._num_rows))
+            self._local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
+        finally:
+            self._set_arrays()
 
     def _double_directory(self) -> None:
         depth = int(self.state[hashing.DEPTH])

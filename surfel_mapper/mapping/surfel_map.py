@@ -260,11 +260,12 @@ class SurfelMap(MomentMap):
             Voxels with fewer points are skipped.
 
         """
-        min_points = as_whole('min_points', min_points)
-        if since is not None:
-            since = as_whole('since', since)
-        else:
+        if type(min_points) is not int:
+            min_points = as_whole('min_points', min_points)
+        if since is None:
             since, self._reported = max(self._reported, self.cleared_at), self.version
+        elif type(since) is not int:
+            since = as_whole('since', since)
         least = max(min_points, 1)
         changed = self._changes.since(since, self._table, least)
         if changed is None:

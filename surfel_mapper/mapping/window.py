@@ -59,7 +59,8 @@ class WindowedScan:
 
     def __post_init__(self) -> None:
         """Refuse what would fail only after the map has the scan."""
-        check_kind('moments', self.moments, ScanMoments)
+        if not isinstance(self.moments, ScanMoments):
+            check_kind('moments', self.moments, ScanMoments)
         if isinstance(self.stamp_ns, bool) or not isinstance(self.stamp_ns, (int, np.integer)):
             raise ValueError(f'stamp_ns: {self.stamp_ns!r}, expected whole nanoseconds as an int')
         if np.shape(self.T_map_sensor) != (4, 4):
@@ -68,8 +69,10 @@ class WindowedScan:
     @property
     def nbytes(self) -> int:
         """Size of moments, points and columns, bytes."""
-        kept = [*self.columns.values(), *([] if self.points is None else [self.points])]
-        return self.moments.nbytes + sum(array.nbytes for array in kept)
+        num_bytes = self.moments.nbytes + (0 if self.points is None else self.points.nbytes)
+        for column in self.columns.values():
+            num_bytes += column.nbytes
+        return num_bytes
 
 
 VOXEL_BYTES = 128
@@ -227,14 +230,21 @@ class SlidingWindow:
             If the map refuses the scan; nothing is changed.
 
         """
-        check_kind('scan', scan, WindowedScan)
-        min_points = as_whole('min_points', min_points)
+        if not isinstance(scan, WindowedScan):
+            check_kind('scan', scan, WindowedScan)
+        if type(min_points) is not int:
+            min_points = as_whole('min_points', min_points)
         self._map.insert(scan.moments)
-        self._append(scan)
-        evicted = []
-        while len(self._scans) > 1 and (limit := self._limit_reached()):
-            evicted.append(self._evict(limit, min_points))
-        while len(self._scans) > 1 and not self.keeps_scans:
+        self._scans.append((scan, self._travel.add(scan.frame_id, scan.T_map_sensor)))
+        self._nbytes += scan.nbytes
+        evicted, limits = [], self._limits()
+        while len(self._scans) > 1 and (limit := self._limit_reached(limits)):
+            oldest, _ = self._scans[0]
+            fallen = self._map.remove(oldest.moments, min_points)
+            self._scans.popleft()
+            self._nbytes -= oldest.nbytes
+            evicted.append(Eviction(scan=oldest, limit=limit, fallen=fallen))
+        while len(self._scans) > 1 and not (limits or self.config.keep_points):
             self._nbytes -= self._scans.popleft()[0].nbytes
             self._num_settled += 1
         return evicted
@@ -354,25 +364,21 @@ class SlidingWindow:
     @property
     def keeps_scans(self) -> bool:
         """Whether scans are kept: some limit can evict them, or their points are wanted."""
-        return self.config.keep_points or any(self._largest(name) for name in LIMITS)
+        return bool(self.config.keep_points or self._limits())
 
-    def _largest(self, name: str) -> float:
-        """Return the value of a limit; 0 means no such limit."""
-        value: float = getattr(self.config if name in SETTINGS else self, name)
-        return value
+    def _limits(self) -> list[tuple[str, float]]:
+        """Return name and value of the limits that are set."""
+        limits = []
+        for name in LIMITS:
+            largest: float = getattr(self.config if name in SETTINGS else self, name)
+            if largest:
+                limits.append((name, largest))
+        return limits
 
-    def _evict(self, limit: str, min_points: int) -> Eviction:
-        scan, _ = self._scans[0]
-        fallen = self._map.remove(scan.moments, min_points)
-        self._scans.popleft()
-        self._nbytes -= scan.nbytes
-        return Eviction(scan=scan, limit=limit, fallen=fallen)
-
-    def _limit_reached(self) -> str:
+    def _limit_reached(self, limits: list[tuple[str, float]]) -> str:
         """Return the name of the first limit that is exceeded, or an empty string."""
-        for name, measure in LIMITS.items():
-            largest = self._largest(name)
-            if largest and measure(self) > largest:
+        for name, largest in limits:
+            if LIMITS[name](self) > largest:
                 return name
         return ''
 
@@ -383,9 +389,9 @@ LIMITS: dict[str, Callable[[SlidingWindow], float]] = {
         (window._scans[-1][0].stamp_ns - window._scans[0][0].stamp_ns) / 1e9
     ),
     'max_distance_m': lambda window: window._travel.travelled_m - window._scans[0][1],
-    'max_bytes': lambda window: window.nbytes,
+    'max_bytes': lambda window: window._nbytes,
     'max_voxels': lambda window: window._map.num_voxels,
-    'max_total_bytes': lambda window: window._map.num_voxels * VOXEL_BYTES + window.nbytes,
+    'max_total_bytes': lambda window: window._map.num_voxels * VOXEL_BYTES + window._nbytes,
 }
 """
 The limits of a window with two scans or more, and the measure that each limits.

@@ -113,15 +113,14 @@ class MessageReader:
 
     def sequence(self) -> memoryview:
         """Return the next sequence of bytes, as a view."""
-        return self.view(self.number('I'))
+        return self.view(self.numbers('I')[0])
 
     def view(self, size: int) -> memoryview:
         """Return the next ``size`` bytes, as a view."""
-        if size > self.remaining:
-            raise ValueError(f'{size} bytes announced, {self.remaining} left')
-        view = memoryview(self._raw)[self._at : self._at + size]
-        self._at += size
-        return view
+        first, self._at = self._at, self._at + size
+        if self._at > len(self._raw):
+            raise ValueError(f'{size} bytes announced, {len(self._raw) - first} left')
+        return memoryview(self._raw)[first : self._at]
 
     def string(self) -> str:
         """Return the next string."""
@@ -175,7 +174,7 @@ class MessageWriter:
 def read_header(reader: MessageReader) -> Header:
     """Return the next std_msgs/Header; the sequence number of ROS 1 is skipped."""
     *_, sec, nanosec = reader.numbers('III' if reader.is_ros1 else 'iI')
-    return Header(Stamp(sec, nanosec), checked_frame(reader.string()))
+    return Header(Stamp(sec, nanosec), reader.string())
 
 
 def write_header(writer: MessageWriter, stamp_ns: int, frame_id: str) -> None:
@@ -187,17 +186,21 @@ def write_header(writer: MessageWriter, stamp_ns: int, frame_id: str) -> None:
 
 
 def frame_name(frame_id: str) -> str:
-    """Return the name of a frame without the leading slash of ROS 1; see checked_frame."""
-    return checked_frame(str(frame_id)).removeprefix('/')
+    """
+    Return the name of a frame without the leading slash of ROS 1.
 
+    Raises
+    ------
+    CloudFormatError
+        If it is longer than any real one.
 
-def checked_frame(name: str) -> str:
-    """Return the name of a frame; raise CloudFormatError if it is longer than any real one."""
+    """
+    name = str(frame_id)
     if len(name) > MAX_FRAME_NAME:
         raise CloudFormatError(
             f'frame {name[:20]!r}... of {len(name)} characters, expected at most {MAX_FRAME_NAME}'
         )
-    return name
+    return name.removeprefix('/')
 
 
 def stamp_ns(header: Any) -> int:

@@ -26,9 +26,8 @@ import numpy.typing as npt
 from surfel_mapper.errors import CloudFormatError, MapError
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import check_possible, pack_keys, ScanMoments, within_reach
-from surfel_mapper.mapping.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.surfels import surfel_columns, Surfels
 from surfel_mapper.messages.pointcloud2 import (
     append_fields,
     CloudBytes,

@@ -8,7 +8,9 @@ not imported. Sizes and fields are checked before a byte is read, with Python in
 not overflow. Columns are strided, read-only views into the message, so unused ones cost nothing.
 
 Coordinates are gathered into one array in Fortran order, as the kernels of the map need them, in
-one pass over the bytes. Three strided copies would read each line of the cache three times.
+blocks that stay in the cache. Three copies of the whole would take twice as long.
+
+All arrays together are no larger than the message, because fields must not overlap.
 
 ``parse_cloud`` reads a serialised message in place: its data is a view of the bytes.
 """
@@ -17,17 +19,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from functools import lru_cache, partial
 from itertools import pairwise
 import logging
 import math
+from operator import attrgetter
 import struct
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.messages.cdr import (
     checked_stamp_ns,
@@ -47,9 +50,6 @@ DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', UINT32: 'u4', FLOAT32: 'f
 
 MAX_FIELDS = 1024
 """Limit of the number of fields; drivers have some ten, clouds with descriptors some hundred."""
-
-FIELD_BYTES = 400
-"""Memory of a field: its object, its name and its place in a dictionary."""
 
 MAX_WARNED = 64
 """Number of warnings about layouts that are kept, to give each once."""
@@ -119,18 +119,18 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
     if int(msg.height) * int(msg.width) == 0:
         nothing = np.empty((0, 3), np.float32)
         return Scan(points=nothing, stamp_ns=stamp_ns, frame_id=frame_id, topic=topic)
-    budget = Budget(topic, len(data), CloudFormatError)
-    fields = checked_fields(msg, topic, budget)
-    xyz = [checked_coordinate(fields, name, topic) for name in 'xyz']
+    fields = checked_fields(msg, topic)
+    xyz = tuple(map(partial(checked_coordinate, fields, topic), 'xyz'))
     check_overlap(fields, topic)
     points = Points.of(msg, data)
-    lazy: Any = coordinates(points, xyz, budget)
-    others = {name: field for name, field in fields.items() if name not in ('x', 'y', 'z')}
+    lazy: Any = coordinates(points, xyz)
+    for name in 'xyz':
+        del fields[name]
     return Scan(
         points=lazy,
         stamp_ns=stamp_ns,
         frame_id=frame_id,
-        columns=MessageColumns(points, others, budget),
+        columns=MessageColumns(points, fields, math.prod(points.shape)),
         topic=topic,
         msg=msg,
     )
@@ -187,7 +187,7 @@ def warn_of_layout(topic: str, problem: str) -> None:
     _log.warning('%s: %s', topic, problem)
 
 
-def checked_fields(msg: Any, topic: str, budget: Budget) -> dict[str, Field]:
+def checked_fields(msg: Any, topic: str) -> dict[str, Field]:
     """
     Return the fields of a message by name; raise CloudFormatError if they do not fit a point.
 
@@ -195,7 +195,6 @@ def checked_fields(msg: Any, topic: str, budget: Budget) -> dict[str, Field]:
     """
     if len(msg.fields) > MAX_FIELDS:
         raise CloudFormatError(f'{topic}: {len(msg.fields)} fields, expected at most {MAX_FIELDS}')
-    budget.take(len(msg.fields) * FIELD_BYTES, f'{len(msg.fields)} fields')
     fields: dict[str, Field] = {}
     for found in msg.fields:
         field = Field(found.name, int(found.offset), int(found.datatype), int(found.count) or 1)
@@ -223,17 +222,17 @@ def check_overlap(fields: Mapping[str, Field], topic: str) -> None:
     Without overlap all columns together are no larger than the message. A 3 MB message with 200
     overlapping fields took 5.7 GB.
     """
-    ordered = sorted(fields.values(), key=lambda field: field.offset)
-    for before, field in pairwise(ordered):
-        end = before.offset + before.count * np.dtype(DTYPES[before.datatype]).itemsize
+    ordered = sorted(fields.values(), key=attrgetter('offset'))
+    for lower, field in pairwise(ordered):
+        end = lower.offset + lower.count * np.dtype(DTYPES[lower.datatype]).itemsize
         if field.offset < end:
             raise CloudFormatError(
                 f'{topic}: field {field.name!r} at byte {field.offset} of a point overlaps field '
-                f'{before.name!r}, which ends at byte {end}'
+                f'{lower.name!r}, which ends at byte {end}'
             )
 
 
-def checked_coordinate(fields: Mapping[str, Field], name: str, topic: str) -> Field:
+def checked_coordinate(fields: Mapping[str, Field], topic: str, name: str) -> Field:
     """Return the field x, y or z; raise CloudFormatError if it is missing or not a float."""
     if name not in fields:
         names = ', '.join(fields) or 'none'
@@ -268,16 +267,17 @@ class Points:
             return cls(data, (height * width,), (point_step,), order)
         return cls(data, (height, width), (row_step, point_step), order)
 
-    def view(self, offset: int, dtype: npt.DTypeLike, count: int = 1) -> npt.NDArray[Any]:
-        """Return a view of the items at an offset in every point, (..., count) if count > 1."""
-        dtype = np.dtype(dtype)
+    def view(self, field: Field) -> npt.NDArray[Any]:
+        """Return a view of a field of every point, (..., count) if its count is over 1."""
+        dtype = np.dtype(self.order + DTYPES[field.datatype])
         shape, strides = self.shape, self.strides
-        if count > 1:
-            shape, strides = (*shape, count), (*strides, dtype.itemsize)
-        items: npt.NDArray[Any] = np.ndarray(shape, dtype, self.data, offset, strides)
+        if field.count > 1:
+            shape, strides = (*shape, field.count), (*strides, dtype.itemsize)
+        items: npt.NDArray[Any] = np.ndarray(shape, dtype, self.data, field.offset, strides)
         return items
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class MessageColumns(Mapping[str, npt.NDArray[Any]]):
     """
     The further fields of a cloud as columns, each decoded when it is first read.
@@ -285,77 +285,63 @@ class MessageColumns(Mapping[str, npt.NDArray[Any]]):
     Most are views; those of other byte orders or padded rows are copies, made only if used.
     """
 
-    __slots__ = ('_budget', '_decoded', '_fields', '_points', 'num_rows')
-
-    def __init__(self, points: Points, fields: Mapping[str, Field], budget: Budget) -> None:
-        self._points = points
-        self._budget = budget
-        self._fields = fields
-        self._decoded: dict[str, npt.NDArray[Any]] = {}
-        self.num_rows = math.prod(points.shape)
+    points: Points
+    fields: Mapping[str, Field]
+    num_rows: int
+    decoded: dict[str, npt.NDArray[Any]] = dataclass_field(default_factory=dict)
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
-        if name not in self._decoded:
-            self._decoded[name] = column(self._points, self._fields[name], self._budget)
-        return self._decoded[name]
+        if name not in self.decoded:
+            self.decoded[name] = column(self.points, self.fields[name])
+        return self.decoded[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._fields)
+        return iter(self.fields)
 
     def __len__(self) -> int:
-        return len(self._fields)
+        return len(self.fields)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._fields
+        return name in self.fields
 
 
-def column(points: Points, field: Field, budget: Budget) -> npt.NDArray[Any]:
+def column(points: Points, field: Field) -> npt.NDArray[Any]:
     """Return one field of all points, (N,) or (N, count), read-only and in native byte order."""
-    values = points.view(field.offset, points.order + DTYPES[field.datatype], field.count)
-    if not values.dtype.isnative or len(points.shape) > 1:
-        budget.take(values.nbytes, f'field {field.name!r}')
+    values = points.view(field)
     values = values.astype(values.dtype.newbyteorder('='), copy=False)
     values = values.reshape(-1, field.count) if field.count > 1 else values.reshape(-1)
     values.flags.writeable = False
     return values
 
 
-def coordinates(points: Points, xyz: list[Field], budget: Budget) -> LazyPoints:
+def coordinates(points: Points, xyz: Sequence[Field]) -> LazyPoints:
     """Return three fields as points that are decoded when they are first read."""
-    views = [points.view(f.offset, points.order + DTYPES[f.datatype]) for f in xyz]
+    x, y, z = views = tuple(map(points.view, xyz))
     dtype = np.result_type(*views).newbyteorder('=')
     num_points = math.prod(points.shape)
-    budget.take(3 * num_points * dtype.itemsize, f'coordinates of {num_points} points')
-    is_uniform = all(v.dtype == dtype and v.ndim == 1 for v in views)
+    is_uniform = x.dtype == y.dtype == z.dtype == dtype and x.ndim == 1
     decode = partial(packed, views, num_points, dtype)
-    return LazyPoints(num_points, decode, tuple(views) if is_uniform else None)
+    return LazyPoints(num_points, decode, views if is_uniform else None)
+
+
+BLOCK = 4096
+"""Points gathered at once: their bytes stay in the cache for all three coordinates."""
 
 
 def packed(
-    views: list[npt.NDArray[Any]], num_points: int, dtype: np.dtype[Any]
+    views: tuple[npt.NDArray[Any], ...], num_points: int, dtype: np.dtype[Any]
 ) -> npt.NDArray[Any]:
     """Return three views of all points as a new (N, 3) array in Fortran order."""
-    kinds = {values.dtype for values in views}
     found: npt.NDArray[Any] = np.empty((num_points, 3), dtype, order='F')
-    if len(kinds) == 1 and dtype in kinds:
-        # loads numba, for which an `info` of a bag without clouds does not wait
-        from surfel_mapper.messages.kernels.coordinates import gather_coordinates
-
-        for values in views:
-            values.flags.writeable = False  # as of bytes: a writable array is another type
-        x, y, z = map(np.atleast_2d, views)
-        gather_coordinates(x, y, z, found.T)
+    if views[0].ndim > 1:
+        for axis, values in enumerate(views):
+            found[:, axis].reshape(values.shape)[...] = values
         return found
-    for axis, values in enumerate(views):  # other byte orders, or float32 beside float64
-        found[:, axis].reshape(values.shape)[...] = values
+    for start in range(0, num_points, BLOCK):
+        rows = slice(start, start + BLOCK)
+        for axis, values in enumerate(views):
+            found[rows, axis] = values[rows]
     return found
-
-
-def warm_up() -> None:
-    """Compile the kernel that decodes clouds of float32."""
-    points = np.zeros((2, 3), np.float32)  # a view of a single one would be contiguous
-    cloud = from_columns(dict(zip('xyz', points.T, strict=True)))
-    _ = to_scan(parse_cloud(cloud_bytes(cloud, stamp_ns=0, frame_id=''))).points  # decodes them
 
 
 def from_columns(columns: Mapping[str, npt.NDArray[Any]]) -> CloudBytes:
@@ -428,10 +414,6 @@ def field_of(name: str, layout: np.dtype[Any]) -> Field:
     return Field(name, offset, DATATYPES[dtype.base.newbyteorder('=')], count)
 
 
-SMALLEST_FIELD_BYTES = 13
-"""Smallest size of a field, to check their number before the loop."""
-
-
 @dataclass(frozen=True, slots=True)
 class RawCloud:
     """A sensor_msgs/PointCloud2; data is a read-only (row_step * height,) uint8 view."""
@@ -466,37 +448,31 @@ def parse_cloud(raw: bytes | memoryview, *, ros1: bool = False, topic: str = 'po
         If the bytes are truncated, or are not such a message.
 
     """
-    budget = Budget(topic, len(raw), CloudFormatError)
     try:
-        return _read_cloud(MessageReader(raw, ros1=ros1), budget)
+        reader = MessageReader(raw, ros1=ros1)
+        header = read_header(reader)
+        height, width, num_fields = reader.numbers('III')
+        if num_fields > MAX_FIELDS:
+            raise ValueError(f'{num_fields} fields announced, expected at most {MAX_FIELDS}')
+        fields = []
+        for _ in range(num_fields):
+            fields.append(Field(reader.string(), *reader.numbers('IBI')))
+        is_bigendian, point_step, row_step = reader.numbers('BII')
+        return RawCloud(
+            header=header,
+            height=height,
+            width=width,
+            fields=fields,
+            is_bigendian=bool(is_bigendian),
+            point_step=point_step,
+            row_step=row_step,
+            data=np.frombuffer(reader.sequence(), np.uint8),
+            is_dense=bool(reader.numbers('B')[0]),
+        )
     except (struct.error, UnicodeDecodeError, ValueError) as error:
         raise CloudFormatError(
             f'{topic}: {len(raw)} bytes that are not a whole PointCloud2: {error}'
         ) from error
-
-
-def _read_cloud(reader: MessageReader, budget: Budget) -> RawCloud:
-    """Return the next PointCloud2."""
-    header = read_header(reader)
-    height, width, num_fields = reader.numbers('III')
-    if num_fields * SMALLEST_FIELD_BYTES > reader.remaining:
-        raise ValueError(f'{num_fields} fields announced, {reader.remaining} bytes left')
-    if num_fields > MAX_FIELDS:
-        raise ValueError(f'{num_fields} fields, expected at most {MAX_FIELDS}')
-    budget.take(num_fields * FIELD_BYTES, f'{num_fields} fields')
-    fields = [Field(reader.string(), *reader.numbers('IBI')) for _ in range(num_fields)]
-    is_bigendian, point_step, row_step = reader.numbers('BII')
-    return RawCloud(
-        header=header,
-        height=height,
-        width=width,
-        fields=fields,
-        is_bigendian=bool(is_bigendian),
-        point_step=point_step,
-        row_step=row_step,
-        data=np.frombuffer(reader.sequence(), np.uint8),
-        is_dense=bool(reader.number('B')),
-    )
 
 
 WORD_BYTES = 4

@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from surfel_mapper.bags.writer import BagWriter
-from surfel_mapper.mapping.surfel_columns import surfel_columns
+from surfel_mapper.mapping.surfels import surfel_columns
 from surfel_mapper.messages.pointcloud2 import from_columns
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ MAX_FAILURES times in a row is switched off until it is cleared, because it may 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 import logging
 from typing import Any
 
@@ -47,37 +47,42 @@ class LayerStack:
     Attributes
     ----------
     by_name : mapping of str to Layer
+    active : list of Layer
+        The layers that are not switched off, in their order; replaced when one is.
+    clearing, following : list of Layer
+        Those of them that can want voxels cleared, and those that follow scans.
 
     """
 
     def __init__(self, config: Config, around: Surroundings, drops: Drops) -> None:
         layers = [layer(config, around) for layer in enabled(config)]
         self.by_name: Mapping[str, Layer] = {layer.name: layer for layer in layers}
+        self._activate(layers)
         self._drops = drops
         self._failures: Counter[tuple[str, str]] = Counter()  # in a row, by name and task
 
-    def __iter__(self) -> Iterator[Layer]:
-        """Iterate over the layers that are not switched off, in their order."""
-        off = self._drops.counters.layers_off
-        return iter([layer for name, layer in self.by_name.items() if name not in off])
+    def _activate(self, layers: list[Layer]) -> None:
+        """Follow scans with some of the layers from now on."""
+        no_voxels, no_result = Layer.voxels_to_clear, Layer.follow
+        self.active = layers
+        self.clearing = [r for r in layers if type(r).voxels_to_clear is not no_voxels]
+        self.following = [r for r in layers if type(r).follow is not no_result]
 
     @property
     def needs_free_rays(self) -> bool:
         """Whether a layer needs the directions in which the sensor met nothing."""
-        return any(layer.needs_free_rays for layer in self)
+        return any(layer.needs_free_rays for layer in self.active)
 
     @property
     def images(self) -> Images:
         """The images that scans are joined with: those of the first layer that wants any."""
-        wanted = (layer.images for layer in self)
+        wanted = (layer.images for layer in self.active)
         return next((images for images in wanted if images.topics), Images())
 
     def voxels_to_clear(self, inserted: InsertedScan, laps: Laps) -> npt.NDArray[np.int32]:
         """Return the voxels (E, 3) that layers want cleared after a scan, each once."""
         found = []
-        for layer in self:
-            if type(layer).voxels_to_clear is Layer.voxels_to_clear:
-                continue
+        for layer in self.clearing:
             try:
                 voxels = layer.voxels_to_clear(inserted)
             except Exception as error:  # MemoryError too
@@ -95,9 +100,7 @@ class LayerStack:
     def follow(self, inserted: InsertedScan, laps: Laps) -> dict[str, Any]:
         """Pass a scan to all layers; return their results by name."""
         results = {}
-        for layer in self:
-            if type(layer).follow is Layer.follow:
-                continue
+        for layer in self.following:
             try:
                 result = layer.follow(inserted)
             except Exception as error:  # MemoryError too
@@ -113,25 +116,26 @@ class LayerStack:
         """Clear all layers, and switch those on that were switched off."""
         self._failures.clear()
         self._drops.counters.layers_off.clear()
-        for layer in self:
+        self._activate(list(self.by_name.values()))
+        for layer in self.active:
             with self._drops.guarded(f'clearing layer {layer.name}'):
                 layer.clear()
 
     def clear_region(self, contains: Contains) -> None:
         """Empty a region of all layers."""
-        for layer in self:
+        for layer in self.active:
             with self._drops.guarded(f'clearing a region of layer {layer.name}'):
                 layer.clear_region(contains)
 
     def finish(self) -> None:
         """Finish all layers, at the end of a recording."""
-        for layer in self:
+        for layer in self.active:
             with self._drops.guarded(f'finishing layer {layer.name}'):
                 layer.finish()
 
     def warm_up_stages(self) -> list[CompileStage]:
         """Return the stages that compile the kernels of all layers."""
-        return [CompileStage(f'layer {layer.name}', layer.warm_up) for layer in self]
+        return [CompileStage(f'layer {layer.name}', layer.warm_up) for layer in self.active]
 
     def reconfigure(self, config: Config) -> None:
         """Give all layers new settings, also those that are switched off until the next clear."""
@@ -142,7 +146,7 @@ class LayerStack:
     def summary(self) -> dict[str, dict[str, Any]]:
         """Return the figures of the layers that have any, by name."""
         found = {}
-        for layer in self:
+        for layer in self.active:
             with self._drops.guarded(f'figures of layer {layer.name}'):
                 found[layer.name] = layer.summary()
         return {name: figures for name, figures in found.items() if figures}
@@ -158,6 +162,7 @@ class LayerStack:
         self._failures[name, task] += 1
         if self._failures[name, task] >= MAX_FAILURES and not isinstance(error, CloudFormatError):
             self._drops.counters.layers_off[name] = text
+            self._activate([other for other in self.active if other is not layer])
             _log.error(
                 'layer %s is switched off until the map is cleared: it failed %d times in a row, '
                 'last with: %s',

@@ -12,14 +12,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from surfel_mapper.config import Config, WindowConfig
-from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
-from surfel_mapper.pipeline.reduction import reduced
-from surfel_mapper.scan import Scan
 
 MAX_BYTES = 1 << 29
 """Limit of the kept moments, bytes: some 500 scans, for a sensor that stands still."""
@@ -48,16 +43,8 @@ class LocalMap:
         )
         self._window = SlidingWindow(self.surfel_map, limits)
 
-    def add(
-        self,
-        scan: Scan,
-        windowed: WindowedScan,
-        T_fixed_sensor: Transform,
-        config: Config,
-    ) -> None:
-        """Add a scan, given its moments in the map, which are reused if the poses are equal."""
-        if not np.array_equal(windowed.T_map_sensor, T_fixed_sensor):
-            windowed = reduced(scan, T_fixed_sensor, self.surfel_map, config)
+    def add(self, windowed: WindowedScan) -> None:
+        """Add the moments of a scan at its pose in the fixed frame."""
         # a copy: the map of all scans keeps its own hints of rows
         self._window.insert(replace(windowed, moments=replace(windowed.moments), points=None))
 

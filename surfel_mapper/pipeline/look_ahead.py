@@ -20,8 +20,8 @@ import numpy as np
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.pipeline.preparation import reduced
 from surfel_mapper.pipeline.prepared import FilteredScan
-from surfel_mapper.pipeline.reduction import reduced
 from surfel_mapper.scan import Scan
 from surfel_mapper.threads import pool
 
@@ -43,20 +43,20 @@ class Begun(NamedTuple):
 
 class LookAhead:
     """
-    Prepares the next scan in another thread, if there is one.
+    Prepares the next scan in another thread.
 
     Parameters
     ----------
     surfel_map : SurfelMap
         The map that the scans are inserted into.
     threads : int
-        With fewer than two nothing is prepared ahead.
+        Number of threads, two or more.
 
     """
 
     def __init__(self, surfel_map: SurfelMap, threads: int) -> None:
         self._map = surfel_map
-        self.pool = pool(threads)
+        self._pool = pool(threads)
         self._begun: Begun | None = None
 
     def begin(
@@ -72,10 +72,11 @@ class LookAhead:
         ``prepare`` is called here, the function that it returns in the other thread.
         """
         begun = self._begun
-        if self.pool is None or (begun and begun.is_of(scan, T_map_sensor, config)):
+        if begun is not None and begun.is_of(scan, T_map_sensor, config):
             return
+        assert self._pool is not None, 'two threads or more'
         work = prepare(scan, T_map_sensor)
-        result = self.pool.submit(run_ahead, work, T_map_sensor, self._map, config)
+        result = self._pool.submit(run_ahead, work, T_map_sensor, self._map, config)
         self._begun = Begun(scan, T_map_sensor, config, result)
 
     def take(

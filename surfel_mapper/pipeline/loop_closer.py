@@ -29,7 +29,7 @@ from surfel_mapper.mapping.moments import point_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.reducer import within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow
-from surfel_mapper.pipeline.reduction import viewpoint
+from surfel_mapper.pipeline.scan_poses import viewpoint
 from surfel_mapper.scan import Scan
 
 LISTED = 20

@@ -204,10 +204,13 @@ class Mapper:
         messages agree (see StampGuard); else the scan is dropped. ``input.time_offset_s`` is added
         to the stamp. The topic is for the log too. Raises TypeError for anything but a Scan.
         """
-        check_kind('scan', scan, Scan, hint='Scan(points=..., stamp_ns=..., frame_id=...)')
-        check_kind('topic', topic, str)
+        if not (isinstance(scan, Scan) and isinstance(topic, str)):
+            check_kind('scan', scan, Scan, hint='Scan(points=..., stamp_ns=..., frame_id=...)')
+            check_kind('topic', topic, str)
         self.counters.received += 1
-        self._pipeline.add_scan(scan.of_topic(topic or scan.topic))
+        if topic and topic != scan.topic:
+            scan = scan.of_topic(topic)
+        self._pipeline.add_scan(scan)
 
     def refuse_clouds(
         self, cause: str, topic: str, reason: str, number: int = 1, frame_id: str = ''

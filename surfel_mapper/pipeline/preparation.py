@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Preparation of a scan for the map: motion gate, deskewing, images, filters, registration.
+Preparation of a scan for the map: motion gate, deskewing, images, filters, registration, moments.
 
 A scan that the motion gate, the filters or the registration leave out is refused.
 """
@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
 from surfel_mapper.compilation import CompileStage
 from surfel_mapper.config import Config, WindowConfig
@@ -21,14 +22,18 @@ from surfel_mapper.errors import CloudFormatError, MapError, PoseError, ScanRefu
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
 from surfel_mapper.layers import Surroundings
-from surfel_mapper.mapping.channels import checked_channels, missing_columns
+from surfel_mapper.mapping.channels import checked_channels, missing_columns, summed_columns
+from surfel_mapper.mapping.moments import point_keys, ScanMoments
+from surfel_mapper.mapping.reducer import within
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.drops import Drops, GATED
 from surfel_mapper.pipeline.local_map import LocalMap
+from surfel_mapper.pipeline.mapping_stages import expected_type
 from surfel_mapper.pipeline.prepared import FilteredScan, Prepared
-from surfel_mapper.pipeline.reduction import expected_type
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_images import ScanImages
-from surfel_mapper.pipeline.scan_poses import ScanPoses
+from surfel_mapper.pipeline.scan_poses import ScanPoses, viewpoint
 from surfel_mapper.pipeline.window_aligner import WindowAligner
 from surfel_mapper.scan import PointTimes, Scan
 from surfel_mapper.sensors.deskew import warm_up as warm_up_deskewing
@@ -176,9 +181,10 @@ class Preparation:
             If poses within its sweep were forgotten since it got its own.
 
         """
-        times, registered = scan.times, self._poses.registered
-        if registered is None:
-            self._check_motion(scan, pose, config.window)
+        times, registered, gate = scan.times, self._poses.registered, config.window
+        is_gated = bool(gate.gate_distance_m or gate.gate_angle_deg)
+        if is_gated and registered is None:
+            self._check_motion(scan, pose, gate)
         found = self._filtered(scan, pose, laps) if begun is None else begun()
         if self.chain.filters:
             laps.end('filter')
@@ -192,8 +198,8 @@ class Preparation:
             return [prepared]
         confirmed = self._register(registered, prepared, times)
         laps.end('register')
-        if len(confirmed) == 1:  # of several the gate would compare those that waited with one
-            self._check_motion(confirmed[0].scan, confirmed[0].T_map_sensor, config.window)
+        if is_gated and len(confirmed) == 1:  # of several the gate would compare all with one
+            self._check_motion(confirmed[0].scan, confirmed[0].T_map_sensor, gate)
         return confirmed
 
     def _filtered(self, scan: Scan, pose: Transform, laps: Laps) -> FilteredScan:
@@ -207,8 +213,9 @@ class Preparation:
             scan = self._with_images(scan, self._images)
         if self._needs_free_rays or self._images is not None:
             laps.end('images')
-        T_base_sensor = self._poses.of_base(scan) if self.chain.filters else None
-        return filtered_scan(scan, pose, self.chain, T_base_sensor)
+        if not self.chain.filters:
+            return FilteredScan(scan, scan)
+        return filtered_scan(scan, pose, self.chain, self._poses.of_base(scan))
 
     def _deskewed(self, scan: Scan) -> Scan:
         """Return a scan with all points in the sensor frame at its stamp."""
@@ -282,8 +289,6 @@ class Preparation:
         It is compared with the last scan of its frame: sensors that are mounted apart are not at
         rest, nor in motion, because of the distance between them.
         """
-        if not (gate.gate_distance_m or gate.gate_angle_deg):
-            return
         T_map_last = self._around.window.last_pose(scan.frame_id)
         if T_map_last is not None and stands_still(T_map_last, pose, gate):
             raise ScanRefusedError(GATED)
@@ -317,3 +322,44 @@ def stands_still(T_map_last: Transform, T_map_sensor: Transform, gate: WindowCon
     moved = 0.0 < gate.gate_distance_m <= distance_m
     turned = 0.0 < gate.gate_angle_deg <= angle_deg
     return not (moved or turned)
+
+
+def reduced(
+    scan: Scan, T_map_sensor: Transform, surfel_map: SurfelMap, config: Config
+) -> WindowedScan:
+    """Return a scan as its moments at a pose, with its points if the window keeps them."""
+    limits = config.input
+    origin: npt.NDArray[np.float64] | None = T_map_sensor[:3, 3]
+    if config.pose.source == 'identity':
+        origin = viewpoint(T_map_sensor, config)
+    moments = surfel_map.reduce(
+        scan.points,
+        T_map_sensor,
+        origin=origin,
+        min_range_m=limits.min_range_m,
+        max_range_m=limits.max_range_m or np.inf,
+        columns=scan.columns,
+    )
+    windowed = WindowedScan(
+        moments=moments,
+        stamp_ns=scan.stamp_ns,
+        T_map_sensor=T_map_sensor,
+        frame_id=scan.frame_id,
+    )
+    if not config.window.keep_points:
+        return windowed
+    stay = within(scan.points, limits.min_range_m, limits.max_range_m)
+    if 'beyond_map' in moments.left_out:
+        stay &= point_keys(scan.points, T_map_sensor, surfel_map.voxel_size_m) >= 0
+    entered = scan.select(stay)
+    columns = summed_columns(entered.columns, surfel_map.columns)
+    return replace(windowed, points=entered.points, columns=columns)
+
+
+def moments_at(
+    scan: WindowedScan, T_map_sensor: Transform, surfel_map: SurfelMap, config: Config
+) -> ScanMoments:
+    """Return the moments of a scan of the window, whose points are kept, at another pose."""
+    assert scan.points is not None, 'only scans with points are moved'
+    seen_from = viewpoint(T_map_sensor, config)
+    return surfel_map.reduce(scan.points, T_map_sensor, origin=seen_from, columns=scan.columns)

@@ -31,8 +31,8 @@ from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.map_part import ApartMap, LEAST_SCANS, MapPart, MOST_SCANS, Sighting
+from surfel_mapper.pipeline.mapping_stages import expected_type
 from surfel_mapper.pipeline.prepared import Prepared
-from surfel_mapper.pipeline.reduction import expected_type
 from surfel_mapper.pipeline.surroundings import SurroundingMotion
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan

@@ -51,14 +51,12 @@ from surfel_mapper.pipeline.local_map import LocalMap
 from surfel_mapper.pipeline.look_ahead import LookAhead
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import has_own_frame, MapOrigin
-from surfel_mapper.pipeline.preparation import Preparation
+from surfel_mapper.pipeline.mapping_stages import warm_up_stages as map_stages
+from surfel_mapper.pipeline.preparation import moments_at, Preparation, reduced
 from surfel_mapper.pipeline.prepared import Prepared
-from surfel_mapper.pipeline.reduction import moments_at, reduced
-from surfel_mapper.pipeline.reduction import warm_up_stages as reduction_stages
 from surfel_mapper.pipeline.scan_images import ScanImages
-from surfel_mapper.pipeline.scan_poses import ScanPoses
-from surfel_mapper.pipeline.scan_queue import PosedScan, ScanQueue
-from surfel_mapper.pipeline.stamp_guard import Judged, StampGuard
+from surfel_mapper.pipeline.scan_poses import PosedScan, ScanPoses, ScanQueue
+from surfel_mapper.pipeline.stamp_guard import Judged, Order, StampGuard
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.pipeline.window_aligner import Alignment, WindowAligner
 from surfel_mapper.scan import Scan
@@ -122,13 +120,14 @@ class ScanPipeline:
         self._local_map: LocalMap | None = None
         if self.poses.registered is not None:
             self._keep_local_map()
-        self._look_ahead = LookAhead(self.map, config.map.threads or 1)
+        threads = config.map.threads
+        self._look_ahead = LookAhead(self.map, threads) if threads > 1 else None
         fixed = config.frames.fixed
         own_frame = f'{fixed}_local' if has_own_frame(config) else fixed
         self.map_frame = config.align.map_frame or own_frame
         self.arrived: deque[Scan] = deque()
         self._unreported: tuple[int, list[npt.NDArray[np.int32]]] | None = None
-        self._clears_map = self._warned_of_units = False
+        self._clears_map, self._checks_units = False, True
 
     def run(self, more_follows: bool) -> Iterator[Update]:
         """
@@ -140,25 +139,29 @@ class ScanPipeline:
             See Mapper.insert_ready.
 
         """
-        self.judge_stamps()
+        while self.arrived:  # each is used, held until the next message, or dropped
+            self._settle(self.guard.judge(self.arrived.popleft()))
         while (posed := self._next_posed(more_follows)) is not None:
             laps, T_map_fixed = Laps(), self.aligner.T_map_fixed
             for prepared in self._prepared(*posed, laps):  # deskewed, filtered and registered
-                inserted, update = None, None
+                inserted, update, alignment, results = None, None, None, dict[str, Any]()
                 try:
                     if self.config.map.mode == 'frozen':
                         update = self._localised(prepared, laps)
                     else:
-                        prepared = self._corrected(prepared, T_map_fixed)
+                        if self.aligner.T_map_fixed is not T_map_fixed:
+                            prepared = self._corrected(prepared, T_map_fixed)
                         windowed = self._reduced(prepared, laps)
-                        inserted = self._inserted(prepared, windowed)
-                        self._keep(prepared.filtered, windowed)
+                        inserted = self._inserted(prepared, windowed)  # old scans are evicted
+                        if self.loops is not None or self.preparation.local_map is not None:
+                            self._keep(prepared.filtered, windowed)
                         laps.end('insert')
-                        inserted = self._cleared(inserted, laps)
-                        alignment = self._align_when_due(laps)
-                        if alignment is not None:
-                            inserted = inserted.at(alignment.T_map_sensor[-1])
-                        results = self.layers.follow(inserted, laps)
+                        if self.layers.clearing:
+                            inserted = self._cleared(inserted, laps)
+                        if self.config.align.every_scans:
+                            inserted, alignment = self._aligned(inserted, laps)
+                        if self.layers.following:
+                            results = self.layers.follow(inserted, laps)
                         update = self._recorded(prepared, inserted, alignment, results, laps)
                 except Exception as error:  # MemoryError too: the next scan may fit
                     self.drops.failure(prepared.scan, error, is_mapped=inserted is not None)
@@ -169,10 +172,17 @@ class ScanPipeline:
     def add_scan(self, scan: Scan) -> None:
         """Take a scan that can be mapped; ``run`` judges its stamp."""
         self.queue.ended = False
-        try:
-            self.arrived.append(self._checked(scan))
-        except ScanRefusedError as refusal:
-            self.drops.failure(scan, refusal)
+        if not scan.frame_id:
+            self.drops.scan(scan, 'empty_frame_id', 'its header has no frame_id')
+        elif len(scan) == 0:
+            self.drops.scan(scan, 'no_points', 'it has no points')
+        elif self.map.columns and (missing := self._missing_columns(scan)):
+            reason = f'its points have no {" and no ".join(missing)}'
+            self.drops.scan(scan, 'missing_column', reason)
+        elif self.config.deskew.enabled or self.config.input.time_offset_s:
+            self._add_timed(scan)
+        else:
+            self.arrived.append(scan)
         if len(self.arrived) + len(self.queue.waiting) > self.queue.max_scans:
             self.judge_stamps()  # no more scans may wait
 
@@ -189,34 +199,26 @@ class ScanPipeline:
         else:
             self._settle(self.guard.judge(pose))
 
-    def _checked(self, scan: Scan) -> Scan:
-        """Return a scan that can be mapped, by the clock of the poses, with its times."""
-        offset_ns = round(1e9 * self.config.input.time_offset_s)
-        return self._timed(scan).moved_in_time(offset_ns)
+    def _missing_columns(self, scan: Scan) -> list[str]:
+        """Return the columns that the map sums and a scan has not, nor gets from images."""
+        missing = missing_columns(scan.columns, self.map.columns)
+        images = self.images
+        return [name for name in missing if images is None or not images.will_give(scan, name)]
 
-    def _timed(self, scan: Scan) -> Scan:
-        """Return a scan that can be mapped, with the times that deskewing needs; else raise."""
-        if not scan.frame_id:
-            raise ScanRefusedError('empty_frame_id', 'its header has no frame_id')
-        if len(scan) == 0:
-            raise ScanRefusedError('no_points', 'it has no points')
-        if self.map.columns:
-            missing, images = missing_columns(scan.columns, self.map.columns), self.images
-            if images is not None:
-                missing = [name for name in missing if not images.will_give(scan, name)]
-            if missing:
-                reason = f'its points have no {" and no ".join(missing)}'
-                raise ScanRefusedError('missing_column', reason)
-        deskew = self.config.deskew
-        if not deskew.enabled:
-            return scan
-        try:
-            return scan.with_times(point_times(scan, deskew.field, deskew.unit, deskew.reference))
-        except CloudFormatError as error:
-            raise ScanRefusedError('no_times', str(error)) from error
+    def _add_timed(self, scan: Scan) -> None:
+        """Take a scan by the clock of the poses, with the times that deskewing needs."""
+        deskew, offset_s = self.config.deskew, self.config.input.time_offset_s
+        if deskew.enabled:
+            try:
+                times = point_times(scan, deskew.field, deskew.unit, deskew.reference)
+            except CloudFormatError as error:
+                self.drops.scan(scan, 'no_times', str(error))
+                return
+            scan = scan.with_times(times)
+        self.arrived.append(scan.moved_in_time(round(1e9 * offset_s)))
 
     def _settle(self, judged: Sequence[Judged]) -> None:
-        """Use or drop messages whose stamps were judged."""
+        """Queue scans and enter poses whose stamps were judged, or drop them."""
         for message, odd in judged:
             if isinstance(message, StampedPose):
                 if odd:
@@ -224,23 +226,21 @@ class ScanPipeline:
                     self.drops.message('odd_stamp', text)
                 else:
                     self.poses.add(*message, static=False)
-            elif odd:
-                self.drops.scan(message, 'odd_stamp', odd)
+                continue
+            if odd:
+                order = Order('odd_stamp', odd)
             else:
-                self._enqueue(message)
-
-    def _enqueue(self, scan: Scan) -> None:
-        """Queue a scan unless it is out of order; clear the map if time was set back."""
-        order = self.guard.order(scan, takes_late=self.poses.registered is None)
-        if order.cause:
-            self.drops.scan(scan, order.cause, order.reason)
-            return
-        if order.back_s:
-            self._start_anew(scan, order.back_s)
-        elif order.odd_ns is not None:
-            self.queue.drop_odd(scan, order.odd_ns)
-        self.poses.mount(scan.frame_id)
-        self.queue.push(scan)
+                order = self.guard.order(message, takes_late=self.poses.registered is None)
+            if order.cause:
+                self.drops.scan(message, order.cause, order.reason)
+                continue
+            if order.back_s:
+                self._start_anew(message, order.back_s)
+            elif order.odd_ns is not None:
+                self.queue.drop_odd(message, order.odd_ns)
+            if message.frame_id not in self.poses.mounted:
+                self.poses.mount(message.frame_id)
+            self.queue.push(message)
 
     def _start_anew(self, scan: Scan, back_s: float) -> None:
         """
@@ -281,7 +281,7 @@ class ScanPipeline:
             return posed.popleft()
         if self._clears_map:
             self._clear_map()
-        ahead = int(self._looks_ahead)
+        ahead = int(self._look_ahead is not None and self._can_look_ahead)
         keeps = ahead if more_follows else 0
         if self.queue.fill_posed(1 + ahead, self.guard.newest_of, self.config.pose) > keeps:
             return posed.popleft()
@@ -292,11 +292,9 @@ class ScanPipeline:
         return None
 
     @property
-    def _looks_ahead(self) -> bool:
-        """Whether another thread prepares the next scan while one is mapped."""
-        if self._look_ahead.pool is None or self.config.map.mode == 'frozen':
-            return False
-        return self.preparation.is_independent
+    def _can_look_ahead(self) -> bool:
+        """Whether the next scan can be prepared while one is mapped."""
+        return self.config.map.mode != 'frozen' and self.preparation.is_independent
 
     def _begin(self, scan: Scan, T_fixed_sensor: Transform) -> None:
         """
@@ -304,6 +302,7 @@ class ScanPipeline:
 
         Without the poses of its sweep nothing is begun; the scan is counted later.
         """
+        assert self._look_ahead is not None, 'no scan has its pose early otherwise'
         pose = self.aligner.to_map(T_fixed_sensor)
         with suppress(PoseError):
             self._look_ahead.begin(scan, pose, self.config, self.preparation.ahead)
@@ -316,9 +315,12 @@ class ScanPipeline:
         confirms it comes with those that have waited.
         """
         ready: Sequence[Prepared] = ()
-        pose = self.aligner.to_map(T_fixed_sensor)
+        pose, begun = T_fixed_sensor, None
+        if self.aligner.is_corrected:
+            pose = self.aligner.to_map(T_fixed_sensor)
         try:
-            begun = self._look_ahead.take(scan, pose, self.config)
+            if self._look_ahead is not None:
+                begun = self._look_ahead.take(scan, pose, self.config)
             ready = self.preparation.prepare(scan, pose, self.config, laps, begun)
         except Exception as error:  # MemoryError too: the next scan may fit
             self.drops.failure(scan, error)
@@ -328,8 +330,6 @@ class ScanPipeline:
 
     def _corrected(self, prepared: Prepared, T_map_fixed: Transform) -> Prepared:
         """Return a scan corrected by the alignments since its pose, those of scans before it."""
-        if self.aligner.T_map_fixed is T_map_fixed:
-            return prepared
         T_fixed_sensor = compose(inverse(T_map_fixed), prepared.T_map_sensor)
         pose = self.aligner.to_map(T_fixed_sensor)
         return replace(prepared, T_map_sensor=pose, windowed=None)
@@ -350,26 +350,30 @@ class ScanPipeline:
         if not len(windowed.moments):
             cause = 'map_limit' if 'beyond_map' in left_out else 'no_valid_points'
             raise ScanRefusedError(cause, f'left out: {left_out}')
-        if not self._warned_of_units and looks_like_other_unit(windowed.moments):
-            self._warned_of_units = True
-            _log.warning('scan in frame %s: %s', prepared.scan.frame_id, OTHER_UNIT)
+        if self._checks_units:
+            self._checks_units = False  # all later scans have the unit of the first
+            if looks_like_other_unit(windowed.moments):
+                _log.warning('scan in frame %s: %s', prepared.scan.frame_id, OTHER_UNIT)
         return windowed
 
     def _inserted(self, prepared: Prepared, windowed: WindowedScan) -> InsertedScan:
         """Add a scan to the map, and evict those that leave the window."""
         version, removed = self._unreported or (self.map.version, [NO_VOXELS])
         evictions = self.window.insert(windowed, self.config.map.min_points)
-        self._unreported = version, [*removed, *(eviction.fallen for eviction in evictions)]
+        self._unreported = version, removed
         num_points = windowed.moments.num_points
         self.counters.mapped += 1
         self.counters.points += num_points
-        self.counters.evicted.update(eviction.limit for eviction in evictions)
+        for eviction in evictions:
+            removed.append(eviction.fallen)
+            self.counters.evicted[eviction.limit] += 1
         return InsertedScan(
             scan=prepared.filtered,
             T_map_sensor=prepared.T_map_sensor,
             keys=windowed.moments.key,
             num_points=num_points,
             evictions=tuple(evictions),
+            cleared=NO_VOXELS,
         )
 
     def _keep(self, scan: Scan, windowed: WindowedScan) -> None:
@@ -384,7 +388,10 @@ class ScanPipeline:
                 self.loops = None
         local_map = self.preparation.local_map
         if local_map is not None:  # last: it may refuse the scan, which loops must have
-            local_map.add(scan, windowed, self.aligner.to_fixed(pose), self.config)
+            T_fixed_sensor = self.aligner.to_fixed(pose)
+            if not np.array_equal(pose, T_fixed_sensor):
+                windowed = reduced(scan, T_fixed_sensor, local_map.surfel_map, self.config)
+            local_map.add(windowed)
 
     def _cleared(self, inserted: InsertedScan, laps: Laps) -> InsertedScan:
         """Clear the voxels that layers want cleared after a scan."""
@@ -396,20 +403,22 @@ class ScanPipeline:
         self._unreported[1].append(fallen)
         return replace(inserted, cleared=cleared)
 
-    def _align_when_due(self, laps: Laps) -> Alignment | None:
+    def _aligned(
+        self, inserted: InsertedScan, laps: Laps
+    ) -> tuple[InsertedScan, Alignment | None]:
         """Align the window every ``align.every_scans`` scans; warn if that fails."""
         if not self.aligner.is_due(self.config.align.every_scans) or len(self.window) < 2:
-            return None
+            return inserted, None
         try:
             alignment = self.aligner.align(self.window, self.config)
             if self.loops is not None:
                 self.loops.follow_window()
         except (AlignmentError, MapError, MemoryError) as error:
             self.drops.warn('alignment', f'the window is not aligned: {described(error)}')
-            return None
+            return inserted, None
         _log.debug('aligned: %s', alignment)
         laps.end('align')
-        return alignment
+        return inserted.at(alignment.T_map_sensor[-1]), alignment
 
     def _recorded(
         self,
@@ -436,7 +445,9 @@ class ScanPipeline:
             T_map_sensor=inserted.T_map_sensor,
             num_points=inserted.num_points,
             changed=changed,
-            removed_voxel_index=removed_voxels(removed, alignment, changed),
+            removed_voxel_index=np.concatenate(removed)
+            if alignment is None
+            else removed_voxels(removed, alignment, changed),
             evictions=inserted.evictions,
             milliseconds=laps.milliseconds,
             layers=results,
@@ -573,7 +584,7 @@ class ScanPipeline:
     def warm_up_stages(self) -> list[CompileStage]:
         """Return the stages that compile kernels; see Mapper.warm_up_stages."""
         return [
-            *reduction_stages(self.config),
+            *map_stages(self.config),
             *self.preparation.warm_up_stages(self.config),
             *self.layers.warm_up_stages(),
         ]
@@ -581,12 +592,10 @@ class ScanPipeline:
 
 def removed_voxels(
     removed: Sequence[npt.NDArray[np.int32]],
-    alignment: Alignment | None,
+    alignment: Alignment,
     changed: Surfels,
 ) -> npt.NDArray[np.int32]:
-    """Return the voxels (K, 3) that were surfels before the scan and are none after it."""
-    if alignment is None:
-        return np.concatenate(removed)
+    """Return the voxels (K, 3) that were surfels before the alignment and are none after it."""
     gone = np.unique(np.concatenate([*removed, alignment.removed_voxel_index]), axis=0)
     left: npt.NDArray[np.int32] = gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]
     return left

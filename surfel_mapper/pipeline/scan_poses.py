@@ -1,10 +1,17 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Poses of the sensor in the fixed frame at the times of a scan: looked up, or registered.
+ScanPoses: poses of the sensors, looked up or registered; ScanQueue: scans that wait for theirs.
 
-Extrinsics of the configuration become static transforms when a frame is first seen, so that
-lookups need only the tree of frames.
+Extrinsics of the configuration become static transforms when a frame is first seen. Lookups need
+only the tree of frames.
+
+A scan older than the one before it of its topic and frame is put before that, if it still waits.
+
+Time is the stamps of the data alone, never the clock: a bag replayed at any speed waits and drops
+alike. A scan whose pose cannot come any more, or did not within ``pose.max_wait_s`` of the newest
+data, is dropped and counted. The wait is longer, ``pose.max_delay_s``, while the scan is newer
+than all poses: these are on the way.
 """
 
 from __future__ import annotations
@@ -15,13 +22,18 @@ from functools import partial
 import math
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from surfel_mapper.arguments import is_unit
-from surfel_mapper.config import Config
-from surfel_mapper.errors import PoseError
+from surfel_mapper.config import Config, PoseConfig
+from surfel_mapper.errors import PoseError, PoseNotYetError, PosesLateError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.map_origin import MapOrigin
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
+from surfel_mapper.pipeline.scan_images import ScanImages
+from surfel_mapper.pipeline.stamp_guard import source_of
 from surfel_mapper.poses import MAX_TRANSFORMS, MountChanges, TransformBuffer
 from surfel_mapper.poses.buffer import FrameMove
 from surfel_mapper.scan import PointTimes, Scan
@@ -57,6 +69,10 @@ class ScanPoses:
         The tree of frames; the origin of the fixed frame is that of the map.
     mounts : MountChanges
         Sensors that have moved on the robot.
+    fixed : str
+        Name of the fixed frame.
+    mounted : set of str
+        The frames of sensors; extrinsics of the configuration were entered, if there are any.
     registered : RegisteredPoses, optional
         The poses by registration, if ``pose.source`` is ``registration``, or auto chose it.
 
@@ -64,11 +80,12 @@ class ScanPoses:
 
     def __init__(self, config: Config, drops: Drops, origin: MapOrigin) -> None:
         self._config = config
+        self.fixed = config.frames.fixed
         self._drops = drops
         self.origin = origin
         self._early: deque[tuple[str, str, int, Transform, bool]] = deque(maxlen=MAX_EARLY)
         self._warned_of_norm = False
-        self._sensors: set[str] = set()
+        self.mounted: set[str] = set()
         self._configured: set[str] = set()  # sensors whose mount is in the configuration
         self._last_ns: int | None = None  # stamp of the last scan that has a pose
         self.mounts = MountChanges()
@@ -116,7 +133,7 @@ class ScanPoses:
         """Log the move of a frame, if a sensor of earlier scans is mounted on it."""
         fixed, transforms = self._config.frames.fixed, self.transforms
         if self._last_ns is not None and any(
-            transforms.is_between(move.child, fixed, sensor) for sensor in self._sensors
+            transforms.is_between(move.child, fixed, sensor) for sensor in self.mounted
         ):
             self._drops.warn(f'mount {move.child}', self.mounts.add(move, self._last_ns))
 
@@ -130,7 +147,7 @@ class ScanPoses:
         self, parent: str, child: str, stamp_ns: int, transform: Transform, static: bool
     ) -> None:
         """Add a pose, shifted by the origin of the map if it is in the fixed frame."""
-        fixed = self._config.frames.fixed
+        fixed = self.fixed
         if self.origin.has_own_frame and fixed in (parent, child):
             if not self.origin.is_known and child == fixed:
                 self._early.append((parent, child, stamp_ns, transform, static))
@@ -149,12 +166,12 @@ class ScanPoses:
 
     def mount(self, frame_id: str) -> None:
         """Add the configured extrinsics of a sensor when its frame is first seen."""
-        if frame_id in self._sensors:
+        if frame_id in self.mounted:
             return
-        if len(self._sensors) >= MAX_SENSORS:
-            self._sensors.clear()
+        if len(self.mounted) >= MAX_SENSORS:
+            self.mounted.clear()
             self._configured.clear()
-        self._sensors.add(frame_id)
+        self.mounted.add(frame_id)
         values, base = self._config.frames.mount_of(frame_id), self._config.frames.base
         if values and frame_id != base:
             self.add(base, frame_id, 0, values[:3], values[3:], static=True)
@@ -185,25 +202,25 @@ class ScanPoses:
             return self.origin.T_local_fixed
         if self.registered is not None:
             self.registered.learn_motion(scan, following)
-        pose = self._at(scan.frame_id, scan.stamp_ns)
-        if scan.times is not None:  # the poses of all points have to be there
-            first_ns, last_ns = scan.times.first_ns, scan.times.last_ns
-            if self.registered is None:
-                fixed = self._config.frames.fixed
-                self.transforms.check_span(fixed, scan.frame_id, first_ns, last_ns)
-            else:
-                self._at(scan.frame_id, first_ns)
-                self._at(scan.frame_id, last_ns)
+            pose = self.registered.predict(scan.frame_id, scan.stamp_ns)
+        else:
+            pose = self.transforms.lookup(self.fixed, scan.frame_id, scan.stamp_ns)
+        if scan.times is not None:
+            self._check_sweep(scan.frame_id, scan.times)
         self._last_ns = max(scan.stamp_ns, self._last_ns or 0)
         return pose
 
-    def newest_for(self, frame_id: str) -> int | None:
-        """Return the newest stamp of transforms, for the wait for the pose of a sensor."""
-        return self.transforms.newest_beside(self._config.frames.fixed, frame_id)
+    def _check_sweep(self, frame_id: str, times: PointTimes) -> None:
+        """Raise unless the poses of all points of a scan are there."""
+        if self.registered is None:
+            self.transforms.check_span(self.fixed, frame_id, times.first_ns, times.last_ns)
+        else:
+            self.registered.predict(frame_id, times.first_ns)
+            self.registered.predict(frame_id, times.last_ns)
 
     def deskewing(self, scan: Scan, times: PointTimes) -> Callable[[], Scan]:
         """Look up the poses within a sweep; return the function that deskews the scan."""
-        fixed, sensor = self._config.frames.fixed, scan.frame_id
+        fixed, sensor = self.fixed, scan.frame_id
         stamps = self.transforms.stamps(fixed, sensor, times.first_ns, times.last_ns)
         min_range_m = self._config.input.min_range_m
         return deskewing(scan, partial(self._at, sensor), stamps, min_range_m)
@@ -240,4 +257,162 @@ class ScanPoses:
         """Return T_fixed_sensor at a time."""
         if self.registered is not None:
             return self.registered.predict(frame_id, stamp_ns)
-        return self.transforms.lookup(self._config.frames.fixed, frame_id, stamp_ns)
+        return self.transforms.lookup(self.fixed, frame_id, stamp_ns)
+
+
+PosedScan = tuple[Scan, Transform]
+"""A scan and its T_fixed_sensor."""
+
+
+class ScanQueue:
+    """
+    A bounded queue of scans, and behind it the scans that have their poses.
+
+    Parameters
+    ----------
+    max_scans : int
+        Scans that may wait; of more, the oldest is dropped.
+    poses : ScanPoses
+        The poses of the sensors.
+    images : ScanImages, optional
+        Scans wait for these images as well.
+    drops : Drops
+        Counts the scans that are dropped.
+
+    Attributes
+    ----------
+    max_scans : int
+        See above.
+    waiting : deque of Scan
+        The scans that wait for their poses.
+    posed : deque of (Scan, (4, 4) float64)
+        The next scans to map, and their T_fixed_sensor.
+    ended : bool
+        No poses come any more: a scan without one is dropped at once, for those behind it.
+    is_open : bool
+        False while the source of the poses is unknown: scans wait, at most ``max_scans``.
+
+    """
+
+    def __init__(
+        self, max_scans: int, poses: ScanPoses, images: ScanImages | None, drops: Drops
+    ) -> None:
+        self.max_scans = max_scans
+        self._poses = poses
+        self._images = images
+        self._drops = drops
+        self.waiting: deque[Scan] = deque()
+        self.posed: deque[PosedScan] = deque()
+        self.ended = False
+        self.is_open = True
+
+    def push(self, scan: Scan) -> None:
+        """Add a scan, before newer ones of its source; beyond the limit the first is dropped."""
+        source, row = source_of(scan), len(self.waiting)
+        for at, other in enumerate(self.waiting):
+            if other.stamp_ns > scan.stamp_ns and source_of(other) == source:
+                row = at
+                break
+        self.waiting.insert(row, scan)
+        if len(self.waiting) > self.max_scans:
+            reason = f'{self.max_scans} newer scans wait for their poses'
+            self._drops.scan(self.waiting.popleft(), 'queue_full', reason)
+
+    def drop_odd(self, scan: Scan, odd_ns: int) -> None:
+        """Drop the scan of a stamp ahead of the next one of its frame, if it still waits."""
+        reason = f'its stamp is {(odd_ns - scan.stamp_ns) / 1e9:.3f} s ahead of the next scan'
+        for row, other in enumerate(self.waiting):
+            if (source_of(other), other.stamp_ns) == (source_of(scan), odd_ns):
+                del self.waiting[row]
+                self._drops.scan(other, 'odd_stamp', reason)
+                return
+        at = f'scan at {odd_ns / 1e9:.6f} s in frame {scan.frame_id!r}'
+        self._drops.warn('odd_stamp', f'{at}: {reason}, but it is mapped')
+
+    def fill_posed(
+        self, number: int, newest_of: Callable[[Scan], int | None], config: PoseConfig
+    ) -> int:
+        """
+        Fill ``posed`` to a number of scans, if their poses are there; return its length.
+
+        Parameters
+        ----------
+        number : int
+            Length to fill it to.
+        newest_of : callable
+            Returns the newest stamp of scans that tells how long a scan has waited.
+        config : PoseConfig
+            Longest waits.
+
+        """
+        while self.is_open and self.waiting and len(self.posed) < number:
+            scan = self.waiting[0]
+            pose_or_reason = self._pose_of(scan, newest_of(scan), config)
+            if pose_or_reason is None:
+                break
+            self.waiting.popleft()
+            if isinstance(pose_or_reason, str):
+                self._drops.scan(scan, 'no_pose', pose_or_reason)
+            else:
+                self.posed.append((scan, pose_or_reason))
+        return len(self.posed)
+
+    def drop_waiting(self, cause: str, reason: str) -> None:
+        """Drop every scan that waits for its pose."""
+        while self.waiting:
+            self._drops.scan(self.waiting.popleft(), cause, reason)
+
+    def drop_all(self, cause: str, reason: str) -> None:
+        """Drop every scan, with its pose or without."""
+        while self.posed:
+            self._drops.scan(self.posed.popleft()[0], cause, reason)
+        self.drop_waiting(cause, reason)
+
+    def _pose_of(
+        self, scan: Scan, newest_scan_ns: int | None, config: PoseConfig
+    ) -> Transform | str | None:
+        """Return T_fixed_sensor, the reason why it will not come, or None while it may come."""
+        newest_ns = scan.stamp_ns
+        newest_pose_ns = self._poses.transforms.newest_beside(self._poses.fixed, scan.frame_id)
+        for stamp_ns in (newest_scan_ns, newest_pose_ns):
+            if stamp_ns is not None and stamp_ns > newest_ns:
+                newest_ns = stamp_ns
+        waited_s = (newest_ns - scan.end_ns) / 1e9
+        images = self._images if waited_s <= config.max_wait_s else None
+        if images is not None and images.is_waiting(scan):
+            return None
+        try:
+            return self._poses.of(scan, self.waiting[1] if len(self.waiting) > 1 else None)
+        except PoseNotYetError as error:
+            is_late = isinstance(error, PosesLateError)
+            longest_s = max(config.max_wait_s, config.max_delay_s if is_late else 0.0)
+            if not self.ended and waited_s <= longest_s:
+                return None
+            within = 'until the end of the input' if self.ended else f'within {waited_s:.3f} s'
+            return f'no pose {within}: {error}'
+        except PoseError as error:
+            return str(error)
+
+
+def viewpoint(T_map_sensor: Transform, config: Config) -> Transform | None:
+    """Return the position of the sensor; None if unknown, and normals stay as they are."""
+    if config.pose.source != 'identity':
+        return T_map_sensor[:3, 3]
+    place = standing_sensor(config)
+    if place is None:
+        return None
+    moved: npt.NDArray[np.float64] = (T_map_sensor[:3, :3] * place).sum(axis=1)
+    return moved + T_map_sensor[:3, 3]
+
+
+def standing_sensor(config: Config) -> npt.NDArray[np.float64] | None:
+    """
+    Return where the sensor stands with ``pose.source: identity``, (3,) m in the fixed frame.
+
+    Only ``frames.base_to_sensor`` tells: clouds in the fixed frame may be those of a sensor that
+    stands in its origin, or made of the scans of one that moves.
+    """
+    values = config.frames.base_to_sensor
+    if config.pose.source != 'identity' or config.frames.sensors or not values:
+        return None
+    return np.array(values[:3])

@@ -34,8 +34,8 @@ MAX_AHEAD_S = 60.0
 ALONE_S = 2.0
 """Span of the odd stamps of a source that no other message contradicts, to believe them, s."""
 
-OUT_OF_STEP_S = 4.0
-"""A scan further ahead of the poses is odd if the scans of another sensor are not, s."""
+OUT_OF_STEP_NS = 4 * 10**9
+"""A scan further ahead of the poses is odd if the scans of another sensor are not, ns."""
 
 MAX_WAITING = 5000
 """Number of odd messages that wait; 2 s of poses at 1 kHz are within it."""
@@ -140,7 +140,9 @@ class StampGuard:
             waiting.append(message)
             return []
         self._odd = []
-        judged = [Judged(m) if agrees else self._refused(m) for m in waiting]
+        judged = []
+        for other in waiting:
+            judged.append(Judged(other) if agrees else self._refused(other))
         if agrees:
             is_odd, self.newest_ns = False, waiting[-1].stamp_ns
             step_ns = message.stamp_ns - waiting[-1].stamp_ns
@@ -190,17 +192,6 @@ class StampGuard:
                 return Order(cause, f'its stamp is {behind_s:.3f} s before the one before it')
             self._recent_ns[source].append(stamp_ns)
             return Order()
-        self._enter(source, stamp_ns, last_ns)
-        return Order(back_s=back_s, odd_ns=odd_ns)
-
-    def forget_scans(self) -> None:
-        """Forget the stamps of all scans, as after time was set back."""
-        self._scan_ns.clear()
-        self._previous_ns.clear()
-        self._recent_ns.clear()
-
-    def _enter(self, source: Source, stamp_ns: int, last_ns: int | None) -> None:
-        """Keep the stamp of a scan as the newest of its source."""
         if last_ns is not None:
             del self._scan_ns[source]  # its new place is at the end
             self._previous_ns[source] = last_ns
@@ -210,6 +201,13 @@ class StampGuard:
                 stamps.pop(silent, None)
         self._scan_ns[source] = stamp_ns
         self._recent_ns.setdefault(source, deque(maxlen=MAX_RECENT)).append(stamp_ns)
+        return Order(back_s=back_s, odd_ns=odd_ns)
+
+    def forget_scans(self) -> None:
+        """Forget the stamps of all scans, as after time was set back."""
+        self._scan_ns.clear()
+        self._previous_ns.clear()
+        self._recent_ns.clear()
 
     def _newest_of(self, source: Source) -> int | None:
         """Return the newest stamp of a source; of a new one the older of all scans' and poses'."""
@@ -229,7 +227,8 @@ class StampGuard:
         if isinstance(message, Scan):
             source, other_ns = source_of(message), pose_ns
             own_ns, kind_ns = self._newest_of(source), pose_ns if scan_ns is None else scan_ns
-            if pose_ns is not None and self._is_out_of_step(source, stamp_ns, pose_ns):
+            is_ahead = pose_ns is not None and stamp_ns - pose_ns > OUT_OF_STEP_NS
+            if pose_ns is not None and is_ahead and self._is_out_of_step(source, pose_ns):
                 return True
             if self._previous_ns.get(source, stamp_ns) < stamp_ns <= (own_ns or stamp_ns):
                 return False  # the last one is odd: this scan continues those before it
@@ -242,11 +241,10 @@ class StampGuard:
             return False
         return other_ns is None or abs(stamp_ns - other_ns) > self._back_ns
 
-    def _is_out_of_step(self, source: Source, stamp_ns: int, pose_ns: int) -> bool:
-        """Return whether a scan is ahead of the poses, and those of another sensor are not."""
-        limit_ns = round(OUT_OF_STEP_S * 1e9)
-        return stamp_ns - pose_ns > limit_ns and any(
-            abs(scan_ns - pose_ns) <= limit_ns
+    def _is_out_of_step(self, source: Source, pose_ns: int) -> bool:
+        """Return whether scans of another sensor are near the poses, unlike those of a source."""
+        return any(
+            abs(scan_ns - pose_ns) <= OUT_OF_STEP_NS
             for other, scan_ns in self._scan_ns.items()
             if other != source
         )

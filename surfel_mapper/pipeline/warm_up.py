@@ -18,20 +18,18 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.images import warm_up as warm_up_depth
 from surfel_mapper.messages.map_cloud import moment_cloud
-from surfel_mapper.messages.pointcloud2 import warm_up as warm_up_decoding
 from surfel_mapper.messages.scan_normals import scan_with_normals
 from surfel_mapper.messages.surfel_markers import disc_colors, surfel_markers
 from surfel_mapper.pipeline.mapper import Mapper
-from surfel_mapper.pipeline.reduction import expected_type
+from surfel_mapper.pipeline.mapping_stages import expected_type
 from surfel_mapper.scan import Scan
 
 
 def node_stages(mapper: Mapper) -> list[CompileStage]:
     """Return the stages for a node with a mapper."""
     config = mapper.config
-    decoding = warm_up_depth if config.input.kind == 'depth' else warm_up_decoding
     return [
-        CompileStage('decoding', decoding),
+        *([CompileStage('decoding', warm_up_depth)] if config.input.kind == 'depth' else []),
         *mapper.warm_up_stages(),
         CompileStage('messages', partial(compile_messages, config)),
     ]

@@ -107,6 +107,8 @@ class WindowAligner:
     T_map_fixed : (4, 4) float64
         From the fixed frame of the poses that come in, shifted by the origin of the map, to the
         map; the identity at first.
+    is_corrected : bool
+        Whether it is not the identity.
 
     """
 
@@ -117,19 +119,19 @@ class WindowAligner:
     def reset(self) -> None:
         """Drop the correction, as for an empty map."""
         self.T_map_fixed: Transform = np.eye(4)
-        self._is_corrected = False
+        self.is_corrected = False
         self._samples: dict[int, tuple[object, Samples]] = {}
         self._num_new = 0
 
     def to_map(self, T_fixed_sensor: Transform) -> Transform:
         """Return the pose in the map of a sensor whose pose in the fixed frame is given."""
-        if not self._is_corrected:
+        if not self.is_corrected:
             return T_fixed_sensor  # to the bit
         return compose(self.T_map_fixed, T_fixed_sensor)
 
     def to_fixed(self, T_map_sensor: Transform) -> Transform:
         """Return the pose in the fixed frame of a sensor whose pose in the map is given."""
-        if not self._is_corrected:
+        if not self.is_corrected:
             return T_map_sensor  # to the bit
         return compose(inverse(self.T_map_fixed), T_map_sensor)
 
@@ -137,7 +139,7 @@ class WindowAligner:
         """Correct later scans as the newest one was moved in the map."""
         if not np.array_equal(T_after_before, IDENTITY):
             self.T_map_fixed = compose(T_after_before, self.T_map_fixed)
-            self._is_corrected = not np.array_equal(self.T_map_fixed, IDENTITY)
+            self.is_corrected = not np.array_equal(self.T_map_fixed, IDENTITY)
 
     def is_due(self, every_scans: int) -> bool:
         """Count a scan, and return whether it is time to align."""

@@ -31,7 +31,7 @@ from std_msgs.msg import Header
 from surfel_mapper.compilation import PROGRESS
 from surfel_mapper.config import Config
 from surfel_mapper.errors import one_line
-from surfel_mapper.pipeline.reduction import standing_sensor
+from surfel_mapper.pipeline.scan_poses import standing_sensor
 from surfel_mapper.ros.base_node import CountedPublisher, Ticker
 from surfel_mapper.ros.context import UDP_PROFILE
 from surfel_mapper.ros.health import ERROR, findings, Interval, OFF_S, OK

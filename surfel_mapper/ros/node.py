@@ -36,7 +36,7 @@ from rosgraph_msgs.msg import Clock
 from surfel_mapper.budget import stated_limit
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError, SurfelMapperError
-from surfel_mapper.pipeline.reduction import standing_sensor
+from surfel_mapper.pipeline.scan_poses import standing_sensor
 from surfel_mapper.ros.base_node import BaseNode, result_of
 from surfel_mapper.ros.bond import Bond
 from surfel_mapper.ros.diagnostics import Diagnostics

@@ -28,8 +28,7 @@ from visualization_msgs.msg import MarkerArray
 from surfel_mapper.config import Config
 from surfel_mapper.filters.columns import as_fields
 from surfel_mapper.mapping.ages import Ages
-from surfel_mapper.mapping.surfel_columns import surfel_columns
-from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.surfels import surfel_columns, Surfels
 from surfel_mapper.messages.map_cloud import moment_cloud, voxel_columns
 from surfel_mapper.messages.markers import marker_array
 from surfel_mapper.messages.pointcloud2 import from_columns

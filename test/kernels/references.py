@@ -38,7 +38,6 @@ REFERENCES = {
     'mapping/kernels/surfels.py': 'mapping/kernels/test_surfels.py',
     'mapping/kernels/voxels.py': 'mapping/test_surfel_map.py',
     'messages/kernels/attach.py': 'messages/test_scan_normals.py',
-    'messages/kernels/coordinates.py': 'messages/test_pointcloud2.py',
     'messages/kernels/discs.py': 'messages/test_surfel_markers.py',
     'messages/kernels/triangles.py': 'messages/test_surfel_markers.py',
     'models/kernels/bisection.py': 'models/kernels/test_bisection.py',

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import NotInMapError
-from surfel_mapper.mapping import voxel_table as module
+from surfel_mapper.mapping import moment_map as module
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.reference import add_moments, as_twin, digest, scan_moments
 

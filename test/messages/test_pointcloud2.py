@@ -22,8 +22,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.mapping.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import surfel_columns
 from surfel_mapper.messages.pointcloud2 import (
     append_fields,
     Field,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 
+import numpy as np
 import pytest
 
 from surfel_mapper import layers
@@ -72,6 +73,26 @@ def test_a_failure_before_the_map_costs_one_scan(monkeypatch, caplog, stage, err
     assert_counts_add_up(mapper)
 
 
+class Busy(Layer):
+    """A layer that takes part in both tasks of a scan."""
+
+    name = 'busy'
+
+    def voxels_to_clear(self, inserted):
+        return np.empty((0, 3), np.int32)
+
+    def follow(self, inserted):
+        return inserted.num_points
+
+
+@pytest.fixture
+def busy():
+    layers.register('busy', f'{__name__}:Busy')
+    yield
+    layers.unregister('busy')
+
+
+@pytest.mark.usefixtures('busy')
 @pytest.mark.parametrize('stage', AFTER)
 @pytest.mark.parametrize('error', ERRORS, ids=lambda error: type(error).__name__)
 def test_changes_of_a_mapped_scan_whose_update_fails_come_with_the_next(monkeypatch, stage, error):

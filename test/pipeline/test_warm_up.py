@@ -14,9 +14,7 @@ from numba.core.dispatcher import Dispatcher
 import numpy as np
 
 from surfel_mapper.config import Config
-from surfel_mapper.messages.pointcloud2 import (
-    cloud_bytes, from_columns, parse_cloud, to_scan, warm_up
-)
+from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns, parse_cloud, to_scan
 from surfel_mapper.pipeline import Mapper
 
 def kernels():
@@ -42,7 +40,6 @@ def mapped(number):
     return list(mapper.insert_ready())
 
 mapper = Mapper(Config.from_mapping({'pose.source': 'identity', 'window.max_scans': 2}))
-warm_up()
 mapper.warm_up()
 before = kernels()
 updates = [update for number in range(1, 6) for update in mapped(number)]

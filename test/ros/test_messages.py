@@ -12,8 +12,8 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2
 
-from surfel_mapper.mapping.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import surfel_columns
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.ros.messages import cloud_message, time_message
 from test.ros.live import room

@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.files.ply import read_points
-from surfel_mapper.mapping.surfel_columns import surfel_columns
+from surfel_mapper.mapping.surfels import surfel_columns
 from surfel_mapper.messages.pointcloud2 import to_scan
 from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
 from test.ros.live import (

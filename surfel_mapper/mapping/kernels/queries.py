@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Select surfels and rows of the slab: by place, by version, by box, by the hash of the voxel key.
+Select surfels and rows of the slab: by place, by box, by the hash of the voxel key.
 
 By place: surfels are found by the hash of their voxel. Around a point all voxels that a ball
 touches are looked up, (2 r / voxel_size + 1)^3 of them, so the cost grows with the radius and not
@@ -18,22 +18,9 @@ import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, U
 from surfel_mapper.kernels.grouping import find_key, hash_shift
-from surfel_mapper.kernels.layout import (
-    EMPTIED,
-    INDEX_OFFSET,
-    KEY,
-    ROW,
-    STAMPS,
-)
-from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
+from surfel_mapper.kernels.layout import INDEX_OFFSET, KEY
 from surfel_mapper.kernels.quantisation import in_range, pack, unpack
 from surfel_mapper.mapping.kernels.rows import count_of, first_word
-
-AHEAD = 16
-"""Number of rows between the prefetch of a row and its use."""
-
-EARLY = 64
-"""Number of rows between the early prefetch of a stamp and its use."""
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio, odd."""
@@ -141,70 +128,6 @@ def keys_in_box(rows, used, low, high):
         if inside and count_of(flat, first_word(row)) > 0:
             kept[num] = key
             num += 1
-    return kept[:num].copy()
-
-
-@kernel()
-def rows_changed_at(rows, stamps, changed, stamp, min_points):
-    """
-    Return the rows of at least min_points points whose last change has a stamp.
-
-    rows        (R, 12) int64, the slab
-    stamps      (R,) uint32, the last change of each row
-    changed     (K,) int32, the rows in question
-    stamp       uint32
-    min_points  0: emptied rows too
-
-    Stamps tell which rows are empty, so rows themselves are read only for a higher min_points.
-    """
-    kept = np.empty(len(changed), np.int32)
-    ignored = EMPTIED if min_points < 1 else 0
-    num, num_changed = U(0), U(len(changed))
-    for index in range(num_changed):
-        if index + U(EARLY) < num_changed:
-            prefetch_early(stamps, np.int64(changed[index + U(EARLY)]))
-        row = changed[index]
-        kept[num] = row  # a branch would be mispredicted half of the time
-        num += U((stamps[U(row)] ^ stamp) <= ignored)
-    return kept[:num] if min_points <= 1 else kept[: keep_full(rows, kept, num, min_points)]
-
-
-@njit(cache=True, nogil=True, inline='always')
-def keep_full(rows, kept, num, min_points):
-    """Move the rows of at least min_points points to the front; return their number."""
-    flat = rows.ravel()
-    num_full = 0
-    for index in range(num):
-        if index + AHEAD < num:
-            prefetch(flat, np.int64(kept[index + AHEAD]) * ROW)
-        row = kept[index]
-        kept[num_full] = row
-        num_full += count_of(flat, first_word(row)) >= min_points
-    return num_full
-
-
-@kernel()
-def rows_changed_after(rows, stamps, used, stamp, changes, min_points):
-    """
-    Return the rows of at least min_points points that the latest changes changed.
-
-    rows        (R, 12) int64, the slab
-    stamps      (R,) uint32, the last change of each row
-    used        number of rows ever used
-    stamp       uint32, of the latest change
-    changes     int64, number of changes
-    min_points  0: emptied rows too
-    """
-    kept = np.empty(used, np.int32)
-    ignored = EMPTIED if min_points < 1 else 0
-    num = 0
-    for row in range(used):
-        last = np.int64(stamps[row])
-        age = (((stamp | EMPTIED) - last) & STAMPS) >> 1
-        kept[num] = row
-        num += (age < changes) & (last & EMPTIED <= ignored)
-    if min_points > 1:
-        num = keep_full(rows, kept, num, min_points)
     return kept[:num].copy()
 
 

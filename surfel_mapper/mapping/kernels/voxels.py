@@ -47,6 +47,7 @@ from surfel_mapper.kernels.layout import (
     KEY,
     PRODUCT,
     ROW,
+    STAMPS,
     SUM,
     VIEW,
 )
@@ -365,6 +366,70 @@ def holds_exactly(words, flat, at, voxel):
     for pair in range(U(6)):
         equal &= flat[at + U(PRODUCT) + pair] == product[U(6) * voxel + pair]
     return equal
+
+
+@kernel()
+def rows_changed_at(rows, stamps, changed, stamp, min_points):
+    """
+    Return the rows of at least min_points points whose last change has a stamp.
+
+    rows        (R, 12) int64, the slab
+    stamps      (R,) uint32, the last change of each row
+    changed     (K,) int32, the rows in question
+    stamp       uint32
+    min_points  0: emptied rows too
+
+    Stamps tell which rows are empty, so rows themselves are read only for a higher min_points.
+    """
+    kept = np.empty(len(changed), np.int32)
+    ignored = EMPTIED if min_points < 1 else 0
+    num, num_changed = U(0), U(len(changed))
+    for index in range(num_changed):
+        if index + U(EARLY) < num_changed:
+            prefetch_early(stamps, np.int64(changed[index + U(EARLY)]))
+        row = changed[index]
+        kept[num] = row  # a branch would be mispredicted half of the time
+        num += U((stamps[U(row)] ^ stamp) <= ignored)
+    return kept[:num] if min_points <= 1 else kept[: keep_full(rows, kept, num, min_points)]
+
+
+@njit(cache=True, nogil=True, inline='always')
+def keep_full(rows, kept, num, min_points):
+    """Move the rows of at least min_points points to the front; return their number."""
+    flat = rows.ravel()
+    num_full = 0
+    for index in range(num):
+        if index + AHEAD < num:
+            prefetch(flat, np.int64(kept[index + AHEAD]) * ROW)
+        row = kept[index]
+        kept[num_full] = row
+        num_full += count_of(flat, first_word(row)) >= min_points
+    return num_full
+
+
+@kernel()
+def rows_changed_after(rows, stamps, used, stamp, changes, min_points):
+    """
+    Return the rows of at least min_points points that the latest changes changed.
+
+    rows        (R, 12) int64, the slab
+    stamps      (R,) uint32, the last change of each row
+    used        number of rows ever used
+    stamp       uint32, of the latest change
+    changes     int64, number of changes
+    min_points  0: emptied rows too
+    """
+    kept = np.empty(used, np.int32)
+    ignored = EMPTIED if min_points < 1 else 0
+    num = 0
+    for row in range(used):
+        last = np.int64(stamps[row])
+        age = (((stamp | EMPTIED) - last) & STAMPS) >> 1
+        kept[num] = row
+        num += (age < changes) & (last & EMPTIED <= ignored)
+    if min_points > 1:
+        num = keep_full(rows, kept, num, min_points)
+    return kept[:num].copy()
 
 
 @kernel()
