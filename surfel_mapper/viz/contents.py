@@ -21,7 +21,6 @@ import numpy.typing as npt
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files import map_state, parquet, ply
 from surfel_mapper.files.arrays import is_cloud
-from surfel_mapper.files.foreign_points import has_faces
 from surfel_mapper.files.latest_map import DRAWABLE, map_in
 from surfel_mapper.files.parquet_tiles import tiles_in
 from surfel_mapper.files.scan_files import looks_like_points, read_scan
@@ -141,7 +140,7 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
         raise FileFormatError(f'{path}: no such file or directory')
     name, suffix = name or path.stem, path.suffix.lower()
     is_table = suffix in TABLES and looks_like_points(path)
-    if is_table or is_cloud(path) or (suffix == '.obj' and not has_faces(path)):
+    if is_table or is_cloud(path) or (suffix == '.obj' and looks_like_points(path)):
         yield cloud(path, name)
     elif suffix == '.npz':
         moments, empty, scans = map_state.load_moments(path)
