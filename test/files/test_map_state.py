@@ -107,16 +107,6 @@ def test_moments_are_read_without_their_map(tmp_path):
     assert [scan.stamp_ns for scan in scans] == [scan.stamp_ns for scan in window]
 
 
-@pytest.mark.parametrize('name', ['duplicate', 'count', 'shape', 'type', 'missing', 'pose'])
-def test_impossible_moments_are_refused(tmp_path, name):
-    save_map(tmp_path / 'map.npz', *driven())
-    arrays, attributes = load_state(tmp_path / 'map.npz')
-    globals()[f'damage_{name}'](arrays, attributes)
-    save_state(tmp_path / 'map.npz', arrays, attributes)
-    with pytest.raises(FileFormatError, match='damaged'):
-        load_moments(tmp_path / 'map.npz')
-
-
 def test_an_empty_map_comes_back(tmp_path):
     save_map(tmp_path / 'map.npz', SurfelMap(0.25))
     loaded, scans = load_map(tmp_path / 'map.npz')
@@ -141,59 +131,30 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
         load_map(tmp_path / 'map.npz')
 
 
-def damage_duplicate(arrays, attributes):
-    arrays['map.key'][1] = arrays['map.key'][0]
-
-
-def damage_count(arrays, attributes):
-    arrays['map.count'][0] = 0
-
-
-def damage_negative_count(arrays, attributes):
-    arrays['scan1.count'][0] = -4
-
-
-def damage_sum(arrays, attributes):
-    arrays['map.total'][0, 0] = 10**15
-
-
-def damage_shape(arrays, attributes):
-    arrays['map.product'] = arrays['map.product'][:, :5].copy()
-
-
-def damage_type(arrays, attributes):
-    arrays['map.total'] = arrays['map.total'].astype(np.float64)
-
-
-def damage_digest(arrays, attributes):
-    attributes['digest'] = '0' * 64
-
-
-def damage_missing(arrays, attributes):
-    del arrays['scan0.view']
-
-
-def damage_scan(arrays, attributes):
-    arrays['scan0.key'][0] = 1  # a voxel that the map does not have
-
-
-def damage_pose(arrays, attributes):
-    arrays['scans.pose'][0, 0, 0] = np.nan
-
-
-def damage_voxel_size(arrays, attributes):
-    attributes['voxel_size_m'] = 'large'
-
-
 @pytest.mark.parametrize(
-    'damage', [value for name, value in sorted(globals().items()) if name.startswith('damage_')]
+    ('name', 'change'),
+    [
+        ('map.key', lambda keys: np.repeat(keys[:1], len(keys))),
+        ('map.count', lambda counts: 0 * counts),
+        ('scan1.count', np.negative),
+        ('map.total', lambda totals: totals + 10**15),
+        ('map.product', lambda products: products[:, :5].copy()),
+        ('map.total', lambda totals: totals.astype(np.float64)),
+        ('digest', lambda _: '0' * 64),
+        ('scan0.view', None),
+        ('scan0.key', lambda keys: np.arange(len(keys))),  # voxels that the map does not have
+        ('scans.pose', lambda poses: np.nan * poses),
+        ('voxel_size_m', lambda _: 'large'),
+    ],
 )
-def test_contents_that_no_map_can_have_are_refused(tmp_path, damage):
+def test_contents_that_no_map_can_have_are_refused(tmp_path, name, change):
     """The hash of a file proves that it is unchanged, not that its content is a possible map."""
-    surfel_map, window = driven()
-    save_map(tmp_path / 'map.npz', surfel_map, window)
+    save_map(tmp_path / 'map.npz', *driven())
     arrays, attributes = load_state(tmp_path / 'map.npz')
-    damage(arrays, attributes)
+    changed = arrays if name in arrays else attributes
+    value = changed.pop(name)
+    if change:
+        changed[name] = change(value)
     save_state(tmp_path / 'map.npz', arrays, attributes)
 
     with pytest.raises(FileFormatError, match='damaged'):
