@@ -107,3 +107,8 @@ def test_poses_stay_without_loops(drive):
 def test_loops_between_missing_keyframes_are_refused(source, target):
     with pytest.raises(AlignmentError, match=rf'loop {source} -> {target}: expected a later'):
         solve_loops(square(6), [Loop(source, target, np.eye(4))], 0.01)
+
+
+def test_one_keyframe_is_refused():
+    with pytest.raises(AlignmentError, match='1 keyframes, expected two'):
+        solve_loops(square(1), [], 0.01)

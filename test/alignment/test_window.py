@@ -195,3 +195,8 @@ def test_scans_with_nothing_to_match_are_refused():
 
     with pytest.raises(AlignmentError, match=r'0 of 3 scans have enough surfels of 1 m'):
         align_scans([scan] * 3, np.array([np.eye(4)] * 3))
+
+
+def test_frames_that_are_not_one_for_each_scan_are_refused():
+    with pytest.raises(AlignmentError, match='1 frames of 2 scans'):
+        align_scans([NOTHING] * 2, np.array([np.eye(4)] * 2), frame_ids=['front'])

@@ -117,19 +117,6 @@ def after(number):
     return lambda: next(asked, None) is None
 
 
-def test_a_stopped_run_gives_the_map_of_the_shards_done(tmp_path):
-    bag, config = written(tmp_path, 'plain')
-    expected = in_one_go(bag, config, duration_s=RECORDED_S / 6 * 2 - 1e-6)
-
-    shards = shards_of(bag, config, 1.0)
-    mapped = map_bags([shards], Workers(), stopped=after(2))
-
-    assert mapped.interrupted
-    assert mapped.num_shards == 2
-    assert mapped.mapper.map == expected.map
-    assert counted(mapped.counts) == counted(expected.summary())
-
-
 def test_shards_after_a_gap_are_left_out_when_it_is_stopped(tmp_path):
     first, config = written(tmp_path, 'plain')
     second, _ = written(tmp_path, 'faults')
@@ -143,16 +130,6 @@ def test_shards_after_a_gap_are_left_out_when_it_is_stopped(tmp_path):
     assert mapped.mapper.map == expected.map
     with pytest.raises(MapError, match='no scan was mapped'):
         map_bags(bags, LastFirst(), stopped=after(1))
-
-
-@pytest.mark.parametrize('shards_asked', [5, 6])
-def test_a_bag_in_which_time_is_set_back_is_left_out_when_it_is_stopped(tmp_path, shards_asked):
-    """Its first shard was kept if the stop came before it was mapped again."""
-    bag, config = written(tmp_path, 'time set back')
-    shards = shards_of(bag, config, 1.0)
-    assert len(shards) == 6
-    with pytest.raises(MapError, match='no scan was mapped'):
-        map_bags([shards], Workers(), stopped=after(shards_asked))
 
 
 def test_several_bags_make_the_sum_of_their_maps(tmp_path):

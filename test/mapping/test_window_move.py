@@ -52,27 +52,6 @@ def moved(surfel_map, window, changes):
     }
 
 
-def test_the_map_equals_one_built_where_the_scans_are_now(window):
-    surfel_map, window = window
-
-    window.move(moved(surfel_map, window, {0: shifted(7.0), 2: shifted(-0.01)}))
-
-    assert [scan.T_map_sensor[0, 3] for scan in window] == [7.0, 0.3, -0.01]
-    assert surfel_map.digest() == rebuilt(window).digest()
-
-
-def test_moved_scans_leave_without_a_trace(window):
-    surfel_map, window = window
-    window.move(moved(surfel_map, window, {0: shifted(7.0), 1: shifted(3.0)}))
-
-    for number in range(3, 6):
-        points = np.random.default_rng(number).uniform(-3.0, 3.0, (200, 3))
-        window.insert(scan_at(surfel_map, points, shifted(0.0), number))
-
-    assert len(window) == 3
-    assert surfel_map.digest() == rebuilt(window).digest()
-
-
 def test_voxels_that_fell_below_are_named_once_and_only_those(window):
     surfel_map, window = window
     before = surfel_map.surfels(3).voxel_index

@@ -60,22 +60,6 @@ def test_odometry_without_a_child_frame_has_the_poses_of_the_base(caplog):
     assert '/odom: child_frame_id is empty' in caplog.text
 
 
-@pytest.mark.parametrize('kind', ['odometry', 'tf', 'pose'])
-def test_the_leading_slash_of_ros1_frames_is_left_out(kind):
-    entries = Entries()
-    entries.odometry('/odom', STAMP_NS, XYZ)
-    entries.transform('/tf', STAMP_NS, '/odom', '/base_link', XYZ)
-    entries.pose_stamped('/pose', STAMP_NS, XYZ)
-    odometry, transform, pose = (message for *_, message in entries)
-    odometry.header.frame_id, odometry.child_frame_id = '/odom', '/base_link'
-    pose.header.frame_id = '/odom'
-    message = {'odometry': odometry, 'tf': transform, 'pose': pose}[kind]
-
-    (found,) = poses_in(kind, message, 'base_link')
-
-    assert (found.parent, found.child) == ('odom', 'base_link')
-
-
 names = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=9)
 numbers = st.floats(allow_nan=False)
 transforms = st.lists(

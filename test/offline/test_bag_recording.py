@@ -23,10 +23,8 @@ from test.bags.recorded import (
     NUM_SCANS,
     ODOMETRY,
     POSE,
-    ROS1,
     START_NS,
     TF,
-    write_ros1,
     write_rosbag2,
 )
 
@@ -67,12 +65,6 @@ def test_every_source_of_poses_gives_the_map_made_by_hand(tmp_path, source, moun
 
     assert mapper.counters.mapped == NUM_SCANS
     assert mapper.map.digest() == expected_digest(entries)
-
-
-def test_a_ros1_bag_gives_the_same_map(tmp_path):
-    mapper = mapped(write_ros1(tmp_path / 'a.bag', drive(ROS1)), {})
-
-    assert mapper.map.digest() == expected_digest(drive())
 
 
 def test_with_identity_clouds_are_mapped_as_they_are(tmp_path):

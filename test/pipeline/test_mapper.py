@@ -7,10 +7,6 @@ Every map is compared by digest with one made from the points and the poses alon
 in, scans received = mapped + gated + dropped + waiting.
 """
 
-from pathlib import Path
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -228,56 +224,6 @@ def test_a_region_that_is_cleared_stays_empty_until_it_is_seen_again():
     removed = update.removed_voxel_index.tolist()
     assert not set(map(tuple, gone.tolist())) & set(map(tuple, removed))
     assert_counts_add_up(mapper)
-
-
-COMPILED_BEFORE_THE_FIRST_SCAN = """
-import importlib, pkgutil
-import numpy as np
-import surfel_mapper
-from surfel_mapper.config import Config
-from surfel_mapper.pipeline import Mapper
-from surfel_mapper.scan import Scan
-
-def compiled():
-    found = {}
-    for module in pkgutil.walk_packages(surfel_mapper.__path__, 'surfel_mapper.'):
-        if '.kernels.' not in module.name:
-            continue
-        module = importlib.import_module(module.name)
-        for name, kernel in vars(module).items():
-            if hasattr(kernel, 'signatures'):
-                found[name] = list(map(str, kernel.signatures))
-    return found
-
-config = Config.from_mapping({'pose.source': 'identity', 'window.max_scans': 2})
-Mapper(config).warm_up()
-before = compiled()
-mapper = Mapper(config)
-rng = np.random.default_rng(1)
-for number in range(8):
-    points = rng.uniform(-9.0, 9.0, (70_000 if number == 5 else 500, 3)).astype(np.float32)
-    if number > 3:
-        points = np.asfortranarray(points)
-    points.setflags(write=number < 3)
-    mapper.add_scan(Scan(points=points, stamp_ns=number * 10**9, frame_id='lidar'))
-    assert len(list(mapper.insert_ready())) == 1
-mapper.map.surfels_changed(since=-1)
-mapper.summary()
-after = compiled()
-print({name: kinds for name, kinds in after.items() if kinds != before[name]})
-"""
-
-
-def test_after_the_warm_up_nothing_is_compiled_any_more():
-    done = subprocess.run(
-        [sys.executable, '-c', COMPILED_BEFORE_THE_FIRST_SCAN],
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == '{}\n'
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from test.pipeline.made_scans import (
     mapper_with,
     S,
     scan_at,
-    TURNED,
 )
 
 pytestmark = pytest.mark.filterwarnings('error')
@@ -58,26 +57,6 @@ def test_updates_keep_a_copy_of_the_map_up_to_date(min_points):
         assert copy == surfels_by_voxel(mapper.map.surfels(min_points))
     assert mapper.map.digest() == reference.digest(moments, 0.5)
     assert dict(mapper.counters.evicted) == {'max_scans': 15}
-
-
-def test_normals_of_an_update_are_those_of_the_exact_twin():
-    mapper = mapper_with(map__min_points=8)
-    rng = np.random.default_rng(1)
-    compared = 0
-    for stamp_s in range(4):
-        add_pose(mapper, stamp_s, x=0.1 * stamp_s, q_xyzw=TURNED)
-        points = rng.uniform([-3, -3, -1], [3, 3, -0.9], (900, 3))
-        (update,) = insert(mapper, scan_at(stamp_s, points=points))
-    twins = reference.as_twin(mapper.map.moments())
-    for voxel, normal in zip(
-        map(tuple, update.changed.voxel_index.tolist()), update.changed.normal, strict=True
-    ):
-        twin = reference.surfel(voxel, twins[voxel], 0.5)
-        e0, e1, e2 = twin['eigenvalues']
-        if e1 - e0 > 1e-4 * e2 and twin['towards'] > 1e-6:
-            compared += 1
-            assert np.linalg.norm(normal - twin['normal']) <= 1e-6
-    assert compared > 100
 
 
 def test_without_deriving_updates_hold_no_surfels_and_the_map_is_the_same():

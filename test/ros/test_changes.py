@@ -21,7 +21,6 @@ from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.messages.map_cloud import (
     halves,
     MapMirror,
-    MAX_RECENT,
     moment_cloud,
     voxel_columns,
     whole,
@@ -167,20 +166,6 @@ def test_a_mirror_follows_clearing_and_loading():
     assert_equal(mirror, node)
 
 
-def test_a_mirror_follows_a_reset_of_time():
-    node, mirror = Node(), MapMirror(0.5)
-    for stamp_s in (100, 101, 102, 5, 6):
-        if stamp_s == 5:  # a second message that agrees, without which the scan is one odd stamp
-            at = 5 * SECOND
-            node.mapper.add_pose('odom', 'base_link', at, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-        mirror.change(node.map_scan(stamp_s * SECOND)[1])
-        assert_equal(mirror, node)
-        assert mirror.stamp_ns == stamp_s * SECOND
-    assert node.mapper.counters.resets == 1
-    mirror.replace(node.full())
-    assert_equal(mirror, node)
-
-
 @pytest.mark.parametrize('fails_first', [False, True])
 @pytest.mark.parametrize(
     ('before', 'after'),
@@ -278,11 +263,3 @@ def test_clouds_without_moments_are_refused_and_change_nothing():
     with pytest.raises(CloudFormatError, match=r'voxels of 0\.4 m'):
         MapMirror(0.4).change(full)
     assert mirror.map.digest() == digest
-
-
-def test_the_memory_for_recent_changes_is_bounded():
-    node, mirror = Node(), MapMirror(0.5)
-    for number in range(MAX_RECENT + 5):
-        mirror.change(node.map_scan(number * SECOND, num=5)[1])
-    assert len(mirror._recent) == MAX_RECENT
-    assert_equal(mirror, node)

@@ -44,17 +44,6 @@ def outputs_for(num):
 
 
 @both
-@pytest.mark.parametrize('times', [1, 7, 49, 98, 10**6 + 3, 2**22, 2**31])
-@pytest.mark.parametrize('place', [(0, 0, 0), (1, -1, 3), (-32768, 32767, 12345)])
-def test_equal_points_spread_by_exactly_0(call, times, place):
-    outputs = outputs_for(1)
-    rows = np.array([row_of([place], times=times)])
-    call(derive_surfels, rows, np.zeros(1, np.int32), 0.5, 16, outputs)
-    assert outputs[4].tolist() == [[0.0] * 3]
-    assert np.isnan(outputs[1]).all()
-
-
-@both
 @pytest.mark.parametrize('bits', [16, 20])
 @pytest.mark.parametrize('times', [1, 3, 10**5, 2**21 - 1, 2**21, 2**30])
 def test_eigenvalues_are_exact_to_rounding_for_any_number_of_points(call, times, bits):

@@ -13,18 +13,12 @@ from surfel_mapper.models.kernels.surfel_classes import (
     classify,
     classify_sparse,
     FLAT,
-    NONE,
     ROUGH,
     YOUNG,
 )
 from surfel_mapper.models.kernels.surfel_groups import (
     find_doubtful,
     mean_normals,
-)
-from surfel_mapper.models.kernels.surfel_links import (
-    find_hosts,
-    ROUNDS,
-    spread,
 )
 from test.kernels.modes import both
 
@@ -69,74 +63,6 @@ def test_classes_and_axes_equal_the_eigen_decomposition(call):
         expected = vectors[row, :, :0:-1].T
         assert np.abs((along * expected).sum(axis=1)) == pytest.approx([1.0, 1.0], abs=1e-6)
         assert np.linalg.norm(along, axis=1) == pytest.approx([1.0, 1.0], abs=1e-6)
-
-
-def grid_of_surfels(seed):
-    """Return neighbour table, classes, positions and normals of random voxels on a lattice."""
-    rng = np.random.default_rng(seed)
-    steps = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
-    half = [step for step in steps if step > (0, 0, 0)]
-    steps = half + [tuple(-np.array(step)) for step in half]
-    voxels = [tuple(v) for v in np.argwhere(rng.random((6, 6, 3)) < 0.7).tolist()]
-    row = {voxel: k for k, voxel in enumerate(voxels)}
-    table = np.array(
-        [[row.get(tuple(np.add(v, step).tolist()), -1) for step in steps] for v in voxels],
-        np.int32,
-    )
-    kind = rng.choice([YOUNG, FLAT, FLAT, FLAT, ROUGH], len(voxels)).astype(np.uint8)
-    position = 0.1 * (np.array(voxels) + rng.uniform(0.4, 0.6, (len(voxels), 3)))
-    normal = np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, 0.15, (len(voxels), 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return table, kind, position, normal
-
-
-def brute_hosts(table, kind, position, normal, six, rules):
-    """Return host and round of every voxel that is not flat, round by round."""
-    host, level = np.full(len(kind), -1), np.zeros(len(kind), int)
-    for step in range(1, ROUNDS + 1):
-        before, was = host.copy(), level.copy()
-        for row in np.flatnonzero((kind != FLAT) & (was == 0)):
-            near = [j for j in table[row] if j >= 0]
-            if step == 1:
-                roots = [j for j in near if kind[j] == FLAT]
-            else:
-                roots = [before[j] for j in near if kind[j] != FLAT and was[j] == step - 1]
-            found = [
-                (abs(normal[j] @ (position[row] - position[j])), k, j)
-                for k, j in enumerate(roots)
-                if normal[j] ** 2 @ six[row, [0, 3, 5]] < rules[1]
-                and abs(normal[j] @ (position[row] - position[j])) < rules[0]
-            ]
-            if found:
-                host[row], level[row] = min(found)[2], step
-    return host, level
-
-
-@both
-def test_hosts_grow_round_by_round_over_the_nearest_planes(call):
-    table, kind, position, normal = grid_of_surfels(7)
-    kind[np.random.default_rng(3).random(len(kind)) < 0.7] = YOUNG
-    six = np.abs(np.random.default_rng(8).normal(0.0, 1e-4, (len(table), 6)))
-    six[:, [1, 2, 4]] = 0.0
-    chosen = np.flatnonzero(kind != FLAT).astype(np.int32)
-    host, level = np.full(len(kind), -1, np.int32), np.zeros(len(kind), np.uint8)
-    rules, state = (0.05, 1e-4, 1e9), (kind, position, normal)
-    call(find_hosts, chosen, table, state, six, rules, host, level)
-    expected = brute_hosts(table, kind, position, normal, six, rules)
-    assert host.tolist() == expected[0].tolist()
-    assert level.tolist() == expected[1].tolist()
-    assert {1, 2} <= set(level.tolist())
-    assert NONE == 0
-
-    # after a change, the voxels around it are enough
-    kind[chosen[5]] = FLAT
-    host[chosen[5]], level[chosen[5]] = -1, 0
-    found, marks = np.empty(len(kind), np.int32), np.zeros(len(kind), bool)
-    around = found[: call(spread, chosen[5:6], table, ROUNDS, marks, found)]
-    rest = around[kind[around] != FLAT]
-    call(find_hosts, rest, table, state, six, rules, host, level)
-    expected = brute_hosts(table, kind, position, normal, six, rules)
-    assert host.tolist() == expected[0].tolist()
 
 
 @both
