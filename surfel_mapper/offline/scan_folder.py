@@ -26,6 +26,7 @@ from surfel_mapper.errors import BagError, ConfigError, FileFormatError
 from surfel_mapper.files.scan_files import scan_files, scan_reader, SUFFIXES
 from surfel_mapper.offline import ouster_pcap
 from surfel_mapper.offline.datasets import Dataset, E57Scans, find_dataset
+from surfel_mapper.offline.depth_folders import DepthFolder, find_depth_folder, layout_of
 from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.offline.pose_choice import (
     choose_for_folder,
@@ -100,11 +101,15 @@ class ScanFolder:
     def __init__(self, request: Request, config: Config, poses: PosePath | None) -> None:
         self.path = request.path
         suffix = self.path.suffix.lower()
-        self.dataset: Dataset | OusterPcap | E57Scans | None
+        self.dataset: Dataset | DepthFolder | OusterPcap | E57Scans | None
         if suffix == ouster_pcap.SUFFIX:
             self.dataset = OusterPcap(self.path)
+        elif suffix == '.e57':
+            self.dataset = E57Scans(self.path)
         else:
-            self.dataset = (E57Scans if suffix == '.e57' else find_dataset)(self.path)
+            self.dataset = find_dataset(self.path) or find_depth_folder(self.path)
+        if isinstance(self.dataset, DepthFolder):
+            config = config.replace({'input.kind': 'depth'})
         if self.dataset is not None:
             self.files, self.format = self.dataset.files, self.dataset.format
         else:
@@ -210,6 +215,8 @@ class ScanFolder:
         mapper.add_scan(scan)
 
     def _read(self, number: int, stamp_ns: int, frame: str) -> Scan:
+        if isinstance(self.dataset, DepthFolder):
+            return self.dataset.depth_scan(number, stamp_ns, frame)
         if self.dataset is None:
             points, columns = self._read_file(self.files[number])
             if columns.keys() >= SURFEL_COLUMNS:
@@ -293,6 +300,6 @@ def is_scans(path: Path) -> bool:
         return path.suffix.lower() in (ouster_pcap.SUFFIX, *SUFFIXES)
     if not path.is_dir() or (path / METADATA).exists():
         return False
-    if find_dataset(path) is not None:
+    if layout_of(path) is not None or find_dataset(path) is not None:
         return True
     return not any(map(is_storage, path.iterdir())) and bool(scan_files(path))
