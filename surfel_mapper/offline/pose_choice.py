@@ -113,20 +113,20 @@ def choose_by_sample(
 ) -> PoseChoice:
     """Return the source that gives the clouds of a sample their poses, or registration."""
     sources = list(TYPES) if wanted is None else [wanted]
-    best = {
-        source: tried
-        for source in sources
-        if (tried := best_offer([o for o in offers(sample) if o.clouds in topics], source, sample))
-    }
+    made = [offer for offer in offers(sample) if offer.clouds in topics]
+    usable_offers = [offer for offer in made if is_usable(offer, sample)]
+    best = {source: tried for source in sources if (tried := best_offer(made, source, sample))}
     usable = [offer for offer in best.values() if is_usable(offer, sample)]
     has_half = any(2 * offer.covered >= offer.total for offer in usable)
     candidates = [candidate(source, best.get(source), sample, has_half) for source in sources]
     choice = choose_source(candidates)
     if choice.topic:
         settings = best[choice.source].settings
+        rivals = {o.poses for o in usable_offers if source_of(o) == choice.source}
+        topic = choice.topic if len(rivals) == 1 else ''  # else the user has to name one
         is_plain = wanted is not None and not changes(settings)
         reason = '' if is_plain else choice.reason
-        return PoseChoice(config.replace(settings), reason, choice.topic)
+        return PoseChoice(config.replace(settings), reason, topic)
     if wanted is not None:
         return PoseChoice(config)
     return registered(reader, topics, config, choice.reason)
@@ -142,15 +142,17 @@ def candidate(source: str, offer: Offer | None, sample: Survey, needs_half: bool
     """Return the best offer of a source as a candidate; some need poses for half of the clouds."""
     if offer is None:
         return PoseCandidate(source, '', 'no topic' if sample.stamps else 'no cloud can be read')
-    missing = ''
-    if not is_usable(offer, sample):
-        missing = f'{offer.poses}: {offer.missing or "none of them moves"}'
-    elif needs_half and 2 * offer.covered < offer.total:
-        missing = f'{offer.poses} covers {offer.covered} of {offer.total} clouds'
-    texts = [f'{name}: {value}' for name, value in changes(offer.settings).items()]
-    surveyed = sample.topics.get(offer.poses)
+    missing, name = '', offer.poses
+    surveyed = sample.topics.get(name)
     if surveyed and surveyed.topic.type not in USUAL:
-        texts.insert(0, f'a {surveyed.topic.type.rpartition("/")[2]}')
+        name += f' ({surveyed.topic.type.rpartition("/")[2]})'
+    if not is_usable(offer, sample):
+        missing = f'{name}: {offer.missing or "none of them moves"}'
+    elif needs_half and 2 * offer.covered < offer.total:
+        missing = f'{name} covers {offer.covered} of {offer.total} clouds'
+    texts = [f'{key}: {value}' for key, value in changes(offer.settings).items()]
+    if name != offer.poses:
+        texts.insert(0, name)
     return PoseCandidate(source, offer.poses, missing, ', '.join(texts))
 
 

@@ -36,6 +36,9 @@ TYPES = {'tf': (TF,), 'odometry': (ODOMETRY,), 'pose': (POSE, POSE_WITH_COVARIAN
 SET_BY_HAND = 'initialpose'
 """End of the name of topics whose poses users set in RViz; these are no source."""
 
+SAME_PLACE = 1e-4
+"""Difference of the numbers of two static transforms that agree, as of rounded texts, m."""
+
 STATIC = 'tf_static'
 """End of the name of topics of static transforms."""
 
@@ -280,7 +283,9 @@ def static_transforms(
     by_child: dict[str, tuple[str, StampedPose]] = {}
     for (topic, child), pose in first.items():
         other, agreed = by_child.setdefault(child, (topic, pose))
-        if agreed != pose:
+        if agreed.parent != pose.parent or not np.allclose(
+            [*agreed.xyz, *agreed.q_xyzw], [*pose.xyz, *pose.q_xyzw], atol=SAME_PLACE, rtol=0.0
+        ):
             raise BagError(
                 f'{reader.path}: {other} and {topic} disagree about the frame {child}: '
                 f'{placed(agreed)}, {placed(pose)}; --static-topic chooses one, --mount gives the '

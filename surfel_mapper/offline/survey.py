@@ -258,10 +258,27 @@ def offers(found: Survey) -> list[Offer]:
 
 
 def of_namespace(sources: Sequence[Source], clouds: str) -> list[Source]:
-    """Return the sources of each kind in the namespace of clouds; all of a kind if none is."""
-    own = [source for source in sources if shares_namespace(source.topic, clouds)]
-    kinds = {source.kind for source in own}
-    return [source for source in sources if source in own or source.kind not in kinds]
+    """Return the sources of each kind in the innermost namespace of clouds; all if none is."""
+    depths = {
+        kind: max(
+            (
+                source.topic.count('/')
+                for source in sources
+                if source.kind == kind and shares_namespace(source.topic, clouds)
+            ),
+            default=0,
+        )
+        for kind in TYPES
+    }
+    return [
+        source
+        for source in sources
+        if not depths[source.kind]
+        or (
+            shares_namespace(source.topic, clouds)
+            and source.topic.count('/') == depths[source.kind]
+        )
+    ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,7 +57,7 @@ REMEDIES = {
     'overload': 'larger voxels (map.voxel_size_m) or a shorter range (input.max_range_m) map '
     'faster',
     'queue_full': 'poses come late; pose.max_waiting_scans lets more scans wait',
-    'stamp_back': 'do two sensors share one frame?',
+    'stamp_back': 'clouds are out of order, or two sensors share one topic and frame',
     'stamp_repeated': 'is the same cloud published twice?',
 }
 """Remedy by cause of a drop, for the log."""

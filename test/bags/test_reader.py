@@ -11,7 +11,7 @@ import sqlite3
 from mcap.writer import Writer
 import numpy as np
 import pytest
-from rosbags import rosbag2
+from rosbags import rosbag1, rosbag2
 
 from surfel_mapper.bags.compression import import_zstd
 from surfel_mapper.bags.reader import BagReader
@@ -178,6 +178,21 @@ def test_livox_messages_are_read_as_clouds(tmp_path):
     for scan, (*_, message) in zip(decoded, clouds, strict=True):
         np.testing.assert_array_equal(scan.points, to_scan(message).points)
         assert (scan.stamp_ns, scan.frame_id) == (to_scan(message).stamp_ns, 'lidar')
+
+
+def test_livox_messages_of_a_ros1_bag_are_read(tmp_path):
+    path, points = tmp_path / 'drive.bag', np.ones((5, 3), np.float32)
+    name = LIVOX.replace('driver2', 'driver')
+    definition = DEFINITION.replace('driver2', 'driver')
+    with rosbag1.Writer(path) as writer:
+        connection = writer.add_connection(
+            '/livox/lidar', name, msgdef=definition, md5sum=32 * '0'
+        )
+        writer.write(connection, 10**9, custom_message(points, ros1=True))
+    with BagReader(path) as reader:
+        assert reader.topics.choose_cloud() == '/livox/lidar'
+        (message,) = reader.messages()
+        np.testing.assert_array_equal(to_scan(reader.decode(message)).points, points)
 
 
 @pytest.mark.parametrize('definition', ['uint8 x', 'std_msgs/Header header\nfloat32[] points', ''])

@@ -141,3 +141,15 @@ def test_the_error_of_the_first_scan_is_shown(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert 'first scan that can be read: 2 points' in printed
     assert f'damaged: {tmp_path}/1.ply: not a PLY file' in printed
+
+
+def test_options_of_each_robot_are_printed(tmp_path, capsys):
+    rows = [(f'/{name}{row[0]}', *row[1:]) for name in ('a', 'b') for row in drive()]
+    bag = write_rosbag2(tmp_path / 'bag', sorted(rows, key=lambda row: row[2]))
+    assert main(['info', str(bag)]) == 0
+    printed = capsys.readouterr().out
+    for name in ('a', 'b'):
+        assert f'(--topic /{name}/points --pose-topic /{name}/tf)' in printed
+    assert '--topic /a/points --pose-topic /b' not in printed
+    assert 'a replay without options is refused' in printed
+    assert 'several topics to choose from' in printed

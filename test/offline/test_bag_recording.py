@@ -220,6 +220,16 @@ def test_each_robot_of_a_bag_has_its_own_mount_and_poses(tmp_path, request_):
     assert found['pose_topics'] == ['/a/tf', '/a/tf_static']
 
 
+def test_of_two_trees_of_transforms_one_has_to_be_named(tmp_path):
+    entries, other = drive(), drive()
+    rows = [*entries, *(('/b/tf', *row[1:]) for row in other if row[0] == '/tf')]
+    rows = [('/a/tf', *row[1:]) if row[0] == '/tf' else row for row in rows]
+    path = write_rosbag2(tmp_path / 'bag', sorted(rows, key=lambda row: row[2]))
+    with pytest.raises(BagError, match=r'several topics .* name one; .* /a/tf, /b/tf'):
+        replayed(path)
+    assert replayed(path, pose_topic='/a/tf')[0].map.digest() == expected_digest(entries)
+
+
 def test_static_transforms_that_disagree_are_refused_with_the_option(tmp_path):
     entries, other = drive(), drive()
     other[0][3].transforms[0].transform.translation.z = 9.0
@@ -229,6 +239,14 @@ def test_static_transforms_that_disagree_are_refused_with_the_option(tmp_path):
     named = {'static_topics': ('/tf_static', '/b/tf_static')}
     with pytest.raises(BagError, match=r'/tf_static disagree .* lidar: at .*--static-topic'):
         replayed(path, **named)
+
+
+def test_transforms_that_differ_by_rounding_agree(tmp_path):
+    entries, other = drive(), drive()
+    other[0][3].transforms[0].transform.translation.z += 1e-6
+    path = write_rosbag2(tmp_path / 'both', [('/b/tf_static', *other[0][1:]), *entries])
+    mapper, _ = replayed(path, static_topics=('/tf_static', '/b/tf_static'))
+    assert mapper.counters.mapped == NUM_SCANS
 
 
 def test_poses_with_covariance_are_a_source_and_named(tmp_path):
@@ -246,7 +264,7 @@ def test_poses_with_covariance_are_a_source_and_named(tmp_path):
     mapper, found = replayed(write_rosbag2(tmp_path / 'bag', with_covariance))
     assert mapper.map.digest() == expected_digest(entries)
     assert found['poses_from'] == 'pose'
-    assert '/amcl_pose has them (a PoseWithCovarianceStamped' in found['poses_reason']
+    assert '/amcl_pose (PoseWithCovarianceStamped)' in found['poses_reason']
     by_hand = [('/initialpose', *row[1:]) for row in with_covariance if row[1] == COVARIANCE]
     twice = write_rosbag2(tmp_path / 'initial', [*with_covariance, *by_hand])
     assert replayed(twice)[1]['pose_topics'] == ['/amcl_pose']
