@@ -14,6 +14,7 @@ surroundings seem to move along. The last lines say which, with counts by cause.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 import json
 import math
 from pathlib import Path
@@ -106,6 +107,26 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='TOPIC=X,Y,Z,QX,QY,QZ,QW',
         help='pose of the sensor of a topic in frames.base, m; repeatable',
     )
+    add_pose_arguments(add)
+    add('--start', type=seconds, default=0.0, metavar='S', help='leave out the first S seconds')
+    add('--duration', type=positive_float, default=math.inf, metavar='S', help='map S seconds')
+    add('--every', type=positive_int, default=1, metavar='N', help='map one cloud of every N')
+    add_bin_columns(group)
+    add(
+        '--window',
+        action='store_true',
+        help="let scans leave the map by the configuration's window, as the node does",
+    )
+    add(
+        '--align',
+        action=argparse.BooleanOptionalAction,
+        help='close loops, and align all scans with each other at the end; the latter keeps all '
+        'points in memory (default: loops only, if poses come from registration)',
+    )
+
+
+def add_pose_arguments(add: Callable[..., argparse.Action]) -> None:
+    """Declare the options for transforms, poses and clocks."""
     add('--pose-topic', metavar='TOPIC', help='topic of the poses (/tf, /odom or /pose)')
     add(
         '--static-topic',
@@ -140,21 +161,6 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='[TOPIC=]S',
         help='add S seconds to the stamps of the clouds, of a topic or of all '
         '(input.time_offset_s), whose clock differs from that of the poses; repeatable',
-    )
-    add('--start', type=seconds, default=0.0, metavar='S', help='leave out the first S seconds')
-    add('--duration', type=positive_float, default=math.inf, metavar='S', help='map S seconds')
-    add('--every', type=positive_int, default=1, metavar='N', help='map one cloud of every N')
-    add_bin_columns(group)
-    add(
-        '--window',
-        action='store_true',
-        help="let scans leave the map by the configuration's window, as the node does",
-    )
-    add(
-        '--align',
-        action=argparse.BooleanOptionalAction,
-        help='close loops, and align all scans with each other at the end; the latter keeps all '
-        'points in memory (default: loops only, if poses come from registration)',
     )
 
 

@@ -58,7 +58,7 @@ REMEDIES = {
     'faster',
     'queue_full': 'poses come late; pose.max_waiting_scans lets more scans wait',
     'stamp_back': 'clouds are out of order, or two sensors share one topic and frame',
-    'stamp_repeated': 'is the same cloud published twice?',
+    'stamp_repeated': 'is the same cloud published twice, or header.stamp not set?',
 }
 """Remedy by cause of a drop, for the log."""
 

@@ -220,7 +220,7 @@ def test_each_robot_of_a_bag_has_its_own_mount_and_poses(tmp_path, request_):
     assert found['pose_topics'] == ['/a/tf', '/a/tf_static']
 
 
-def test_of_two_trees_of_transforms_one_has_to_be_named(tmp_path):
+def test_two_trees_of_transforms_have_to_be_chosen_from(tmp_path):
     entries, other = drive(), drive()
     rows = [*entries, *(('/b/tf', *row[1:]) for row in other if row[0] == '/tf')]
     rows = [('/a/tf', *row[1:]) if row[0] == '/tf' else row for row in rows]
