@@ -138,37 +138,6 @@ def slow(scan, size, anchor, centroid=True):
     return (np.array(list(voxels)) + 0.5 + shift) * size
 
 
-@pytest.mark.parametrize('anchor', ['origin', 'minimum'])
-@pytest.mark.parametrize('centroid', [True, False])
-@pytest.mark.parametrize('dtype', [np.float32, np.float64])
-@pytest.mark.parametrize('number', [1, 40, 9000])
-def test_voxel_grid_equals_its_slow_twin(anchor, centroid, dtype, number):
-    scan = random_scan(number, dtype=dtype)
-    size = (0.5, 0.3, 0.7)
-    found = filter_of(
-        'voxel_grid',
-        size_x_m=size[0],
-        size_y_m=size[1],
-        size_z_m=size[2],
-        use_centroid=centroid,
-        anchor=anchor,
-    ).apply(scan)
-    expected = slow(scan, size, anchor, centroid)
-    tolerance = 4 * np.finfo(dtype).eps * 4.0  # coordinates are below 4 m
-    np.testing.assert_allclose(found.points, expected, rtol=0.0, atol=tolerance)
-
-
-@pytest.mark.parametrize('dtype', [np.float32, np.float64])
-def test_voxels_of_points_in_long_runs_are_those_of_the_slow_twin(dtype):
-    scan = random_scan(9000, dtype=dtype)
-    order = np.lexsort(np.floor(scan.points.T / 0.5))
-    scan = scan.select(np.concatenate([order, order[::-1]]))  # each voxel in two runs
-    found = filter_of('voxel_grid', size_x_m=0.5, size_y_m=0.5, size_z_m=0.5).apply(scan)
-    expected = slow(scan, [0.5, 0.5, 0.5], 'origin')
-    tolerance = 4 * np.finfo(dtype).eps * 4.0  # coordinates are below 4 m
-    np.testing.assert_allclose(found.points, expected, rtol=0.0, atol=tolerance)
-
-
 def test_columns_of_the_first_point_are_kept_without_averaging():
     scan = scan_of([[0.1, 0.0, 0.0], [0.3, 0.0, 0.0]], intensity=[1.0, 3.0], label=[4, 5])
     averaged = filter_of('voxel_grid').apply(scan).columns

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import FilterError
-from surfel_mapper.filters.kernels.sampling import choose, choose_farthest
+from surfel_mapper.filters.kernels.sampling import choose_farthest
 from surfel_mapper.filters.sampling import resistance
 from test.filters.examples import filter_of, kept, random_scan, scan_of
 
@@ -234,27 +234,6 @@ def test_rotations_are_measured_by_a_length(norm, length):
     forces = np.hstack([arms, normals])
     held = np.linalg.eigvalsh(forces.T @ forces)[3:]  # nothing holds x, y and turns about z
     np.testing.assert_allclose(np.linalg.eigvalsh(found.T @ found), held, atol=1e-12)
-
-
-def slow_choose(resists, number):
-    held, chosen = np.zeros(6), []
-    for _ in range(number):
-        left = np.setdiff1d(np.arange(len(resists)), chosen)
-        motion = held.argmin()
-        best = left[np.abs(resists[left, motion]).argmax()]
-        chosen.append(best)
-        held += resists[best] ** 2
-    return set(chosen)
-
-
-@pytest.mark.parametrize('number', [0, 1, 30, 60])
-@pytest.mark.parametrize('call', [choose, choose.py_func])
-def test_the_kernel_chooses_what_its_slow_twin_chooses(number, call):
-    resists = np.random.default_rng(2).normal(size=(60, 6))
-    order = np.ascontiguousarray(np.argsort(-np.abs(resists), axis=0, kind='stable').T)
-    chosen = np.zeros(60, np.bool_)
-    call(resists, order, number, chosen)
-    assert set(np.flatnonzero(chosen)) == slow_choose(resists, number)
 
 
 def slow_farthest(points, number):

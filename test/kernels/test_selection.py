@@ -5,31 +5,8 @@
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.selection import compact, copy_ranges, number_ranges
+from surfel_mapper.kernels.selection import compact
 from test.kernels.modes import both
-
-RANGES = np.array([[2, 5], [0, 0], [7, 8], [5, 7], [0, 2]])
-
-
-@both
-def test_ranges_are_concatenated_in_their_order(call):
-    points = np.random.default_rng(1).normal(size=(10, 3))
-    out = np.full((8, 3), np.nan)
-    call(copy_ranges, points, RANGES, out)
-    expected = np.concatenate([points[first:last] for first, last in RANGES])
-    np.testing.assert_array_equal(out, expected)
-
-
-@both
-def test_items_get_the_number_of_their_range_at_their_old_position(call):
-    order = np.random.default_rng(2).permutation(10)
-    numbers = np.array([10, 20, 30, 40, 50])
-    out = np.full(10, -1, np.int32)
-    call(number_ranges, RANGES, numbers, order, out)
-    expected = np.full(10, -1)
-    for (first, last), number in zip(RANGES, numbers, strict=True):
-        expected[order[first:last]] = number
-    np.testing.assert_array_equal(out, expected)
 
 
 @both

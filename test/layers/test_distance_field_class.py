@@ -7,7 +7,6 @@ import pytest
 
 from surfel_mapper import DistanceField
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.errors import FileFormatError
 from surfel_mapper.tsdf.queries import FREE, OCCUPIED, UNKNOWN
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
@@ -50,14 +49,3 @@ def test_depth_image_is_fused_with_its_colours():
     mesh = field.mesh()
     assert np.abs(mesh.vertices[:, 2] - 1.55).max() < 1e-3
     assert (mesh.colors == 77).all()
-
-
-def test_loaded_field_equals_the_saved_one(tmp_path):
-    field = DistanceField(CONFIG)
-    field.add(SPHERE, np.eye(4))
-    field.save(tmp_path / 'field.npz')
-    other = DistanceField.load(tmp_path / 'field.npz', CONFIG)
-    assert len(other) == len(field)
-    np.testing.assert_array_equal(other.sample(SPHERE), field.sample(SPHERE))
-    with pytest.raises(FileFormatError, match='voxel_size_m'):
-        DistanceField.load(tmp_path / 'field.npz', TsdfConfig(voxel_size_m=0.2))

@@ -40,24 +40,6 @@ def integrator():
     return Integrator(BlockMap(TsdfConfig(**SETTINGS)))
 
 
-def test_the_mesh_of_changed_blocks_equals_that_of_all_blocks_to_the_bit(integrator):
-    following = Mesher(integrator.blocks)
-    for image, stamp_ns in scans(8):
-        integrator.integrate(image, np.eye(4), stamp_ns)
-        following.update()
-    whole = Mesher(integrator.blocks)
-    whole.update()
-    one, other = following.mesh(), whole.mesh()
-    assert len(other) > 3000
-    order, expected = (np.lexsort(mesh.vertices.T) for mesh in (one, other))
-    assert np.array_equal(one.vertices[order], other.vertices[expected])
-    corners = [
-        np.sort(np.sort(m.vertices[m.triangles].reshape(-1, 9), axis=1), axis=0)
-        for m in (one, other)
-    ]
-    assert np.array_equal(*corners)
-
-
 def test_vertices_of_the_live_mesh_are_those_of_the_exact_one_within_its_tolerance(integrator):
     live = LiveMesh(integrator.blocks)
     for image, stamp_ns in scans(8):

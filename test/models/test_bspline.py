@@ -7,7 +7,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.models import bspline
 from surfel_mapper.models.bspline import (
     axis_degree,
     basis,
@@ -168,27 +167,3 @@ def test_greville_points_make_the_same_surface_a_nurbs_patch(cells):
         assert ((u >= 0.0) & (u <= 1.0)).all()
         place = BSpline(knots(cells[axis], degree), control[axis], degree)(u)
         np.testing.assert_allclose(place, xy[:, axis], atol=1e-12)
-
-
-def rough_scene(cells):
-    """Return a start, places, heights and weights: noise, empty cells and large holes."""
-    rng = np.random.default_rng(7)
-    x, y = np.meshgrid(np.arange(cells[0]), np.arange(cells[1]), indexing='ij')
-    filled = (np.abs(x - y) < 0.4 * cells[0]) & (rng.random(cells) > 0.2)
-    filled &= np.hypot(x - 30.0, y - 25.0) > 15.0
-    xy = PITCH * np.stack([x, y], -1) + PITCH * rng.uniform(0.1, 0.9, (*cells, 2))
-    z = np.sin(0.5 * xy[..., 0]) + 0.1 * xy[..., 1] + 0.02 * rng.standard_normal(cells)
-    weight = np.ceil(400.0 / (1.0 + np.hypot(x - 50.0, y - 50.0)))
-    start = initial_field(PITCH, np.zeros(2), z, filled, 3)
-    return start, xy[filled], z[filled], weight[filled]
-
-
-@pytest.mark.parametrize('cells', [(60, 45), (45, 60), (150, 30)])
-@pytest.mark.parametrize('smoothing', [1e-3, 1e-2, 0.1])
-def test_iterative_fields_are_banded_ones_at_the_samples(monkeypatch, cells, smoothing):
-    samples = rough_scene(cells)
-    expected = fit_pspline(*samples, smoothing)
-    monkeypatch.setattr(bspline, 'is_direct', lambda *_: False)
-    found = fit_pspline(*samples, smoothing)
-    away = found.heights(samples[1]) - expected.heights(samples[1])
-    assert np.sqrt(np.mean(away**2)) < 0.1 * 0.02  # the noise

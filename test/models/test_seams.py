@@ -16,7 +16,6 @@ from surfel_mapper.config import ModelsConfig, ModelsLayerConfig
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models import fit
 from surfel_mapper.models.live import LiveModels
-from surfel_mapper.models.seams import continuations
 
 NOISE_M = 0.005
 
@@ -105,24 +104,3 @@ def test_coverage_is_that_of_own_points():
         local = surface.to_local(points[model.labels == surface.id])[:, :2]
         assert surface.grid.contains(local).mean() > 0.95
         assert (local.min(axis=0) - surface.grid.origin < surface.grid.pitch_m).all()
-
-
-def test_continuations_equal_those_of_every_pair():
-    rng = np.random.default_rng(3)
-    points = rng.uniform(0.0, 1.0, (400, 3)) * [1.0, 1.0, 0.1]
-    normals = rng.standard_normal((400, 3)) * 0.4 + [0.0, 0.0, 1.0]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    owner, axes = rng.integers(0, 4, 400), np.tile([0.0, 0.0, 1.0], (4, 1))
-    found = continuations(points, normals, owner, axes, 0.05)
-    for surface in range(4):
-        own, expected = np.flatnonzero(owner == surface), []
-        for row in np.flatnonzero(owner != surface):
-            away = np.linalg.norm(points[own] - points[row], axis=1)
-            near = own[away.argmin()]
-            height = abs((points[row] - points[near]) @ normals[near])
-            smooth = away.min() < 0.15 and height < 0.5 * max(away.min(), 0.05)
-            turned = abs(normals[row] @ normals[near]) < np.cos(np.radians(35.0))
-            if smooth and not turned and abs(normals[row, 2]) > np.cos(np.radians(75.0)):
-                expected.append(row)
-        assert found[surface].tolist() == expected
-        assert len(expected) > 20

@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
 import pytest
-from scipy.spatial.distance import cdist
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
-from surfel_mapper.models.kernels.region_merging import gap, same_surface
-from surfel_mapper.models.segmentation import merge_clusters, segment_cloud
+from surfel_mapper.models.segmentation import segment_cloud
 from surfel_mapper.models.thinning import thin
 from test.models.scenes import A, room, sheet, VIEW
 
@@ -123,34 +120,6 @@ def test_paper_profile_rejects_an_axis_aligned_floor():
 def test_noisy_room_is_mostly_flat_if_the_noise_is_known():
     points, _ = room(320, 240, noise_per_range_sq=1.425e-3)
     assert flat_share(clustered(points, VIEW, noise_per_range_sq=1.425e-3)[0]) >= 0.8
-
-
-def pairs(clusters):
-    return itertools.combinations(np.flatnonzero(clusters.flat), 2)
-
-
-def gap_of(clusters, i, j):
-    delta = clusters.mean[i] - clusters.mean[j]
-    value, frame = clusters.eigenvalues, clusters.frames
-    return gap(delta, np.linalg.norm(delta), value[i], frame[i], value[j], frame[j])
-
-
-def test_merged_regions_equal_components_of_the_full_graph():
-    points, _ = room(160, 120)
-    clusters, config = clustered(points, VIEW, fold_angle_deg=89.0)
-    label = np.arange(len(clusters))
-    rules = (math.cos(math.radians(15)), A, math.cos(math.radians(30)), 0.5 * A)
-    for i, j in pairs(clusters):
-        delta = clusters.mean[i] - clusters.mean[j]
-        normals = clusters.frames[i, 2], clusters.frames[j, 2]
-        one, other = (clusters.points[slice(*clusters.rows[k])] for k in (i, j))
-        cheap = same_surface(*normals, delta, 1.0, rules) and gap_of(clusters, i, j) < 5.0 * A
-        if cheap and cdist(one, other).min() < 3.0 * A:
-            label[label == label[i]] = label[j]
-    expected = {frozenset(np.flatnonzero(label == x)) for x in label[clusters.flat]}
-    found = {frozenset(members) for members in merge_clusters(clusters, config, VIEW)}
-    # charts only cut further; at 89 deg nothing here is cut
-    assert found == expected
 
 
 def test_parallel_planes_merge_within_an_offset_and_not_beyond():

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.models.kernels.bisection import (
-    cluster_moments,
     MEANS_ITERATIONS,
     MEANS_SAMPLE,
-    num_outliers,
     SETTLED_SHARE,
     split_two_means,
 )
@@ -30,24 +28,6 @@ def two_sheets(number, seed):
 def frame_of(points):
     values, vectors = np.linalg.eigh(np.cov(points))
     return points.mean(axis=1), values, np.ascontiguousarray(vectors.T[::-1])
-
-
-@pytest.mark.parametrize('number', [1, 4, 150, 1001])
-def test_moments_equal_numpy(number):
-    points = two_sheets(number, 1)
-    mean, scatter = np.empty(3), np.empty((3, 3))
-    cluster_moments(*points, mean, scatter)
-    centred = points - points.mean(axis=1, keepdims=True)
-    np.testing.assert_allclose(mean, points.mean(axis=1), rtol=1e-14)
-    np.testing.assert_allclose(scatter, centred @ centred.T, atol=1e-12 * number)
-
-
-def test_outliers_are_beyond_three_sigma():
-    points = two_sheets(800, 2)
-    mean, values, frame = frame_of(points)
-    away = points - mean[:, None]
-    distance_sq = (away * np.linalg.solve(np.cov(points), away)).sum(axis=0)
-    assert 0 < (distance_sq >= 9.0).sum() == num_outliers(*points, mean, values, frame)
 
 
 @pytest.mark.parametrize('number', [40, 700, 5 * MEANS_SAMPLE + 3])

@@ -9,35 +9,20 @@ import pytest
 
 from surfel_mapper.models.growth import owner_table, pieces_of
 from surfel_mapper.models.joining import (
-    chunk_boxes,
     described,
     join_patches,
-    layers,
     separated,
     single_regions,
-    touching_regions,
 )
-from surfel_mapper.models.kernels import region_joining
 from surfel_mapper.models.kernels.region_joining import (
-    describe_regions,
-    join_layers,
     join_pair,
-    join_smooth,
 )
 from surfel_mapper.models.thinning import thin
-from test.kernels.modes import both, interpreted
 
 SIZE_M = 0.05
 VIEW = np.array([4.0, 0.2, 6.0])
 CYLINDER, FLOOR, WALL = range(3)
 SURFACES = np.repeat([CYLINDER, FLOOR, WALL], [6, 3, 2])
-
-
-@pytest.fixture(autouse=True)
-def heap_of_the_interpreter(request, monkeypatch):
-    """Interpret what an interpreted kernel does with its heap: numba warns of lists of Python."""
-    if 'call' in request.fixturenames and request.getfixturevalue('call') is interpreted:
-        monkeypatch.setattr(region_joining, 'push', region_joining.push.py_func)
 
 
 def scene(sigma_m):
@@ -78,42 +63,6 @@ def test_patches_of_one_surface_are_joined_and_no_others(sigma_m, seed):
         assert curved[region] == (surface == CYLINDER)
     np.testing.assert_allclose(normals[of_patch[6]], [0.0, 0.0, 1.0], atol=0.02)
     np.testing.assert_allclose(normals[of_patch[-1]], [1.0, 0.0, 0.0], atol=0.02)
-
-
-@both
-def test_layers_of_a_noisy_wall_join_the_largest(call):
-    rng = np.random.default_rng(5)
-    points = np.column_stack([rng.uniform(0.0, 2.0, (9000, 2)), 0.02 * rng.normal(size=9000)])
-    owner = np.digitize(points[:, 2], [-0.025, 0.025]).astype(np.int32)
-    given = pieces(points, owner)
-    regions = single_regions(given, VIEW, (0.02, 0.0), SIZE_M)
-    order = layers(given.touching(), given, regions)
-    call(join_layers, order, given.means, given.weights, given.starts, regions)
-    assert regions.root.tolist() == [1, 1, 1]
-    np.testing.assert_array_equal(regions.patch_normal[0], regions.patch_normal[1])
-
-
-@both
-def test_a_cylinder_turns_and_bends_by_its_arc(call):
-    given = pieces(*scene(0.01))
-    regions = single_regions(given, VIEW, (0.01, 0.0), SIZE_M)
-    edges, adjacent = touching_regions(given.touching(), regions.root)
-    state, floor = (given.means, given.weights, given.starts), (0.02 * SIZE_M) ** 2
-    state = *state, chunk_boxes(given.means)
-    call(join_smooth, edges, adjacent, *state, floor, regions)
-    names = np.unique(regions.root)
-    normals, found = np.empty((len(names), 3)), np.empty((len(names), 4))
-    call(describe_regions, names, (*state, floor), regions, (0.0, 0.0, 0.0), normals, found)
-    assert len(names) == 3
-    round_one = np.searchsorted(names, regions.root[0])
-    # 72 deg of radius 1 m; the turn of a parabola of equal arc is a little larger
-    assert np.degrees(found[round_one, 1]) == pytest.approx(72.0, rel=0.1)
-    heights = np.cos(np.radians(np.linspace(-36.0, 36.0, 1000)))
-    # steep ends weigh less, by the squared cosine of the slope
-    assert found[round_one, 2] == pytest.approx(np.sqrt(12.0) * heights.std(), rel=0.12)
-    others = np.delete(found, round_one, axis=0)
-    assert np.abs(others[:, 2]).max() < 0.01  # the noise
-    np.testing.assert_allclose(others[:, 3], 0.01, rtol=0.15)
 
 
 def test_joins_that_are_much_worse_planes_than_their_patches_are_undone():
