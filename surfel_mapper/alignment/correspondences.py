@@ -254,12 +254,12 @@ def loop_candidates(
     near = pairs[path_m[pairs[:, 1]] - path_m[pairs[:, 0]] >= least_m]
     distance = np.linalg.norm(position[near[:, 1]] - position[near[:, 0]], axis=1)
     num_of: dict[int, int] = {}
-    found = []
+    loops = []
     for target, source in near[np.argsort(distance, kind='stable')].tolist():
         if num_of.get(source, 0) < LOOPS_A_SCAN:
             num_of[source] = num_of.get(source, 0) + 1
-            found.append((source, target))
-    return sorted(found)
+            loops.append((source, target))
+    return sorted(loops)
 
 
 def _moved(points: Floats, T: Floats) -> Floats:

@@ -189,17 +189,17 @@ class EdgeTerms:
     dropped: dict[int, str]
     weak: dict[int, Floats]
 
-    def joined(self, other: EdgeTerms, order: npt.NDArray[np.int64]) -> EdgeTerms:
-        """Return the terms of these and of other edges, reordered."""
-        num, place = len(self.center), np.argsort(order).tolist()
+    def joined(self, added: EdgeTerms, order: npt.NDArray[np.int64]) -> EdgeTerms:
+        """Return the terms of these and of added edges, reordered."""
+        num, row_of = len(self.center), np.argsort(order).tolist()
         return EdgeTerms(
-            center=np.concatenate([self.center, other.center])[order],
-            motion=np.concatenate([self.motion, other.motion])[order],
-            information=np.concatenate([self.information, other.information])[order],
-            dropped={place[e]: why for e, why in self.dropped.items()}
-            | {place[num + e]: why for e, why in other.dropped.items()},
-            weak={place[e]: axes for e, axes in self.weak.items()}
-            | {place[num + e]: axes for e, axes in other.weak.items()},
+            center=np.concatenate([self.center, added.center])[order],
+            motion=np.concatenate([self.motion, added.motion])[order],
+            information=np.concatenate([self.information, added.information])[order],
+            dropped={row_of[e]: why for e, why in self.dropped.items()}
+            | {row_of[num + e]: why for e, why in added.dropped.items()},
+            weak={row_of[e]: axes for e, axes in self.weak.items()}
+            | {row_of[num + e]: axes for e, axes in added.weak.items()},
         )
 
 
@@ -288,8 +288,8 @@ def exact_terms(sums: EdgeSums) -> EdgeTerms:
     inertia, axes = np.linalg.eigh(sums.inertia)
     turn = np.einsum('eji,ej->ei', axes, sums.turn)
     largest = inertia[:, 2:]
-    known = inertia > EXACT * largest
-    rotation = np.divide(turn, inertia, out=np.zeros_like(turn), where=known)
+    determined = inertia > EXACT * largest
+    rotation = np.divide(turn, inertia, out=np.zeros_like(turn), where=determined)
     spread, gap_sq = sums.spread, sums.gap_sq
     ss = _floored(gap_sq - (turn * rotation).sum(axis=1), spread)
     of_noise = (ss / 6.0)[:, None]  # the moment of inertia of c if z is the noise of a and b
@@ -383,7 +383,7 @@ def weighted_terms(
     matrix = np.einsum('emia,eijab,enjb->emn', B, quadratic, B, optimize=True)
     dropped = {int(e): NO_WEIGHT for e in np.flatnonzero(~(total > 0.0))}
     dropped |= {int(e): FEW_PAIRS for e in np.flatnonzero(moments[:, COUNT] < MIN_PAIRS)}
-    matrix, motion, weak = _known(matrix, right)
+    matrix, motion, weak = _determined(matrix, right)
     ss = gap_sq - (right * motion).sum(axis=1)
     variance = np.maximum(ss / np.maximum(moments[:, COUNT] - NUM_UNKNOWNS, 1.0), 1.0)
     variance[list(dropped)] = np.inf
@@ -416,10 +416,10 @@ def _floored(ss: Floats, spread: Floats) -> Floats:
     return np.maximum(ss, EXACT * spread)
 
 
-def _counted_from(T: Floats, places: Floats) -> Floats:
-    """Return the transforms (E, 4, 4) of points that are counted from places (E, 3) instead."""
+def _counted_from(T: Floats, origins: Floats) -> Floats:
+    """Return the transforms (E, 4, 4) of points that are counted from origins (E, 3) instead."""
     result = T.copy()
-    result[:, :3, 3] = _moved(T, places)
+    result[:, :3, 3] = _moved(T, origins)
     return result
 
 
@@ -455,7 +455,7 @@ def _directions(A: Floats, center: Floats) -> Floats:
     return result
 
 
-def _known(matrix: Floats, right: Floats) -> tuple[Floats, Floats, dict[int, Floats]]:
+def _determined(matrix: Floats, right: Floats) -> tuple[Floats, Floats, dict[int, Floats]]:
     """
     Return information, motions and open directions.
 

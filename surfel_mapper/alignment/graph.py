@@ -80,11 +80,11 @@ class Graph:
 
     def points(self, vertex: int) -> Points:
         """Return the points of a vertex; they cannot be written to."""
-        return self._points[self._known(vertex)]
+        return self._points[self._vertex(vertex)]
 
     def set_points(self, vertex: int, points: npt.ArrayLike) -> None:
         """Replace the points of a vertex; its pairs stay and must refer to existing points."""
-        checked = _points(self._known(vertex), points)
+        checked = _points(self._vertex(vertex), points)
         for ends, edge in self._edges.items():
             for column, end in enumerate(ends):
                 if end == vertex:
@@ -96,11 +96,11 @@ class Graph:
 
     def pose(self, vertex: int) -> Floats:
         """Return the pose of a vertex, (6,); a copy."""
-        return np.array(self._poses[self._known(vertex)])
+        return np.array(self._poses[self._vertex(vertex)])
 
     def set_pose(self, vertex: int, pose: npt.ArrayLike) -> None:
         """Move a vertex other than the reference."""
-        if self._known(vertex) == 0:
+        if self._vertex(vertex) == 0:
             raise AlignmentError('vertex 0 is the reference: its pose is fixed at the origin')
         self._poses[vertex] = _pose(vertex, pose)
 
@@ -110,7 +110,7 @@ class Graph:
 
     def edge(self, source: int, target: int) -> Edge:
         """Return an edge."""
-        ends = (self._known(source), self._known(target))
+        ends = (self._vertex(source), self._vertex(target))
         if ends not in self._edges:
             raise AlignmentError(f'there is no edge {source} -> {target}')
         return self._edges[ends]
@@ -119,7 +119,7 @@ class Graph:
         self, source: int, target: int, pairs: npt.ArrayLike, weights: npt.ArrayLike | None
     ) -> None:
         """Add or replace an edge."""
-        ends = (self._known(source), self._known(target))
+        ends = (self._vertex(source), self._vertex(target))
         if source == target:
             raise AlignmentError(f'edge {source} -> {target}: from a vertex to itself')
         rows = np.asarray(pairs)
@@ -166,7 +166,7 @@ class Graph:
                 weighted_moments(source, target, edge.pairs, edge.weights, edge.moments)
         return edge.moments
 
-    def _known(self, vertex: int) -> int:
+    def _vertex(self, vertex: int) -> int:
         """Return a vertex number; AlignmentError if there is no such vertex."""
         if not 0 <= vertex < self.num_vertices:
             raise AlignmentError(f'there is no vertex {vertex} among {self.num_vertices}')
@@ -226,9 +226,9 @@ def _check_definite(ends: tuple[int, int], weights: Floats) -> None:
     minors = (yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy)
     determinant = xx * minors[0] - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     for size, values in ((1, (xx, yy, zz)), (2, minors), (3, (determinant,))):
-        for each in values:
-            if (each < -ROUNDING * scale**size).any():
-                row = int(each.argmin())
+        for minor in values:
+            if (minor < -ROUNDING * scale**size).any():
+                row = int(minor.argmin())
                 raise AlignmentError(
                     f'{name} {row} has a negative eigenvalue: {weights[row].tolist()}'
                 )

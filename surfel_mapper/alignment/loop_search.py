@@ -134,12 +134,12 @@ class LoopSearch:
         frame_ids: Sequence[str] | None = None,
     ) -> None:
         self._scans = scans
-        self._before = np.asarray(T_map_sensor, np.float64)
+        self._initial = np.asarray(T_map_sensor, np.float64)
         self._settings = settings
         self._voxel_size_m = voxel_size_m
         verifying = replace(registration, coarse_levels=COARSE_LEVELS, search_deg=0.0)
         self._registration = Registration(verifying, voxel_size_m)
-        self._path_m = path_lengths(self._before, frame_ids)
+        self._path_m = path_lengths(self._initial, frame_ids)
         self.keys = key_numbers(self._path_m, settings.key_distance_m)
         self._maps: OrderedDict[int, SurfelMap] = OrderedDict()
         self._loops: dict[tuple[int, int], Loop] = {}
@@ -174,9 +174,9 @@ class LoopSearch:
             if not is_kept:
                 self._refuse(as_candidate(loop), 'it contradicts odometry and the other loops')
         kept = tuple(loop for loop, is_kept in verified if is_kept)
-        after = carried(self._before, self.keys, solution.T_map_key) if kept else self._before
+        poses = carried(self._initial, self.keys, solution.T_map_key) if kept else self._initial
         return LoopClosure(
-            T_map_sensor=after.copy(),
+            T_map_sensor=poses.copy(),
             keys=tuple(self.keys),
             loops=kept,
             refusals=tuple(self._refusals.values()),
@@ -192,7 +192,7 @@ class LoopSearch:
         return len(self._loops) + len(self._refusals)
 
     def _solve(self) -> LoopSolution:
-        return solve_loops(self._before[self.keys], self._ordered, self._settings.drift_ratio)
+        return solve_loops(self._initial[self.keys], self._ordered, self._settings.drift_ratio)
 
     def _recognise(self) -> bool:
         """Verify the places that are recognised; return False if that is not installed."""
@@ -218,8 +218,8 @@ class LoopSearch:
 
     def _near(self, T_map_key: Floats) -> list[Candidate]:
         """Return the keyframes near each other, with their pose by the present solution."""
-        found = []
-        taken: set[int] = set()
+        candidates = []
+        sources: set[int] = set()
         distance_m = self._settings.near_distance_m
         path_m = self._path_m[self.keys]
         pairs = loop_candidates(T_map_key, distance_m, path_m, self._least_loop_m)
@@ -227,27 +227,27 @@ class LoopSearch:
             key=lambda p: float(np.linalg.norm(T_map_key[p[0]][:3, 3] - T_map_key[p[1]][:3, 3]))
         )
         for source, target in pairs:
-            known = (source, target) in self._loops or (source, target) in self._refusals
-            if source in taken:
+            is_done = (source, target) in self._loops or (source, target) in self._refusals
+            if source in sources:
                 continue
-            taken.add(source)
-            if not known:
+            sources.add(source)
+            if not is_done:
                 T = compose(inverse(T_map_key[target]), T_map_key[source])
-                found.append(Candidate(source, target, T))
-        return sorted(found, key=lambda each: (each.source, each.target))
+                candidates.append(Candidate(source, target, T))
+        return sorted(candidates, key=lambda candidate: (candidate.source, candidate.target))
 
     def _verify(self, candidate: Candidate) -> None:
         """Register the local map of one keyframe to that of the other; keep or refuse the loop."""
         ends = (candidate.source, candidate.target)
         if ends in self._loops:
             return
-        found = self.register(candidate)
-        reason = self.reason_against(candidate.source, found)
+        result = self.register(candidate)
+        reason = self.reason_against(candidate.source, result)
         if reason:
             self._refuse(candidate, reason)
             return
         self._refusals.pop(ends, None)
-        self._loops[ends] = Loop(*ends, found.T_map_sensor, found.support, candidate.votes)
+        self._loops[ends] = Loop(*ends, result.T_map_sensor, result.support, candidate.votes)
 
     def register(self, candidate: Candidate) -> RegistrationResult:
         """Return the pose of the source of a candidate on the local map of its target."""
@@ -255,7 +255,7 @@ class LoopSearch:
         target = self._local_map(candidate.target)
         return self._registration.align(cells, target, [candidate.T_target_source], DEVIATION_M)
 
-    def overlap(self, source: int, found: RegistrationResult) -> float:
+    def overlap(self, source: int, result: RegistrationResult) -> float:
         """
         Return the share of a local map that overlaps, of that which can.
 
@@ -266,21 +266,21 @@ class LoopSearch:
             levels = PlaneLevels(self._registration.config, local, cells, [np.eye(4)])
             equations = levels.planes(0).equations(cells, np.eye(4), self._voxel_size_m)
             self._own_overlap[source] = max(equations[2], 1e-9)
-        return min(found.overlap / self._own_overlap[source], 1.0)
+        return min(result.overlap / self._own_overlap[source], 1.0)
 
-    def reason_against(self, source: int, found: RegistrationResult) -> str:
+    def reason_against(self, source: int, result: RegistrationResult) -> str:
         """Return why a registration is no loop; empty if it is one."""
         settings = self._settings
-        if not found.converged:
+        if not result.converged:
             return 'its registration does not settle'
-        overlap = self.overlap(source, found)
-        if overlap < settings.min_overlap_ratio or found.fit < settings.min_fit_ratio:
+        overlap = self.overlap(source, result)
+        if overlap < settings.min_overlap_ratio or result.fit < settings.min_fit_ratio:
             return (
-                f'{overlap:.0%} of it overlaps and {found.fit:.0%} of that fits, expected '
+                f'{overlap:.0%} of it overlaps and {result.fit:.0%} of that fits, expected '
                 f'{settings.min_overlap_ratio:.0%} and {settings.min_fit_ratio:.0%}'
             )
-        if len(found.degenerate):
-            return f'{len(found.degenerate)} of 6 directions are not determined'
+        if len(result.degenerate):
+            return f'{len(result.degenerate)} of 6 directions are not determined'
         return ''
 
     def _refuse(self, candidate: Candidate, reason: str) -> None:
@@ -291,7 +291,7 @@ class LoopSearch:
         alone = [
             loop
             for loop in self._ordered
-            if not any(confirms(other, loop) for other in self._ordered)
+            if not any(confirms(witness, loop) for witness in self._ordered)
         ]
         for loop in alone:
             del self._loops[loop.source, loop.target]
@@ -312,9 +312,9 @@ class LoopSearch:
         half_m = 0.5 * self._settings.local_map_m
         around = np.flatnonzero(np.abs(self._path_m - self._path_m[centre]) <= half_m)
         local = SurfelMap(self._voxel_size_m)
-        T_key_map = inverse(self._before[centre])
+        T_key_map = inverse(self._initial[centre])
         for number in spaced(self._path_m, around, centre):
-            T_key_sensor = compose(T_key_map, self._before[number])
+            T_key_sensor = compose(T_key_map, self._initial[number])
             local.insert(
                 local.reduce(
                     self._scans.points(number),
@@ -347,10 +347,10 @@ def spaced(path_m: Floats, numbers: npt.NDArray[np.int64], centre: int) -> list[
     return sorted({*numbers[nearest].tolist(), centre})
 
 
-def confirms(other: Loop, loop: Loop) -> bool:
+def confirms(witness: Loop, loop: Loop) -> bool:
     """Return whether a loop connects keyframes next to both ends of another."""
-    is_other = (other.source, other.target) != (loop.source, loop.target)
-    apart = max(abs(other.source - loop.source), abs(other.target - loop.target))
+    is_other = (witness.source, witness.target) != (loop.source, loop.target)
+    apart = max(abs(witness.source - loop.source), abs(witness.target - loop.target))
     return is_other and apart <= NEAR_KEYS
 
 

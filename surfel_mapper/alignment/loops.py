@@ -139,9 +139,9 @@ def solve_loops(T_map_key: Floats, loops: Sequence[Loop], drift_ratio: float) ->
     weights = (WIDTH**2 / (graph.residuals() + WIDTH**2)) ** 2
     is_kept = weights >= KEPT
     graph.solve(np.where(is_kept, 1.0, 0.0))
-    found = graph.T_map_key
-    found[0] = poses[0]  # bit for bit
-    return LoopSolution(found, weights, is_kept)
+    solved = graph.T_map_key
+    solved[0] = poses[0]  # bit for bit
+    return LoopSolution(solved, weights, is_kept)
 
 
 class _LoopGraph:
@@ -188,8 +188,8 @@ class _LoopGraph:
         T = transforms(self._lum.graph.poses)
         result = np.empty(len(self._loops))
         for row, loop in enumerate(self._loops):
-            found = compose(inverse(T[loop.target]), T[loop.source])
-            gap = moved(found, ANCHORS) - moved(loop.T_target_source, ANCHORS)
+            T_target_source = compose(inverse(T[loop.target]), T[loop.source])
+            gap = moved(T_target_source, ANCHORS) - moved(loop.T_target_source, ANCHORS)
             result[row] = (gap * gap).sum() / (len(ANCHORS) * LOOP_SIGMA_M**2)
         return result
 

@@ -325,11 +325,11 @@ class LUM:
         terms = exact_terms(sums)
         if not weighted.any():
             return terms, sums.rms
-        others, rms = weighted_terms(
+        weighed, rms = weighted_terms(
             self.graph.moments(True), T_source[weighted], T_target[weighted]
         )
         order = np.argsort(np.concatenate([np.flatnonzero(plain), np.flatnonzero(weighted)]))
-        return terms.joined(others, order), np.concatenate([sums.rms, rms])[order]
+        return terms.joined(weighed, order), np.concatenate([sums.rms, rms])[order]
 
     def _result(
         self,
@@ -342,13 +342,13 @@ class LUM:
         final, rms = self._terms(ends, self.graph.poses)
         counts = np.ones(len(ends), bool)
         counts[list(terms.dropped)] = False
-        part = components(self.num_vertices, ends[counts])
+        component = components(self.num_vertices, ends[counts])
         return LumResult(
             converged=converged and bool(counts.any()),
             iterations=iterations,
             residuals=dict(zip(names, rms.tolist(), strict=True)),
             dropped={names[e]: terms.dropped[e] for e in sorted(terms.dropped)},
-            unconnected=tuple(np.flatnonzero(part != part[0]).tolist()),
+            unconnected=tuple(np.flatnonzero(component != component[0]).tolist()),
             edges={
                 name: EdgeEstimate(
                     center=final.center[e],

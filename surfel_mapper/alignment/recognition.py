@@ -88,17 +88,17 @@ class Recognition:
         if len(points) < LEAST_POINTS:
             return []
         self._numbers.append(number)
-        found = self._closures.get_closures(len(self._numbers) - 1, points)
-        agreeing = [each for each in found if each.number_of_inliers >= self._min_votes]
-        agreeing.sort(key=lambda each: -each.number_of_inliers)
+        loops = self._closures.get_closures(len(self._numbers) - 1, points)
+        agreeing = [loop for loop in loops if loop.number_of_inliers >= self._min_votes]
+        agreeing.sort(key=lambda loop: -loop.number_of_inliers)
         return [
             Candidate(
                 source=number,
-                target=self._numbers[each.source_id],
-                T_target_source=inverse(np.asarray(each.pose, np.float64)),
-                votes=int(each.number_of_inliers),
+                target=self._numbers[loop.source_id],
+                T_target_source=inverse(np.asarray(loop.pose, np.float64)),
+                votes=int(loop.number_of_inliers),
             )
-            for each in agreeing[:num_candidates]
+            for loop in agreeing[:num_candidates]
         ]
 
 

@@ -205,22 +205,22 @@ class Registration:
 
         """
         levels = PlaneLevels(self.config, surfel_map, cells, starts)
-        found = self._descend(cells, levels, starts[0], deviation_m)
-        is_usual = found.converged and found.support >= expected_support and self.fits(found)
+        result = self._descend(cells, levels, starts[0], deviation_m)
+        is_usual = result.converged and result.support >= expected_support and self.fits(result)
         is_predicted = deviation_m <= self._voxel_size_m and not is_lost
-        if is_usual and is_predicted and self._is_near(found, starts[0]):
-            return found
+        if is_usual and is_predicted and self._is_near(result, starts[0]):
+            return result
         view = ScanView(cells)
-        found = self._viewed(found, view, levels)
-        if is_usual and not is_lost and found.seen_through <= MAX_SEEN_THROUGH:
-            return found
+        result = self._viewed(result, view, levels)
+        if is_usual and not is_lost and result.seen_through <= MAX_SEEN_THROUGH:
+            return result
         width_m = levels.voxel_size_m(self.config.coarse_levels)
-        others = [
+        searched = [
             self._viewed(self._descend(cells, levels, start, width_m), view, levels)
-            for start in self._places(cells, levels, starts)
+            for start in self._searched_poses(cells, levels, starts)
         ]
-        chosen = self._chosen([found, *others], starts, is_lost)
-        return replace(chosen, is_found=not self._is_near(chosen, found.T_map_sensor))
+        chosen = self._chosen([result, *searched], starts, is_lost)
+        return replace(chosen, is_found=not self._is_near(chosen, result.T_map_sensor))
 
     def seen_through(
         self, cells: npt.NDArray[np.float64], surfel_map: SurfelMap, T_map_sensor: Transform
@@ -229,40 +229,40 @@ class Registration:
         surfaces = PlaneLevels(self.config, surfel_map, cells, [T_map_sensor]).surfaces
         return ScanView(cells).seen_through(surfaces, T_map_sensor, self._voxel_size_m)
 
-    def _is_near(self, found: RegistrationResult, pose: Transform) -> bool:
+    def _is_near(self, result: RegistrationResult, pose: Transform) -> bool:
         """Return whether a result is at the same place as a pose, within a voxel."""
-        return is_near(found.T_map_sensor, pose, self._voxel_size_m)
+        return is_near(result.T_map_sensor, pose, self._voxel_size_m)
 
     def _viewed(
-        self, found: RegistrationResult, view: ScanView, levels: PlaneLevels
+        self, result: RegistrationResult, view: ScanView, levels: PlaneLevels
     ) -> RegistrationResult:
         """Return a result with the share of the map that its scan sees through."""
-        share = view.seen_through(levels.surfaces, found.T_map_sensor, self._voxel_size_m)
-        return replace(found, seen_through=share)
+        share = view.seen_through(levels.surfaces, result.T_map_sensor, self._voxel_size_m)
+        return replace(result, seen_through=share)
 
     def _chosen(
-        self, places: Sequence[RegistrationResult], starts: Sequence[Transform], is_lost: bool
+        self, results: Sequence[RegistrationResult], starts: Sequence[Transform], is_lost: bool
     ) -> RegistrationResult:
         """
-        Return the nearest of the places that fit about equally well, with its rival.
+        Return the nearest of the results that fit about equally well, with its rival.
 
-        If the scan is lost, the best one.
+        If the scan is lost, return the best one.
         """
-        best = max(places, key=lambda place: (place.converged, place.score))
+        best = max(results, key=lambda result: (result.converged, result.score))
         if not (best.converged and best.score > 0.0):
             return best
 
-        def motion_m(place: RegistrationResult) -> float:
-            off = [compose(inverse(start), place.T_map_sensor) for start in starts]
+        def motion_m(result: RegistrationResult) -> float:
+            off = [compose(inverse(start), result.T_map_sensor) for start in starts]
             return min(math.hypot(*T[:3, 3], best.radius_m * rotation_angle(T)) for T in off)
 
-        equal = [p for p in places if p.converged and p.score >= AMBIGUOUS * best.score]
+        equal = [p for p in results if p.converged and p.score >= AMBIGUOUS * best.score]
         nearest = best if is_lost else min(equal, key=motion_m)
         reach_m = math.inf if is_lost else FARTHER * motion_m(nearest)
         rivals = [
-            place.support
-            for place in equal
-            if motion_m(place) < reach_m and not self._is_near(place, nearest.T_map_sensor)
+            result.support
+            for result in equal
+            if motion_m(result) < reach_m and not self._is_near(result, nearest.T_map_sensor)
         ]
         return replace(nearest, rival=max(rivals, default=0.0))
 
@@ -283,9 +283,9 @@ class Registration:
         """Align from the level that a deviation requires down to the map itself."""
         reach = max(3.0 * deviation_m / levels.voxel_size_m(0), 1.0)
         coarsest = min(self.config.coarse_levels, math.ceil(math.log2(reach)))
-        found, iterations = None, 0
+        result, iterations = None, 0
         for level in range(coarsest, -1, -1):
-            pose = start if found is None else found.T_map_sensor
+            pose = start if result is None else result.T_map_sensor
             size_m = levels.voxel_size_m(level)
             width_m = min(deviation_m, 0.5 * size_m)
             tolerance_m = COARSE_TOLERANCE * size_m if level else TOLERANCE_M
@@ -294,10 +294,10 @@ class Registration:
             finer = self._converge(some, levels.planes(level), pose, width_m, tolerance_m, most)
             iterations += finer.iterations
             # the first scans of few beams may only fill the larger voxels
-            if found is None or finer.overlap >= self.config.min_overlap_ratio:
-                found = finer
-        assert found is not None, 'there is always level 0'
-        return replace(found, num_cells=len(cells), iterations=iterations)
+            if result is None or finer.overlap >= self.config.min_overlap_ratio:
+                result = finer
+        assert result is not None, 'there is always level 0'
+        return replace(result, num_cells=len(cells), iterations=iterations)
 
     def _converge(
         self,
@@ -311,11 +311,11 @@ class Registration:
         """Iterate Gauss-Newton steps until they are below the tolerance."""
         pose, iteration, moved_m = start, 0, math.inf
         least = self.config.min_information_ratio
-        place, placed_m = planes.place(cells, pose), 0.0
+        rows, placed_m = planes.rows_at(cells, pose), 0.0
         while True:
             if placed_m > SAME_VOXELS * planes.voxel_size_m:
-                place, placed_m = planes.place(cells, pose), 0.0
-            hessian, gradient, overlap, fit = planes.equations(cells, pose, width_m, place)
+                rows, placed_m = planes.rows_at(cells, pose), 0.0
+            hessian, gradient, overlap, fit = planes.equations(cells, pose, width_m, rows)
             if moved_m < tolerance_m or iteration == max_iterations:
                 break
             step, degenerate, radius_m = solve(hessian, gradient, least)
@@ -335,11 +335,11 @@ class Registration:
             radius_m=radius_m,
         )
 
-    def _places(
+    def _searched_poses(
         self, cells: npt.NDArray[np.float64], levels: PlaneLevels, starts: Sequence[Transform]
     ) -> list[Transform]:
         """
-        Return the best places that a coarse alignment of some cells finds.
+        Return the best poses that a coarse alignment of some cells finds.
 
         Every start is turned in steps and aligned to the largest voxels. Comparing headings
         without aligning them would compare errors of position: a hall of two symmetries then
@@ -354,23 +354,23 @@ class Registration:
         )
         for num_cells, num_steps, num_places in stages:
             some = thinned(cells, num_cells)
-            found = [
+            results = [
                 self._converge(some, planes, pose, size_m, COARSE_TOLERANCE * size_m, num_steps)
                 for pose in poses
             ]
-            poses = self._best_places(found, num_places)
+            poses = self._distinct_poses(results, num_places)
         return poses
 
-    def _best_places(self, found: list[RegistrationResult], num: int) -> list[Transform]:
+    def _distinct_poses(self, results: list[RegistrationResult], num: int) -> list[Transform]:
         """Return the poses of the best supported results at different places."""
-        places: list[Transform] = []
-        for result in sorted(found, key=lambda result: result.support, reverse=True):
+        poses: list[Transform] = []
+        for result in sorted(results, key=lambda result: result.support, reverse=True):
             pose = result.T_map_sensor
-            if not any(is_near(pose, place, self._voxel_size_m) for place in places):
-                places.append(pose)
-            if len(places) == num:
+            if not any(is_near(pose, chosen, self._voxel_size_m) for chosen in poses):
+                poses.append(pose)
+            if len(poses) == num:
                 break
-        return places
+        return poses
 
 
 def thinned(cells: npt.NDArray[np.float64], num: int) -> npt.NDArray[np.float64]:
@@ -445,7 +445,7 @@ def moved(T_map_sensor: Transform, step: npt.NDArray[np.float64]) -> Transform:
     first, second = ([_dot(row, column) for column in columns] for row in turn[:2])
     first = _unit(first)  # the product is off by rounding
     along = _dot(second, first)
-    second = _unit([value - along * other for value, other in zip(second, first, strict=True)])
+    second = _unit([value - along * base for value, base in zip(second, first, strict=True)])
     third = [
         first[1] * second[2] - first[2] * second[1],
         first[2] * second[0] - first[0] * second[2],

@@ -87,8 +87,8 @@ def exact_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
 
     """
     used = _used(ends, terms)
-    part = components(len(poses), ends[used])
-    free = part == part[0]
+    component = components(len(poses), ends[used])
+    free = component == component[0]
     free[0] = False
     entries = Entries(
         edges=np.concatenate([used, used]),
@@ -128,9 +128,9 @@ def pcl_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
     entries = entries.chosen(counts[entries.edges])
     free = np.zeros(len(poses), bool)
     free[entries.ij[:, 0]] = True
-    part = components(len(poses), entries.ij)
-    last = {int(number): vertex for vertex, number in enumerate(part)}
-    free[[0 if number == part[0] else vertex for number, vertex in last.items()]] = False
+    component = components(len(poses), entries.ij)
+    last = {int(number): vertex for vertex, number in enumerate(component)}
+    free[[0 if number == component[0] else vertex for number, vertex in last.items()]] = False
     pivots = _pivots(len(poses), entries.ij, terms.center[entries.edges])
     motion = _solve(free, entries, pivots, terms, symmetric=False)
     motion[:, :3] -= np.cross(motion[:, 3:], pivots)  # about the origin of the map
@@ -167,12 +167,12 @@ def pose_covariances(poses: Floats, ends: Ints, terms: EdgeTerms, freedom: Float
 
     """
     used = _used(ends, terms)
-    part = components(len(poses), ends[used])
-    free = part == part[0]
+    component = components(len(poses), ends[used])
+    free = component == component[0]
     result = np.where(free[:, None, None], 0.0, np.full((6, 6), np.nan))
     free[0] = False
-    used = used[np.isin(ends[used][:, 0], np.flatnonzero(part == part[0]))]
-    place = np.cumsum(free) - 1
+    used = used[np.isin(ends[used][:, 0], np.flatnonzero(component == component[0]))]
+    row_of = np.cumsum(free) - 1
     size = 6 * int(free.sum())
     origins = transforms(poses)[:, :3, 3]
     system, noise = np.zeros((2, size, size))
@@ -181,7 +181,7 @@ def pose_covariances(poses: Floats, ends: Ints, terms: EdgeTerms, freedom: Float
         for end, sign in zip(ends[edge], (1.0, -1.0), strict=True):
             if free[end]:
                 arm = _arms((terms.center[edge] - origins[end])[None])[0]
-                rows[:, 6 * place[end] : 6 * place[end] + 6] += sign * arm
+                rows[:, 6 * row_of[end] : 6 * row_of[end] + 6] += sign * arm
         share = rows.T @ terms.information[edge] @ rows
         system += share
         noise += share / freedom[edge]
@@ -225,17 +225,17 @@ def _solve(
     edges, ij, sign = entries.chosen(free[entries.ij[:, 0]])
     if not len(edges):
         return motion
-    place = np.cumsum(free) - 1
+    row_of = np.cumsum(free) - 1
     near = _arms(terms.center[edges] - pivots[ij[:, 0]])
     weighed = near.swapaxes(1, 2) @ terms.information[edges]
     right = np.zeros((int(free.sum()), 6))
     observed = weighed @ (sign[:, None] * terms.motion[edges])[:, :, None]
-    np.add.at(right, place[ij[:, 0]], observed[:, :, 0])
-    other = free[ij[:, 1]]
-    far = _arms(terms.center[edges[other]] - pivots[ij[other, 1]])
-    blocks = np.concatenate([weighed @ near, -(weighed[other] @ far)])
-    rows = place[np.concatenate([ij[:, 0], ij[other, 0]])]
-    columns = place[np.concatenate([ij[:, 0], ij[other, 1]])]
+    np.add.at(right, row_of[ij[:, 0]], observed[:, :, 0])
+    coupled = free[ij[:, 1]]
+    far = _arms(terms.center[edges[coupled]] - pivots[ij[coupled, 1]])
+    blocks = np.concatenate([weighed @ near, -(weighed[coupled] @ far)])
+    rows = row_of[np.concatenate([ij[:, 0], ij[coupled, 0]])]
+    columns = row_of[np.concatenate([ij[:, 0], ij[coupled, 1]])]
     motion[free] = _solve_blocks(blocks, rows, columns, right, symmetric=symmetric)
     return motion
 

@@ -92,7 +92,7 @@ class SurfelPlanes:
         cells: npt.NDArray[np.float64],
         T_map_sensor: Transform,
         width_m: float,
-        place: npt.NDArray[np.int32] | None = None,
+        rows: npt.NDArray[np.int32] | None = None,
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float, float]:
         """
         Return the normal equations of a Gauss-Newton step at a pose.
@@ -105,8 +105,8 @@ class SurfelPlanes:
             The pose.
         width_m : float
             Width of the robust kernel.
-        place : (K,) int32, optional
-            Result of ``place`` at a pose nearby; by default that at the pose.
+        rows : (K,) int32, optional
+            Result of ``rows_at`` at a pose nearby; by default the one at the pose.
 
         Returns
         -------
@@ -120,32 +120,32 @@ class SurfelPlanes:
 
         """
         pose = np.ascontiguousarray(T_map_sensor[:3])
-        if place is None:
-            place = self.place(cells, T_map_sensor)
+        if rows is None:
+            rows = self.rows_at(cells, T_map_sensor)
         hessian, gradient = np.empty((6, 6)), np.empty(6)
         met, fit = sum_equations(
-            cells, pose, place, self._planes, width_m * width_m, hessian, gradient
+            cells, pose, rows, self._planes, width_m * width_m, hessian, gradient
         )
         return hessian, gradient, met / max(len(cells), 1), fit / max(met, 1)
 
-    def place(
+    def rows_at(
         self, cells: npt.NDArray[np.float64], T_map_sensor: Transform
     ) -> npt.NDArray[np.int32]:
         """Return the row of the plane that each cell hits at a pose, -1 if none."""
         pose = np.ascontiguousarray(T_map_sensor[:3])
         keys = np.empty(len(cells), np.int64)
         cell_keys(cells, pose, self._scale, BITS + self._map.level, keys)
-        found = self._map.find(keys)
-        missing = int(found.max(initial=-1)) + 1 - len(self._number)
+        rows = self._map.find(keys)
+        missing = int(rows.max(initial=-1)) + 1 - len(self._number)
         if missing > 0:
             self._number = np.append(self._number, np.full(missing, -1, np.int32))
         num_known = len(self._planes)
-        known = np.empty(num_known + len(cells), np.int32)
-        num_now = number_rows(found, self._number, known, num_known)
+        numbered = np.empty(num_known + len(cells), np.int32)
+        num_now = number_rows(rows, self._number, numbered, num_known)
         if num_now > num_known:
-            new = self._map.surfels_of(known[num_known:num_now])
+            new = self._map.surfels_of(numbered[num_known:num_now])
             self._planes = np.concatenate([self._planes, self._as_planes(new)])
-        return found
+        return rows
 
     def _as_planes(self, surfels: Surfels) -> npt.NDArray[np.float64]:
         """
@@ -163,14 +163,14 @@ class SurfelPlanes:
             (size_m, self._noise_sq, SIGMAS),
             keys,
         )
-        found = self._map.find(keys)
-        others = self._map.surfels_of(found[found >= 0])
-        behind = np.where(found >= 0, np.cumsum(found >= 0) - 1, -1)
+        rows = self._map.find(keys)
+        continued = self._map.surfels_of(rows[rows >= 0])
+        behind = np.where(rows >= 0, np.cumsum(rows >= 0) - 1, -1)
         ring_sq = min(NOISE_IN_PLANE * self._noise_sq, size_m**2 / 48.0)
         planes = np.empty((len(surfels), PLANE))
         fill_planes(
             (surfels.position, surfels.normal, surfels.eigenvalues, surfels.num_points),
-            (others.position, others.normal, others.eigenvalues, others.num_points),
+            (continued.position, continued.normal, continued.eigenvalues, continued.num_points),
             behind,
             (self._noise_sq, SIGMAS, ALIKE, self._min_points, MAX_TILT_SQ, ring_sq),
             planes,
@@ -255,5 +255,5 @@ class PlaneLevels:
 def means(moments: ScanMoments) -> npt.NDArray[np.float64]:
     """Return the mean of the points of every voxel, (K, 3) float64, m."""
     inside = moments.total / moments.count[:, None] + (HALF + 0.5)
-    places = (moments.voxel_index + inside / (1 << BITS)) * moments.voxel_size_m
-    return np.ascontiguousarray(places, np.float64)
+    positions = (moments.voxel_index + inside / (1 << BITS)) * moments.voxel_size_m
+    return np.ascontiguousarray(positions, np.float64)

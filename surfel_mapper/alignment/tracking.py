@@ -168,24 +168,24 @@ class Tracker:
         if self._stamp_ns is not None:
             starts.append(compose(T_map_fixed, self.pose))
         expected = self.expected_support
-        found = self._registration.align(cells, surfel_map, starts, self.deviation_m, expected)
-        is_usual = bool(self._supports) and found.support >= expected > 0.0
-        is_steady = found.converged or is_usual
-        is_ambiguous = found.rival > 0.0
+        result = self._registration.align(cells, surfel_map, starts, self.deviation_m, expected)
+        is_usual = bool(self._supports) and result.support >= expected > 0.0
+        is_steady = result.converged or is_usual
+        is_ambiguous = result.rival > 0.0
         self.num_ambiguous += is_ambiguous and is_steady
-        pose = compose(inverse(T_map_fixed), found.T_map_sensor)
-        refusal = self._refusal(found, is_steady)
+        pose = compose(inverse(T_map_fixed), result.T_map_sensor)
+        refusal = self._refusal(result, is_steady)
         self.doubtful = None
         if not refusal:
-            refusal = self._doubt(found, surfel_map, T_map_fixed)
+            refusal = self._doubt(result, surfel_map, T_map_fixed)
         if refusal:
             self._deviations.clear()
             self.twist = 0.5 * self.twist  # after several failures the prediction is at rest
             raise AlignmentError(refusal)
-        self._supports.append(found.support)
+        self._supports.append(result.support)
         self._cells = cells
         self.advance(pose, stamp_ns, math.sqrt(float((cells**2).sum()) / max(len(cells), 1)))
-        return found
+        return result
 
     @property
     def expected_support(self) -> float:
@@ -202,23 +202,23 @@ class Tracker:
         share = self._registration.seen_through(self._cells, surfel_map, T_map_body)
         return share + MORE_SEEN_THROUGH
 
-    def _shares(self, found: RegistrationResult) -> str:
+    def _shares(self, result: RegistrationResult) -> str:
         """Return the quality of the fit of a scan, in words."""
         return (
-            f'{found.overlap:.0%} of its {found.num_cells} cells meet a surfel and '
-            f'{found.fit:.0%} of these fit it'
+            f'{result.overlap:.0%} of its {result.num_cells} cells meet a surfel and '
+            f'{result.fit:.0%} of these fit it'
         )
 
-    def _refusal(self, found: RegistrationResult, is_steady: bool) -> str:
+    def _refusal(self, result: RegistrationResult, is_steady: bool) -> str:
         """Return the reason why a scan is rejected; empty if it is not."""
         config = self._registration.config
-        said = self._shares(found)
-        if found.rival > 0.0:
+        said = self._shares(result)
+        if result.rival > 0.0:
             return (
-                f'{said}, but another place fits {found.rival / max(found.support, 1e-9):.0%} as '
-                'well: its pose is ambiguous'
+                f'{said}, but another place fits {result.rival / max(result.support, 1e-9):.0%} '
+                'as well: its pose is ambiguous'
             )
-        if not self._registration.fits(found):
+        if not self._registration.fits(result):
             return (
                 f'{said}, expected {config.min_overlap_ratio:.0%} and {config.min_fit_ratio:.0%}'
             )
@@ -227,23 +227,23 @@ class Tracker:
         return ''
 
     def _doubt(
-        self, found: RegistrationResult, surfel_map: SurfelMap, T_map_fixed: Transform
+        self, result: RegistrationResult, surfel_map: SurfelMap, T_map_fixed: Transform
     ) -> str:
         """Return why the next scans have to agree with a place; empty if they need not."""
         expected = self.expected_support
-        is_clear = found.fit >= CLEAR_FIT  # a new place has a small overlap, but fits
-        is_poor = bool(self._supports) and found.support < POOR_SUPPORT * expected
-        is_unusual = found.is_found and found.support < expected
+        is_clear = result.fit >= CLEAR_FIT  # a new place has a small overlap, but fits
+        is_poor = bool(self._supports) and result.support < POOR_SUPPORT * expected
+        is_unusual = result.is_found and result.support < expected
         doubt = ''
-        share = found.seen_through
+        share = result.seen_through
         if share > MORE_SEEN_THROUGH and share > self.max_seen_through(surfel_map, T_map_fixed):
             doubt = f'it sees through {share:.0%} of the map in view'
         elif (is_poor or is_unusual) and not is_clear:
             doubt = f'usually {expected / EXPECTED_SUPPORT:.0%} in all'
         if not doubt:
             return ''
-        self.doubtful = found.T_map_sensor
-        return f'{self._shares(found)}, {doubt}: the next scans have to agree'
+        self.doubtful = result.T_map_sensor
+        return f'{self._shares(result)}, {doubt}: the next scans have to agree'
 
     def advance(self, T_fixed_body: Transform, stamp_ns: int, reach_m: float = 0.0) -> None:
         """

@@ -152,14 +152,14 @@ def align_scans(
     T_map_key[0] = poses[keys[0]]  # bit for bit
     by_surfels = {ends: gap for ends, gap in result.residuals.items() if ends[0] > ends[1]}
     counts = [ends for ends in by_surfels if ends not in result.dropped]
-    part = components(len(keys), np.array(counts, np.int64).reshape(-1, 2))
+    component = components(len(keys), np.array(counts, np.int64).reshape(-1, 2))
     return WindowAlignment(
         T_map_sensor=carried(poses, keys, T_map_key),
         settled=settled,
         rounds=rounds,
         residuals={(keys[s], keys[t]): gap for (s, t), gap in by_surfels.items()},
         dropped={(keys[s], keys[t]): LITTLE_OVERLAP for s, t in result.dropped},
-        unconnected=tuple(keys[v] for v in np.flatnonzero(part != part[0]).tolist()),
+        unconnected=tuple(keys[v] for v in np.flatnonzero(component != component[0]).tolist()),
     )
 
 
@@ -219,13 +219,13 @@ class _Aligner:
 
     def _add(self, v: int, pose: Floats, T_scan_before: Floats) -> None:
         """Add a scan, with the odometry prior from the previous one."""
-        scan, before = self._scans[v], self._scans[v - 1]
-        seen = ANCHORS @ T_scan_before[:3, :3].T + T_scan_before[:3, 3]
-        self._lum.add_point_cloud(np.concatenate([scan.position, ANCHORS, seen]), pose)
+        scan, previous = self._scans[v], self._scans[v - 1]
+        anchors = ANCHORS @ T_scan_before[:3, :3].T + T_scan_before[:3, 3]
+        self._lum.add_point_cloud(np.concatenate([scan.position, ANCHORS, anchors]), pose)
         step_m = float(np.linalg.norm(T_scan_before[:3, 3]))
         sigma_m = max(ODOMETRY_SHARE * step_m, ODOMETRY_LEAST_M)
         number = np.arange(len(ANCHORS))
-        pairs = np.stack([len(before) + number, len(scan) + len(ANCHORS) + number], axis=1)
+        pairs = np.stack([len(previous) + number, len(scan) + len(ANCHORS) + number], axis=1)
         weights = np.tile(np.eye(3) / (len(ANCHORS) * sigma_m**2), (len(ANCHORS), 1, 1))
         self._lum.set_correspondences(v - 1, v, pairs, weights)  # surfels use the opposite edge
 
@@ -236,12 +236,12 @@ class _Aligner:
 
     def round(self) -> bool:
         """Match surfels and move scans; return whether the poses have settled."""
-        before = self._lum.graph.poses
-        T = transforms(before)
+        poses = self._lum.graph.poses
+        T = transforms(poses)
         for source, target in self._ends:
             self._compare(source, target, compose(inverse(T[target]), T[source]))
         self.result = self._lum.compute()
-        moved = np.abs(self._lum.graph.poses - before).max(axis=0)
+        moved = np.abs(self._lum.graph.poses - poses).max(axis=0)
         moved_m, turned_deg = moved[:3].max(), np.degrees(moved[3:].max())
         still = moved_m <= self._settings.settled_m and turned_deg <= self._settings.settled_deg
         was_finest = self._scale_m == self._finest_m
@@ -250,9 +250,9 @@ class _Aligner:
 
     def _compare(self, source: int, target: int, T_target_source: Floats) -> None:
         """Match the surfels of two scans, unless neither moved since the last match."""
-        known = self._matched.get((source, target))
-        if known is not None and known[1] == self._scale_m:
-            moved_m, turned_deg = extent(compose(inverse(known[0]), T_target_source))
+        last = self._matched.get((source, target))
+        if last is not None and last[1] == self._scale_m:
+            moved_m, turned_deg = extent(compose(inverse(last[0]), T_target_source))
             if moved_m <= self._settings.settled_m and turned_deg <= self._settings.settled_deg:
                 return
         self._matched[source, target] = (T_target_source, self._scale_m)
@@ -277,19 +277,19 @@ def _neighbours(T_map_sensor: Floats) -> list[tuple[int, int]]:
     return ends
 
 
-def carried(before: Floats, keys: list[int], T_map_key: Floats) -> Floats:
+def carried(poses: Floats, keys: list[int], T_map_key: Floats) -> Floats:
     """Return the poses of all scans; others move with the key scans around them."""
-    after = before.copy()
-    after[keys] = T_map_key
+    moved = poses.copy()
+    moved[keys] = T_map_key
     last = keys[-1]
-    for number in range(last + 1, len(before)):
-        after[number] = compose(after[last], compose(inverse(before[last]), before[number]))
+    for number in range(last + 1, len(poses)):
+        moved[number] = compose(moved[last], compose(inverse(poses[last]), poses[number]))
     for first, last in pairwise(keys):
         for number in range(first + 1, last):
             from_first, from_last = (
-                compose(after[key], compose(inverse(before[key]), before[number]))
+                compose(moved[key], compose(inverse(poses[key]), poses[number]))
                 for key in (first, last)
             )
             along = (number - first) / (last - first)
-            after[number] = interpolate(from_first, from_last, along)
-    return np.asarray(after)
+            moved[number] = interpolate(from_first, from_last, along)
+    return np.asarray(moved)

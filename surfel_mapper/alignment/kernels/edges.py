@@ -70,8 +70,8 @@ def pair_moments(source, target, pairs, moments):
         cxx, cxy, cxz = cxx + px * qx, cxy + px * qy, cxz + px * qz
         cyx, cyy, cyz = cyx + py * qx, cyy + py * qy, cyz + py * qz
         czx, czy, czz = czx + pz * qx, czy + pz * qy, czz + pz * qz
-    part = 1.0 / max(num, 1)
-    ux, uy, uz, vx, vy, vz = sx * part, sy * part, sz * part, tx * part, ty * part, tz * part
+    share = 1.0 / max(num, 1)
+    ux, uy, uz, vx, vy, vz = sx * share, sy * share, sz * share, tx * share, ty * share, tz * share
     sums = (
         float(num),
         ax + ux,
@@ -182,16 +182,16 @@ def weighted_moments(source, target, pairs, weights, moments):
         )
         moments[COUNT] += 1.0
         moments[GAP_SQ] += wq[0] * qx + wq[1] * qy + wq[2] * qz
-        place = LINEAR
+        index = LINEAR
         for axis in range(3):
             for a in range(4):
-                moments[place] += wq[axis] * h[a]
-                place += 1
+                moments[index] += wq[axis] * h[a]
+                index += 1
         for entry in range(6):
             for a in range(4):
                 scaled = upper[entry] * h[a]
                 for b in range(a, 4):
-                    moments[place] += scaled * h[b]
-                    place += 1
+                    moments[index] += scaled * h[b]
+                    index += 1
     for entry, value in enumerate((ax, ay, az, bx, by, bz)):
         moments[FIRST_PAIR + entry] = value

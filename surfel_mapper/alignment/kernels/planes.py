@@ -57,7 +57,7 @@ def fill_planes(first, second, behind, limits, planes):
     planes         (K, 8) float64, out: see sum_equations; unusable surfels get variance inf
     """
     position, normal, eigenvalues, count = first
-    others, other_normal, other_values, other_count = second
+    centres, other_normal, other_values, other_count = second
     noise_sq, sigmas, alike, min_points, max_tilt_sq, ring_sq = limits
     for i in range(len(planes)):
         x, y, z = position[i, 0], position[i, 1], position[i, 2]
@@ -65,7 +65,7 @@ def fill_planes(first, second, behind, limits, planes):
         e0, e1, num = eigenvalues[i, 0], eigenvalues[i, 1], float(count[i])
         j = behind[i]
         if j >= 0:
-            dx, dy, dz = others[j, 0] - x, others[j, 1] - y, others[j, 2] - z
+            dx, dy, dz = centres[j, 0] - x, centres[j, 1] - y, centres[j, 2] - z
             across_m = dx * nx + dy * ny + dz * nz
             mx, my, mz = other_normal[j, 0], other_normal[j, 1], other_normal[j, 2]
             cosine = mx * nx + my * ny + mz * nz

@@ -52,34 +52,34 @@ def cell_keys(cells, pose, scale, bits, keys):
 
 
 @kernel(error_model='numpy')
-def number_rows(found, number, known, num_known):
+def number_rows(rows, number, numbered, num):
     """
     Assign numbers to the rows of a map in the order of first use; return the next number.
 
-    found   (K,) int32, in: rows of a map, -1 for none; out: their numbers, -1 for none
-    number  (R,) int32, in and out: number of each row of the map, -1 if not numbered
-    known   (K,) int32 or longer, out: the rows by number
+    rows      (K,) int32, in: rows of a map, -1 for none; out: their numbers, -1 for none
+    number    (R,) int32, in and out: number of each row of the map, -1 if not numbered
+    numbered  (K,) int32 or longer, out: the rows by number
     """
-    for i in range(len(found)):
-        row = found[i]
+    for i in range(len(rows)):
+        row = rows[i]
         if row < 0:
             continue
         if number[row] < 0:
-            number[row] = num_known
-            known[num_known] = row
-            num_known += 1
-        found[i] = number[row]
-    return num_known
+            number[row] = num
+            numbered[num] = row
+            num += 1
+        rows[i] = number[row]
+    return num
 
 
 @kernel(error_model='numpy')
-def sum_equations(cells, pose, place, planes, width_sq, hessian, gradient):
+def sum_equations(cells, pose, row_of, planes, width_sq, hessian, gradient):
     """
     Sum the normal equations of a Gauss-Newton step.
 
     cells     (K, 3) float64, m, in the sensor frame
     pose      (3, 4) float64, T_map_sensor
-    place     (K,) int32, row of planes for each cell, -1 for none
+    row_of    (K,) int32, row of planes for each cell, -1 for none
     planes    (P, 8) float64: mean (m), unit normal, variance of a distance from the plane at the
               mean (m^2), and its increase with the squared distance from the mean
     width_sq  float64, m^2: squared width of Geman and McClure's kernel
@@ -97,7 +97,7 @@ def sum_equations(cells, pose, place, planes, width_sq, hessian, gradient):
     g0 = g1 = g2 = g3 = g4 = g5 = 0.0
     met, fit = 0, 0.0
     for i in range(len(cells)):
-        row = place[i]
+        row = row_of[i]
         if row < 0:
             continue
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
