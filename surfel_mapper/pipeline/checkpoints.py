@@ -93,9 +93,9 @@ class Checkpoints:
     def save(self, run: Callable[[Callable[[], Path]], object] = at_once) -> Path:
         """Save the map now; see save_if_due."""
         self._started_s, version = time.monotonic(), self._mapper.map.version
-        newest, before = checkpoint_paths(self._mapper.config.output)
+        newest, older = checkpoint_paths(self._mapper.config.output)
         with self._reporting():
-            self._make_room(newest, before)
+            self._make_room(newest, older)
             copied = CopiedMapper(newest, self._mapper)
 
         def write() -> Path:
@@ -120,21 +120,21 @@ class Checkpoints:
             self._failure = described(error)
             raise
 
-    def _make_room(self, newest: Path, before: Path) -> None:
-        """Make the newest checkpoint the one before."""
+    def _make_room(self, newest: Path, older: Path) -> None:
+        """Make the newest checkpoint the older one."""
         make_directory(newest.parent)
-        both = (layer_files(path, self._mapper) for path in (newest, before))
+        both = (layer_files(path, self._mapper) for path in (newest, older))
         layers = [(new, old) for (new, _), (old, _) in zip(*both, strict=True)]
-        for path in (newest, before, *(path for pair in layers for path in pair)):
+        for path in (newest, older, *(path for pair in layers for path in pair)):
             if path.is_symlink():
                 raise FileFormatError(f'{path}: a link, expected a file or none')
         if is_zipfile(newest):  # else it is cut, or layers are those of a checkpoint that failed
-            before.unlink(missing_ok=True)  # first, and last comes back: a map has its own layers
+            older.unlink(missing_ok=True)  # first, and last comes back: a map has its own layers
             for new, old in layers:
                 old.unlink(missing_ok=True)
                 if new.exists():
                     duplicate(new, old)
-            os.replace(newest, before)
+            os.replace(newest, older)
             for new, _ in layers:
                 new.unlink(missing_ok=True)
 
@@ -181,11 +181,11 @@ def load_start(mapper: Mapper) -> None:
 def _load_latest(mapper: Mapper) -> None:
     output = mapper.config.output
     saved = checkpoint_paths(output)[0].with_name(f'{output.map_name}.npz')
-    found = [path for path in checkpoint_paths(output) if path.is_file()]
+    paths = [path for path in checkpoint_paths(output) if path.is_file()]
     if saved.is_file():  # names give the order of checkpoints: a clock may be set back
         saved_ns = saved.stat().st_mtime_ns
-        found.insert(sum(path.stat().st_mtime_ns > saved_ns for path in found), saved)
-    for path in found:
+        paths.insert(sum(path.stat().st_mtime_ns > saved_ns for path in paths), saved)
+    for path in paths:
         try:
             load_mapper(path, mapper)
         except (FileFormatError, MapError, OSError, MemoryError) as error:

@@ -81,7 +81,7 @@ class LayerStack:
 
     def voxels_to_clear(self, inserted: InsertedScan, laps: Laps) -> npt.NDArray[np.int32]:
         """Return the voxels (E, 3) that layers want cleared after a scan, each once."""
-        found = []
+        cleared = []
         for layer in self.clearing:
             try:
                 voxels = layer.voxels_to_clear(inserted)
@@ -89,13 +89,13 @@ class LayerStack:
                 self._count_failure(layer, 'clear', inserted, error)
                 continue
             if len(voxels):
-                found.append(voxels)
+                cleared.append(voxels)
                 self._drops.counters.voxels_cleared[layer.name] += len(voxels)
             laps.end(layer.name)
             self._failures.pop((layer.name, 'clear'), None)
-        if len(found) < 2:
-            return found[0] if found else np.empty((0, 3), np.int32)
-        return np.unique(np.concatenate(found), axis=0)
+        if len(cleared) < 2:
+            return cleared[0] if cleared else np.empty((0, 3), np.int32)
+        return np.unique(np.concatenate(cleared), axis=0)
 
     def follow(self, inserted: InsertedScan, laps: Laps) -> dict[str, Any]:
         """Pass a scan to all layers; return their results by name."""
@@ -145,11 +145,11 @@ class LayerStack:
 
     def summary(self) -> dict[str, dict[str, Any]]:
         """Return the figures of the layers that have any, by name."""
-        found = {}
+        by_layer = {}
         for layer in self.active:
             with self._drops.guarded(f'figures of layer {layer.name}'):
-                found[layer.name] = layer.summary()
-        return {name: figures for name, figures in found.items() if figures}
+                by_layer[layer.name] = layer.summary()
+        return {name: figures for name, figures in by_layer.items() if figures}
 
     def _count_failure(
         self, layer: Layer, task: str, inserted: InsertedScan, error: Exception
@@ -162,7 +162,7 @@ class LayerStack:
         self._failures[name, task] += 1
         if self._failures[name, task] >= MAX_FAILURES and not isinstance(error, CloudFormatError):
             self._drops.counters.layers_off[name] = text
-            self._activate([other for other in self.active if other is not layer])
+            self._activate([kept for kept in self.active if kept is not layer])
             _log.error(
                 'layer %s is switched off until the map is cleared: it failed %d times in a row, '
                 'last with: %s',

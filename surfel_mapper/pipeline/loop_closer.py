@@ -74,7 +74,7 @@ class LoopMove:
             'accepted': len(closure.loops),
             'recognised': sum(loop.votes > 0 for loop in closure.loops),
             'refused': len(closure.refusals),
-            'refusals': [self._described(each) for each in closure.refusals[:LISTED]],
+            'refusals': [self._described(refusal) for refusal in closure.refusals[:LISTED]],
             'keyframes': len(closure.keys),
             'moved': self.num_moved,
             'largest_m': self.largest_m,
@@ -206,10 +206,10 @@ class LoopCloser:
             raise AlignmentError(
                 f'{len(self)} scans since the map was cleared or loaded, expected two or more'
             )
-        before = self.T_map_sensor
+        poses = self.T_map_sensor
         search = LoopSearch(
             self._spool,
-            before,
+            poses,
             config.loops,
             config.registration,
             config.map.voxel_size_m,
@@ -219,10 +219,10 @@ class LoopCloser:
 
     def move(self, closure: LoopClosure, config: Config) -> LoopMove:
         """Move all scans to the poses of a closure; an error leaves all at their poses before."""
-        before = self.T_map_sensor
+        previous = self.T_map_sensor
         extents = [
             extent(compose(inverse(old), new))
-            for old, new in zip(before, closure.T_map_sensor, strict=True)
+            for old, new in zip(previous, closure.T_map_sensor, strict=True)
         ]
         moved = [
             number
@@ -232,16 +232,16 @@ class LoopCloser:
         full = self._map.keys(config.map.min_points)
         self._begin_emptied()
         self._move_all(moved, closure.T_map_sensor, config)
-        after = self._map.keys(config.map.min_points)
-        has_moved = not np.array_equal(self._poses[-1], before[-1])
+        still_full = self._map.keys(config.map.min_points)
+        has_moved = not np.array_equal(self._poses[-1], previous[-1])
         return LoopMove(
             closure=closure,
             stamps_ns=np.array(self._stamps_ns, np.int64),
             num_moved=len(moved),
             largest_m=max((extents[number][0] for number in moved), default=0.0),
             largest_deg=max((extents[number][1] for number in moved), default=0.0),
-            correction=compose(self._poses[-1], inverse(before[-1])) if has_moved else np.eye(4),
-            removed_voxel_index=unpack_keys(np.setdiff1d(full, after)),
+            correction=compose(self._poses[-1], inverse(previous[-1])) if has_moved else np.eye(4),
+            removed_voxel_index=unpack_keys(np.setdiff1d(full, still_full)),
         )
 
     def _begin_emptied(self) -> None:
@@ -284,12 +284,12 @@ class LoopCloser:
         The poses follow scan by scan: if the points of a scan stay unreadable, its move cannot be
         undone, and its pose has to be the one in the map.
         """
-        after = self._moments(number, T_map_sensor, config)
-        before = self._moments(number, self._poses[number], config)
+        new = self._moments(number, T_map_sensor, config)
+        old = self._moments(number, self._poses[number], config)
         with ExitStack() as undo:
-            self._map.insert(after)
-            undo.callback(self._map.remove, after)
-            self._map.remove(before)
+            self._map.insert(new)
+            undo.callback(self._map.remove, new)
+            self._map.remove(old)
             undo.pop_all()
         self._poses[number] = T_map_sensor
 
@@ -314,35 +314,35 @@ class Emptied:
     """Voxels that were emptied, and the number of scans at the last time; see drop_voxels."""
 
     def __init__(self) -> None:
-        self._parts: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]] = []
+        self._batches: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]] = []
         self.num_scans = 0
 
     def __len__(self) -> int:
         """Return the number of voxels that were noted."""
-        return sum(len(keys) for keys, _ in self._parts)
+        return sum(len(keys) for keys, _ in self._batches)
 
     def add(self, keys: npt.NDArray[np.int64], num_scans: int) -> None:
         """Note that voxels were emptied after a number of scans."""
         if len(keys):
-            self._parts.append((keys, np.full(len(keys), num_scans, np.int64)))
+            self._batches.append((keys, np.full(len(keys), num_scans, np.int64)))
             self.num_scans = num_scans
 
     def contains(self, keys: npt.NDArray[np.int64], number: int) -> npt.NDArray[np.bool_]:
         """Return which voxels of a scan were emptied after it."""
-        known, last = self._merged()
-        at = np.minimum(np.searchsorted(known, keys), len(known) - 1)
-        return np.asarray((known[at] == keys) & (last[at] > number))
+        emptied, last = self._merged()
+        at = np.minimum(np.searchsorted(emptied, keys), len(emptied) - 1)
+        return np.asarray((emptied[at] == keys) & (last[at] > number))
 
     def _merged(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Return each voxel once, sorted, with the last number of scans."""
-        if len(self._parts) > 1:
-            keys, last = (np.concatenate(each) for each in zip(*self._parts, strict=True))
+        if len(self._batches) > 1:
+            keys, last = (np.concatenate(arrays) for arrays in zip(*self._batches, strict=True))
             order = np.lexsort((last, keys))
             keys, last = keys[order], last[order]
             ends = np.append(keys[1:] != keys[:-1], True)
-            self._parts = [(keys[ends], last[ends])]
-        elif self._parts:
-            keys, last = self._parts[0]
+            self._batches = [(keys[ends], last[ends])]
+        elif self._batches:
+            keys, last = self._batches[0]
             order = np.argsort(keys)
-            self._parts = [(keys[order], last[order])]
-        return self._parts[0]
+            self._batches = [(keys[order], last[order])]
+        return self._batches[0]

@@ -87,10 +87,10 @@ class MapOrigin:
             T[:3, 3] -= self._map.origin_m
         return T
 
-    def find(self, place: npt.ArrayLike) -> None:
-        """Take the origin from the first place (3,) in the fixed frame."""
+    def find(self, position: npt.ArrayLike) -> None:
+        """Take the origin from the first position (3,) in the fixed frame."""
         step_m = AUTO_VOXELS * self._map.voxel_size_m
-        self._map.origin_m = np.rint(np.asarray(place, np.float64) / step_m) * step_m + 0.0
+        self._map.origin_m = np.rint(np.asarray(position, np.float64) / step_m) * step_m + 0.0
         self.is_known = True
         _log.info('map.origin auto: %s', self._map.origin_m.tolist())
 
@@ -135,9 +135,9 @@ class MapOrigin:
         if not (self.has_own_frame and self._map.origin_m.any()):
             return transform
         if is_child:
-            place = np.eye(4)
-            place[:3, 3] = self._map.origin_m
-            return compose(transform, place)
+            shift = np.eye(4)
+            shift[:3, 3] = self._map.origin_m
+            return compose(transform, shift)
         T: Transform = transform.copy()
         T[:3, 3] -= self._map.origin_m
         return T

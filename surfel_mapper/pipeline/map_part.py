@@ -154,7 +154,7 @@ class MapPart:
         self.reason = reason
         self._config = config
         self._map = SurfelMap(config.map.voxel_size_m)
-        self._place: Transform | None = None
+        self._T_map_part: Transform | None = None
         self._num_agreeing = 0
         self.scans: list[WaitingScan] = []
         self.tracker = Tracker(registration, np.eye(4))
@@ -162,9 +162,9 @@ class MapPart:
     @property
     def has_place(self) -> bool:
         """Whether a place on the map is known that later scans have to confirm."""
-        return self._place is not None
+        return self._T_map_part is not None
 
-    def add(self, seen: Sighting) -> Transform:
+    def add(self, sighting: Sighting) -> Transform:
         """
         Track a scan on the part and add it; return T_part_middle.
 
@@ -175,29 +175,29 @@ class MapPart:
 
         """
         if self._map.num_voxels:
-            found = self.tracker.track(seen.cells, seen.stamp_ns, self._map, np.eye(4))
-            least = FIRST_SUPPORT if found.is_found else LEAST_SUPPORT
-            if found.support < least:
+            result = self.tracker.track(sighting.cells, sighting.stamp_ns, self._map, np.eye(4))
+            least = FIRST_SUPPORT if result.is_found else LEAST_SUPPORT
+            if result.support < least:
                 raise AlignmentError(
-                    f'{found.support:.0%} of its cells fit, expected {least:.0%} of a new part'
+                    f'{result.support:.0%} of its cells fit, expected {least:.0%} of a new part'
                 )
-        T_part_body = compose(self.tracker.pose, seen.T_middle_body)
-        T_part_sensor = compose(T_part_body, seen.T_body_sensor)
+        T_part_body = compose(self.tracker.pose, sighting.T_middle_body)
+        T_part_sensor = compose(T_part_body, sighting.T_body_sensor)
         limits = self._config.input
         moments = self._map.reduce(
-            seen.prepared.filtered.points,
+            sighting.prepared.filtered.points,
             T_part_sensor,
             origin=T_part_sensor[:3, 3],
             min_range_m=limits.min_range_m,
             max_range_m=limits.max_range_m or math.inf,
         )
         self._map.insert(moments)
-        self.scans.append(WaitingScan(seen.prepared, T_part_body, T_part_sensor))
+        self.scans.append(WaitingScan(sighting.prepared, T_part_body, T_part_sensor))
         return self.tracker.pose
 
     def set_place(self, T_map_middle: Transform, T_part_middle: Transform) -> None:
         """Set a place on the map that the next scans have to confirm."""
-        self._place, self._num_agreeing = compose(T_map_middle, inverse(T_part_middle)), 0
+        self._T_map_part, self._num_agreeing = compose(T_map_middle, inverse(T_part_middle)), 0
 
     def confirmed(
         self, cells: npt.NDArray[np.float64], surfel_map: SurfelMap, T_part_middle: Transform
@@ -216,31 +216,33 @@ class MapPart:
 
         """
         settings = self._registration.config
-        start = compose(self.guess if self._place is None else self._place, T_part_middle)
-        found = self._registration.align(
-            cells, surfel_map, [start], settings.max_deviation_m, is_lost=self._place is None
+        start = compose(
+            self.guess if self._T_map_part is None else self._T_map_part, T_part_middle
         )
-        fits = found.converged and self._registration.fits(found)
+        result = self._registration.align(
+            cells, surfel_map, [start], settings.max_deviation_m, is_lost=self._T_map_part is None
+        )
+        fits = result.converged and self._registration.fits(result)
         usual_support, max_seen_through = self.limits
-        fits &= found.support >= SHARE_OF_USUAL * usual_support
-        if not fits or found.rival > 0.0 or found.seen_through > max_seen_through:
-            self._place = None
+        fits &= result.support >= SHARE_OF_USUAL * usual_support
+        if not fits or result.rival > 0.0 or result.seen_through > max_seen_through:
+            self._T_map_part = None
             return None
-        if self._place is None:
-            self.set_place(found.T_map_sensor, T_part_middle)
+        if self._T_map_part is None:
+            self.set_place(result.T_map_sensor, T_part_middle)
             return None
-        if not is_near(found.T_map_sensor, start, surfel_map.voxel_size_m):
-            self._place = None
+        if not is_near(result.T_map_sensor, start, surfel_map.voxel_size_m):
+            self._T_map_part = None
             return None
-        self._place = compose(found.T_map_sensor, inverse(T_part_middle))
+        self._T_map_part = compose(result.T_map_sensor, inverse(T_part_middle))
         self._num_agreeing += 1
-        return (self._place, found) if self._num_agreeing >= CONFIRMING else None
+        return (self._T_map_part, result) if self._num_agreeing >= CONFIRMING else None
 
     def apart(self) -> ApartMap:
         """Return the part as a map that stays apart."""
         return ApartMap(
             map=self._map,
-            stamps_ns=tuple(each.prepared.scan.stamp_ns for each in self.scans),
-            poses=[each.T_part_sensor for each in self.scans],
+            stamps_ns=tuple(scan.prepared.scan.stamp_ns for scan in self.scans),
+            poses=[scan.T_part_sensor for scan in self.scans],
             reason=self.reason,
         )

@@ -179,9 +179,9 @@ class Mapper:
             if not isinstance(frame, str):
                 raise TypeError(f'{name}: a {type(frame).__name__}, expected the name of a frame')
         if q_xyzw is None:
-            given = f'{np.shape(xyz)} for the position' if xyz is not None else 'no position'
+            shown = f'{np.shape(xyz)} for the position' if xyz is not None else 'no position'
             raise TypeError(
-                f'add_pose: {given} and no orientation, expected xyz (3,) and q_xyzw (4,); '
+                f'add_pose: {shown} and no orientation, expected xyz (3,) and q_xyzw (4,); '
                 'Trajectory.from_matrices turns matrices (S, 4, 4) into these'
             )
         if isinstance(stamp_ns, bool) or not isinstance(stamp_ns, (int, np.integer)):
@@ -493,9 +493,9 @@ class Mapper:
         check_kind('surfel_map', surfel_map, SurfelMap)
         scans = checked_scans(scans)
         for name in ('voxel_size_m', 'level', 'columns'):
-            found, expected = getattr(surfel_map, name), getattr(self.map, name)
-            if found != expected:
-                raise MapError(f'map with {name} {found}, expected {expected} as configured')
+            value, expected = getattr(surfel_map, name), getattr(self.map, name)
+            if value != expected:
+                raise MapError(f'map with {name} {value}, expected {expected} as configured')
         moments = surfel_map.moments()  # before clearing: it may be the map of this mapper
         self._pipeline.origin.take_from(surfel_map)
         self._pipeline.restore(moments, scans)

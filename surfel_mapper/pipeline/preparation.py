@@ -94,7 +94,7 @@ class Preparation:
     def is_independent(self) -> bool:
         """Whether a scan can be prepared before the one before it is mapped."""
         return (
-            all(each.is_repeatable for each in self.chain.filters)
+            all(filter_.is_repeatable for filter_ in self.chain.filters)
             and not self._needs_free_rays
             and self._images is None
             and self._poses.registered is None
@@ -185,15 +185,15 @@ class Preparation:
         is_gated = bool(gate.gate_distance_m or gate.gate_angle_deg)
         if is_gated and registered is None:
             self._check_motion(scan, pose, gate)
-        found = self._filtered(scan, pose, laps) if begun is None else begun()
+        outcome = self._filtered(scan, pose, laps) if begun is None else begun()
         if self.chain.filters:
             laps.end('filter')
-            self._count_steps(found)
+            self._count_steps(outcome)
         elif begun is not None and times is not None:
             laps.end('deskew')
         if self._around.surfel_map.columns:
-            self._check_columns(found.filtered)
-        prepared = Prepared(found.scan, found.filtered, pose, windowed=found.windowed)
+            self._check_columns(outcome.filtered)
+        prepared = Prepared(outcome.scan, outcome.filtered, pose, windowed=outcome.windowed)
         if registered is None:
             return [prepared]
         confirmed = self._register(registered, prepared, times)
@@ -221,12 +221,12 @@ class Preparation:
         """Return a scan with all points in the sensor frame at its stamp."""
         return scan if scan.times is None else self._poses.deskewing(scan, scan.times)()
 
-    def _count_steps(self, found: FilteredScan) -> None:
+    def _count_steps(self, outcome: FilteredScan) -> None:
         """Count what the filters did; raise if they left no points."""
-        counters, num_points = self._drops.counters, len(found.filtered)
-        for s in found.steps:
+        counters, num_points = self._drops.counters, len(outcome.filtered)
+        for s in outcome.steps:
             counters.add_filter(s.name, s.points_in, s.points_out, s.milliseconds, s.not_finite)
-        counters.points_left_out['filtered'] += len(found.scan) - num_points
+        counters.points_left_out['filtered'] += len(outcome.scan) - num_points
         if not num_points:
             raise ScanRefusedError('filtered_out', 'the filters left none of its points')
 
@@ -252,18 +252,18 @@ class Preparation:
         else:
             target, T_target_fixed = self.local_map.surfel_map, np.eye(4)
         try:
-            found = poses.place(prepared, times, target, T_target_fixed)
+            ready = poses.align(prepared, times, target, T_target_fixed)
         except (MapError, PoseError) as error:
             raise ScanRefusedError('not_aligned', str(error)) from error
-        for each in found:
-            if each.registration is not None and len(each.registration.degenerate):
-                num = len(each.registration.degenerate)
+        for item in ready:
+            if item.registration is not None and len(item.registration.degenerate):
+                num = len(item.registration.degenerate)
                 self._drops.warn(
                     'degenerate',
-                    f'scan at {each.scan.stamp_ns / 1e9:.6f} s: {num} of 6 directions of motion '
+                    f'scan at {item.scan.stamp_ns / 1e9:.6f} s: {num} of 6 directions of motion '
                     'are not determined by its points; the prediction is kept in these',
                 )
-        return [replace(p, T_map_sensor=self._aligner.to_map(p.T_map_sensor)) for p in found]
+        return [replace(p, T_map_sensor=self._aligner.to_map(p.T_map_sensor)) for p in ready]
 
     def _with_images(self, scan: Scan, images: ScanImages) -> Scan:
         """Return a scan with columns from images, before points are filtered."""

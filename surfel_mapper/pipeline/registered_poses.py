@@ -99,7 +99,7 @@ class RegisteredPoses:
         self._config = config
         self._transforms = transforms
         self._drops = drops
-        self._part: MapPart | None = None
+        self._map_part: MapPart | None = None
         self.apart: list[ApartMap] = []
         self._states = StateTimes()
         self._surroundings = SurroundingMotion()
@@ -125,7 +125,7 @@ class RegisteredPoses:
     @property
     def _active(self) -> Tracker:
         """The tracker of the newest scan: that of a part, if there is one."""
-        return self._tracker if self._part is None else self._part.tracker
+        return self._tracker if self._map_part is None else self._map_part.tracker
 
     def warm_up(self) -> None:
         """Compile the kernels."""
@@ -180,7 +180,7 @@ class RegisteredPoses:
         """
         return compose(self._active.predict(stamp_ns), self._mount(frame_id, stamp_ns))
 
-    def place(
+    def align(
         self,
         prepared: Prepared,
         times: PointTimes | None,
@@ -227,32 +227,32 @@ class RegisteredPoses:
         if not surfel_map.num_voxels:
             self._tracker.advance(T_active_middle, middle_ns)
             return [self._placed(prepared, T_middle_body, None)]
-        seen = Sighting(
+        sighting = Sighting(
             prepared=prepared,
             cells=transformed(T_middle_body, self._cells(scan)),
             stamp_ns=middle_ns,
             T_middle_body=T_middle_body,
             T_body_sensor=self._mount(scan.frame_id, scan.stamp_ns),
         )
-        if self._part is None:
-            placed = self._track(seen, surfel_map, T_map_fixed)
+        if self._map_part is None:
+            placed = self._track(sighting, surfel_map, T_map_fixed)
         else:
-            placed = self._recover(seen, self._part, surfel_map, T_map_fixed)
-        is_surrounded = self._is_surrounded(seen, placed, surfel_map)
+            placed = self._recover(sighting, self._map_part, surfel_map, T_map_fixed)
+        is_surrounded = self._is_surrounded(sighting, placed, surfel_map)
         self._count_state(scan.stamp_ns, placed, is_surrounded)
         return placed
 
     def finish(self) -> None:
         """End the part whose place was not confirmed: it stays apart."""
-        part, self._part = self._part, None
-        if part is None:
+        map_part, self._map_part = self._map_part, None
+        if map_part is None:
             return
-        is_kept = len(part.scans) >= LEAST_SCANS
-        for waiting in part.scans:
+        is_kept = len(map_part.scans) >= LEAST_SCANS
+        for waiting in map_part.scans:
             cause = 'apart' if is_kept else 'not_aligned'
-            self._drops.scan(waiting.prepared.scan, cause, part.reason)
+            self._drops.scan(waiting.prepared.scan, cause, map_part.reason)
         if is_kept:
-            self.apart = [*self.apart, part.apart()][-MOST_PARTS:]
+            self.apart = [*self.apart, map_part.apart()][-MOST_PARTS:]
             self._num_parts += 1
 
     def summary(self) -> dict[str, Any]:
@@ -266,76 +266,77 @@ class RegisteredPoses:
             'fit': {'median': float(np.median(fits)), 'min': float(np.min(fits))},
             'tracking': self._states.summary(),
             'parts_apart': self._num_parts,
-            'apart': [part.summary() for part in self.apart],
+            'apart': [apart.summary() for apart in self.apart],
         }
 
     def _track(
-        self, seen: Sighting, surfel_map: SurfelMap, T_map_fixed: Transform
+        self, sighting: Sighting, surfel_map: SurfelMap, T_map_fixed: Transform
     ) -> list[Prepared]:
         """Align a scan at its expected pose; if its place is uncertain, begin a part with it."""
-        T_map_middle = compose(T_map_fixed, self._tracker.predict(seen.stamp_ns))
+        T_map_middle = compose(T_map_fixed, self._tracker.predict(sighting.stamp_ns))
         twist = self._tracker.twist
         try:
-            found = self._tracker.track(seen.cells, seen.stamp_ns, surfel_map, T_map_fixed)
+            fit = self._tracker.track(sighting.cells, sighting.stamp_ns, surfel_map, T_map_fixed)
         except AlignmentError as error:
             limits = (
                 self._tracker.expected_support,
                 self._tracker.max_seen_through(surfel_map, T_map_fixed),
             )
-            part = self._begin_part(seen, T_map_middle, twist, limits, str(error))
+            map_part = self._begin_part(sighting, T_map_middle, twist, limits, str(error))
             if self._tracker.doubtful is not None:
-                part.set_place(self._tracker.doubtful, np.eye(4))
+                map_part.set_place(self._tracker.doubtful, np.eye(4))
             return []
-        return [self._placed(seen.prepared, seen.T_middle_body, found)]
+        return [self._placed(sighting.prepared, sighting.T_middle_body, fit)]
 
     def _begin_part(
         self,
-        seen: Sighting,
+        sighting: Sighting,
         T_map_middle: Transform,
         twist: npt.NDArray[np.float64],
         limits: tuple[float, float],
         reason: str,
     ) -> MapPart:
         """Begin a part with a scan, predicted at a pose with a velocity; see MapPart."""
-        part = MapPart(self._registration, self._config, T_map_middle, limits, reason)
-        part.tracker.begin(seen.stamp_ns, twist)
-        part.add(seen)
-        self._part = part
+        map_part = MapPart(self._registration, self._config, T_map_middle, limits, reason)
+        map_part.tracker.begin(sighting.stamp_ns, twist)
+        map_part.add(sighting)
+        self._map_part = map_part
         self._drops.warn(
-            'lost', f'scan at {seen.stamp_ns / 1e9:.6f} s has no certain place: {reason}'
+            'lost', f'scan at {sighting.stamp_ns / 1e9:.6f} s has no certain place: {reason}'
         )
-        return part
+        return map_part
 
     def _recover(
-        self, seen: Sighting, part: MapPart, surfel_map: SurfelMap, T_map_fixed: Transform
+        self, sighting: Sighting, map_part: MapPart, surfel_map: SurfelMap, T_map_fixed: Transform
     ) -> list[Prepared]:
         """Track a scan on the part, and join the part once its place on the map is confirmed."""
-        twist = part.tracker.twist
+        twist = map_part.tracker.twist
         try:
-            T_part_middle = part.add(seen)
+            T_part_middle = map_part.add(sighting)
         except AlignmentError:
-            return self._leave(seen, part, twist, surfel_map, T_map_fixed)
-        confirmed = part.confirmed(seen.cells, surfel_map, T_part_middle)
+            return self._leave(sighting, map_part, twist, surfel_map, T_map_fixed)
+        confirmed = map_part.confirmed(sighting.cells, surfel_map, T_part_middle)
         if confirmed is None:
-            if len(part.scans) >= MOST_SCANS:
+            if len(map_part.scans) >= MOST_SCANS:
                 self.finish()
             return []
-        T_map_part, found = confirmed
+        T_map_part, result = confirmed
         T_fixed_part = compose(inverse(T_map_fixed), T_map_part)
-        self._part = None
+        self._map_part = None
         T_fixed_middle = compose(T_fixed_part, T_part_middle)
-        self._tracker.resume(T_fixed_middle, seen.stamp_ns, part.tracker.twist, seen.cells)
-        self._num_aligned += len(part.scans)
-        self._fits.append(found.fit)
+        twist = map_part.tracker.twist
+        self._tracker.resume(T_fixed_middle, sighting.stamp_ns, twist, sighting.cells)
+        self._num_aligned += len(map_part.scans)
+        self._fits.append(result.fit)
         return [
-            self._at(each.prepared, compose(T_fixed_part, each.T_part_body), found)
-            for each in part.scans
+            self._at(waiting.prepared, compose(T_fixed_part, waiting.T_part_body), result)
+            for waiting in map_part.scans
         ]
 
     def _leave(
         self,
-        seen: Sighting,
-        part: MapPart,
+        sighting: Sighting,
+        map_part: MapPart,
         twist: npt.NDArray[np.float64],
         surfel_map: SurfelMap,
         T_map_fixed: Transform,
@@ -346,11 +347,11 @@ class RegisteredPoses:
         A single scan that fits nothing is no loss: the next one may continue the track.
         """
         self.finish()
-        if len(part.scans) > 1:
-            guess = compose(part.guess, part.tracker.predict(seen.stamp_ns))
-            self._begin_part(seen, guess, twist, part.limits, part.reason)
+        if len(map_part.scans) > 1:
+            guess = compose(map_part.guess, map_part.tracker.predict(sighting.stamp_ns))
+            self._begin_part(sighting, guess, twist, map_part.limits, map_part.reason)
             return []
-        return self._track(seen, surfel_map, T_map_fixed)
+        return self._track(sighting, surfel_map, T_map_fixed)
 
     def _placed(
         self,
@@ -383,31 +384,31 @@ class RegisteredPoses:
         )
 
     def _is_surrounded(
-        self, seen: Sighting, placed: list[Prepared], surfel_map: SurfelMap
+        self, sighting: Sighting, placed: list[Prepared], surfel_map: SurfelMap
     ) -> bool:
         """Return whether most of what a scan on the track sees seems to move along; warn then."""
         if len(placed) != 1 or placed[0].registration is None:
             self._surroundings.clear()
             return False
         T_map_middle = placed[0].registration.T_map_sensor
-        found = self._surroundings.move_along(seen.cells, T_map_middle, surfel_map)
-        if found:
+        moves = self._surroundings.move_along(sighting.cells, T_map_middle, surfel_map)
+        if moves:
             self._drops.warn(
                 'surrounded',
-                f'scan at {seen.stamp_ns / 1e9:.6f} s: more of it is new than its motion '
+                f'scan at {sighting.stamp_ns / 1e9:.6f} s: more of it is new than its motion '
                 'explains; most of what it sees seems to move along, and its pose may be wrong',
             )
-        return found
+        return moves
 
     def _count_state(self, stamp_ns: int, placed: list[Prepared], is_surrounded: bool) -> None:
         """Count the time since the scan before under the states of this one."""
         states = ['surrounded'] if is_surrounded else []
-        if self._part is not None:
-            states.append('unconfirmed' if self._part.has_place else 'lost')
-            states += ['ambiguous'] if 'ambiguous' in self._part.reason else []
+        if self._map_part is not None:
+            states.append('unconfirmed' if self._map_part.has_place else 'lost')
+            states += ['ambiguous'] if 'ambiguous' in self._map_part.reason else []
         elif placed and placed[-1].registration is not None:
-            found = placed[-1].registration
-            states += ['degenerate'] if len(found.degenerate) else []
+            result = placed[-1].registration
+            states += ['degenerate'] if len(result.degenerate) else []
         self._states.add(stamp_ns, states)
 
     def _cells(self, scan: Scan) -> npt.NDArray[np.float64]:

@@ -80,7 +80,7 @@ class ScanImages:
         return bool(scan.camera) and any(column in COLUMNS[kind] for kind in self._images)
 
     def joined(
-        self, scan: Scan, place: Callable[[SceneImage], Transform]
+        self, scan: Scan, pose_of: Callable[[SceneImage], Transform]
     ) -> tuple[Scan, list[str]]:
         """
         Return a scan with columns from its images, and the kinds of which no image came.
@@ -89,7 +89,7 @@ class ScanImages:
         ----------
         scan : Scan
             In the frame of its sensor.
-        place : callable
+        pose_of : callable
             Returns T_camera_sensor for an image.
 
         Raises
@@ -110,9 +110,9 @@ class ScanImages:
                 check_size(image, scan)
                 depth = replace(depth, **{kind: image.pixels})
                 continue
-            seen = seen_in(image, scan, place)
-            if seen is not None:
-                columns[COLUMNS[kind][0]] = seen
+            values = seen_in(image, scan, pose_of)
+            if values is not None:
+                columns[COLUMNS[kind][0]] = values
         if depth is not None:
             return replace(scan, depth=depth, columns=PixelColumns(scan, depth)), missing
         return replace(scan, columns=columns), missing
@@ -132,7 +132,7 @@ def has_column(scan: Scan, kind: str) -> bool:
 
 
 def seen_in(
-    image: SceneImage, scan: Scan, place: Callable[[SceneImage], Transform]
+    image: SceneImage, scan: Scan, pose_of: Callable[[SceneImage], Transform]
 ) -> npt.NDArray[Any] | None:
     """
     Return the pixels of an image at the points of a scan; None if no point is in the image.
@@ -145,7 +145,7 @@ def seen_in(
         camera, points = camera_of(scan), scan.points
     else:
         assert image.camera is not None, 'images beside a lidar come with their camera'
-        camera, T = image.camera, place(image)
+        camera, T = image.camera, pose_of(image)
         points = scan.points @ T[:3, :3].T + T[:3, 3]
     pixel = pixels_of(camera, points, image.pixels.shape[:2])
     if not len(pixel) or pixel.max() < 0:
@@ -159,9 +159,9 @@ def pixel_values(
     """Return the values of an image at pixels counted row by row, as seen_in; -1: none."""
     values: npt.NDArray[Any]
     values, nothing = (pixels.ravel(), -1) if kind == LABEL else (packed(pixels), 0)
-    seen = values[pixel]
-    seen[pixel < 0] = nothing
-    return seen
+    chosen = values[pixel]
+    chosen[pixel < 0] = nothing
+    return chosen
 
 
 def check_size(image: SceneImage, scan: Scan) -> None:

@@ -597,5 +597,5 @@ def removed_voxels(
 ) -> npt.NDArray[np.int32]:
     """Return the voxels (K, 3) that were surfels before the alignment and are none after it."""
     gone = np.unique(np.concatenate([*removed, alignment.removed_voxel_index]), axis=0)
-    left: npt.NDArray[np.int32] = gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]
-    return left
+    voxels: npt.NDArray[np.int32] = gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]
+    return voxels

@@ -141,8 +141,8 @@ class StampGuard:
             return []
         self._odd = []
         judged = []
-        for other in waiting:
-            judged.append(Judged(other) if agrees else self._refused(other))
+        for odd in waiting:
+            judged.append(Judged(odd) if agrees else self._refused(odd))
         if agrees:
             is_odd, self.newest_ns = False, waiting[-1].stamp_ns
             step_ns = message.stamp_ns - waiting[-1].stamp_ns
@@ -245,8 +245,8 @@ class StampGuard:
         """Return whether scans of another sensor are near the poses, unlike those of a source."""
         return any(
             abs(scan_ns - pose_ns) <= OUT_OF_STEP_NS
-            for other, scan_ns in self._scan_ns.items()
-            if other != source
+            for sensor, scan_ns in self._scan_ns.items()
+            if sensor != source
         )
 
     def _is_confirmed(self, message: Scan | StampedPose) -> bool:

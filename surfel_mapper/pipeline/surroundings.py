@@ -42,12 +42,12 @@ class SurroundingMotion:
     def __init__(self) -> None:
         self._latest: deque[tuple[float, float]] = deque(maxlen=SCANS)
         self._num_scans = 0
-        self._before: Transform | None = None
+        self._previous: Transform | None = None
 
     def clear(self) -> None:
         """Forget all scans, after a loss."""
         self._latest.clear()
-        self._before = None
+        self._previous = None
 
     def move_along(
         self, cells: npt.NDArray[np.float64], T_map_body: Transform, surfel_map: SurfelMap
@@ -68,11 +68,11 @@ class SurroundingMotion:
         keys = np.unique(point_keys(cells, T_map_body, surfel_map.voxel_size_m))
         share = float((surfel_map.find(keys) < 0).mean()) if len(keys) else 0.0
         self._num_scans += 1
-        if self._before is not None and self._num_scans > YOUNG:
-            off = compose(inverse(self._before), T_map_body)
+        if self._previous is not None and self._num_scans > YOUNG:
+            off = compose(inverse(self._previous), T_map_body)
             way_m = float(np.linalg.norm(off[:3, 3])) + LEVER_M * rotation_angle(off)
             self._latest.append((share, way_m / surfel_map.voxel_size_m))
-        self._before = T_map_body
+        self._previous = T_map_body
         if len(self._latest) < SCANS:
             return False
         new, way = np.mean(self._latest, axis=0)

@@ -162,31 +162,31 @@ class WindowAligner:
         self._num_new = 0
         scans = list(window)
         self._check(len(window), scans, config.map.columns)
-        before = np.array([scan.T_map_sensor for scan in scans]).reshape(-1, 4, 4)
+        old_poses = np.array([scan.T_map_sensor for scan in scans]).reshape(-1, 4, 4)
         samples = self._samples_of(scans, config.align.voxel_size_m)
         frames = [scan.frame_id for scan in scans]
-        alignment = align_scans(samples, before, config.align, frames)
+        alignment = align_scans(samples, old_poses, config.align, frames)
         extents = [
             extent(compose(inverse(old), new))
-            for old, new in zip(before, alignment.T_map_sensor, strict=True)
+            for old, new in zip(old_poses, alignment.T_map_sensor, strict=True)
         ]
         moved = {
-            place: self._moved(scans[place], alignment.T_map_sensor[place])
-            for place, (way_m, turn_deg) in enumerate(extents)
+            index: self._moved(scans[index], alignment.T_map_sensor[index])
+            for index, (way_m, turn_deg) in enumerate(extents)
             if way_m > config.align.move_m or turn_deg > config.align.move_deg
         }
         fallen = window.move(moved, config.map.min_points)
-        after = np.array([scan.T_map_sensor for scan in window])
+        new_poses = np.array([scan.T_map_sensor for scan in window])
         if len(scans) - 1 in moved:
-            self.correct(compose(after[-1], inverse(before[-1])))
+            self.correct(compose(new_poses[-1], inverse(old_poses[-1])))
         return Alignment(
             solution=alignment,
             stamps_ns=np.array([scan.stamp_ns for scan in scans], np.int64),
-            T_map_sensor=after,
+            T_map_sensor=new_poses,
             T_map_fixed=self.T_map_fixed,
             num_moved=len(moved),
-            largest_m=max((extents[place][0] for place in moved), default=0.0),
-            largest_deg=max((extents[place][1] for place in moved), default=0.0),
+            largest_m=max((extents[index][0] for index in moved), default=0.0),
+            largest_deg=max((extents[index][1] for index in moved), default=0.0),
             removed_voxel_index=fallen,
         )
 
@@ -210,8 +210,8 @@ class WindowAligner:
         """Return the surfels of each scan in its own frame, made once per scan."""
         kept: dict[int, tuple[object, Samples]] = {}
         for scan in scans:
-            known = self._samples.get(id(scan.points))  # alive, as it is kept here
-            kept[id(scan.points)] = known or (scan.points, _samples(scan, voxel_size_m))
+            cached = self._samples.get(id(scan.points))  # alive, as it is kept here
+            kept[id(scan.points)] = cached or (scan.points, _samples(scan, voxel_size_m))
         self._samples = kept
         return [kept[id(scan.points)][1] for scan in scans]
 
