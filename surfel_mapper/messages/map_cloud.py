@@ -120,14 +120,14 @@ def surfels_in(msg: Any) -> Surfels:
 
 def means_in(columns: Columns) -> dict[str, npt.NDArray[np.float64]]:
     """Return the means of the channels of a map: ``intensity``; ``red``, ``green``, ``blue``."""
-    found = {}
+    means = {}
     if 'intensity' in columns:
-        found['intensity'] = columns['intensity'].astype(np.float64)
+        means['intensity'] = columns['intensity'].astype(np.float64)
     if 'rgb' in columns:
         packed = np.ascontiguousarray(columns['rgb'], np.float32).view(np.uint32)
         for shift, name in ((16, 'red'), (8, 'green'), (0, 'blue')):
-            found[name] = ((packed >> shift) & 255).astype(np.float64)
-    return found
+            means[name] = ((packed >> shift) & 255).astype(np.float64)
+    return means
 
 
 def moments_in(columns: Columns, voxel_size_m: float, channels: tuple[str, ...]) -> ScanMoments:

@@ -60,15 +60,17 @@ class MapWriter:
     def _save(self) -> str:
         return self._thread.call(partial(copied_map, self._mapper)).result()()
 
-    def write(self, function: Callable[[], object]) -> None:
-        """Call a function that writes; its errors are counted and logged."""
-        self._executor.submit(self._guarded, function)
+    def write(self, function: Callable[[], object], done: Callable[[], object]) -> None:
+        """Call a function that writes, then ``done`` in the mapping thread; count errors."""
+        self._executor.submit(self._guarded, function, done)
 
-    def _guarded(self, function: Callable[[], object]) -> None:
+    def _guarded(self, function: Callable[[], object], done: Callable[[], object]) -> None:
         try:
             function()
         except Exception as error:  # MemoryError too
             self._thread.report_failure('a checkpoint', error)
+        else:
+            self._thread.post(done)
 
     def close(self) -> None:
         """Finish what is being written, after the mapping thread has ended."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections import deque
 from concurrent.futures import CancelledError
 from contextlib import suppress
+from functools import partial
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -174,10 +175,15 @@ class Session:
         with self.mapper.guarded('publishing of the pose'):
             if self.registration is not None:
                 self.registration.publish(update)
-        with self.mapper.guarded('a checkpoint'):
-            self.checkpoints.save_if_due(self._writer.write)
+        self._save_checkpoint()
         now_ns = self._node.get_clock().now().nanoseconds
         self.latencies_s.append((now_ns - update.stamp_ns) / 1e9)
+
+    def _save_checkpoint(self) -> None:
+        """Save a checkpoint if it is due, and another if scans came while it was written."""
+        run = partial(self._writer.write, done=self._save_checkpoint)
+        with self.mapper.guarded('a checkpoint'):
+            self.checkpoints.save_if_due(run)
 
     def _on_choice(self, choice: SourceChoice) -> None:
         """Map the scans that have waited for the choice of ``pose.source: auto``."""

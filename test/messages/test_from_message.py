@@ -12,7 +12,7 @@ import pytest
 
 from surfel_mapper import SurfelMap, Surfels
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.mapping.surfel_columns import surfel_columns
+from surfel_mapper.mapping.surfels import surfel_columns
 from surfel_mapper.messages.map_cloud import moment_cloud
 from surfel_mapper.messages.pointcloud2 import from_columns
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from importlib.util import find_spec
 import signal
 
@@ -18,7 +19,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from surfel_mapper.errors import ConfigError
+from surfel_mapper.errors import ConfigError, FileFormatError
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.ros.context import context
@@ -213,10 +214,17 @@ def test_a_node_that_is_killed_continues_from_its_checkpoint(start, peer, tmp_pa
     messages = drive(3)
     send(peer, messages)
     peer.spin_until(lambda: len(changed) == 3)
-    peer.diagnosis({'scans.mapped': 3})  # from the thread that writes them, so after the last
+    _, mapper = mapped(messages)
+
+    def is_saved():
+        with suppress(FileFormatError):  # absent while the one before gets its name
+            saved, _ = load_map(tmp_path / 'maps' / 'map.checkpoint.npz')
+            return saved.digest() == mapper.map.digest()
+        return False
+
+    peer.spin_until(is_saved)
     first.kill()
 
     second = start('node', *arguments(**places, **{'map.load': 'latest'}))
     peer.diagnosis({'state': 'active', 'scans.mapped': 0, 'window_scans': 3})
-    _, mapper = mapped(messages)
     assert f'map.checkpoint.npz, digest {mapper.map.digest()}' in second.output
