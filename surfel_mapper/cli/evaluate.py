@@ -183,9 +183,12 @@ def trajectories(args: argparse.Namespace) -> dict[str, Any]:
     """Return the errors of a trajectory."""
     from surfel_mapper.evaluation.trajectory_errors import compare
     from surfel_mapper.evaluation.truth import read_poses, true_poses
+    from surfel_mapper.files.trajectory import read_trajectory
 
-    estimated_ns, estimated = read_poses(args.map)
-    true_ns, true = true_poses(args.truth, estimated_ns)
+    files = [path for path in (args.map, args.truth) if not path.is_dir()]
+    by_number = len(files) == 2 and all(read_trajectory(f).stamp_ns is None for f in files)
+    estimated_ns, estimated = read_poses(args.map, by_number=by_number)
+    true_ns, true = true_poses(args.truth, estimated_ns, by_number=by_number)
     try:
         return compare(
             estimated_ns,

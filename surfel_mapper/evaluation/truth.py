@@ -94,9 +94,11 @@ def load_truth(path: Path) -> WorldTruth:
     return WorldTruth(World.load(path / WORLD_FILE if path.is_dir() else path))
 
 
-def read_poses(path: Path) -> tuple[npt.NDArray[np.int64], Floats]:
+def read_poses(path: Path, *, by_number: bool = False) -> tuple[npt.NDArray[np.int64], Floats]:
     """
     Return stamps (S,), ns, and poses (S, 4, 4) of a trajectory in a file.
+
+    Poses without times may have their numbers as seconds instead.
 
     Raises
     ------
@@ -105,17 +107,21 @@ def read_poses(path: Path) -> tuple[npt.NDArray[np.int64], Floats]:
 
     """
     trajectory = read_trajectory(path)
-    if trajectory.stamp_ns is None:
+    stamps_ns = trajectory.stamp_ns
+    if stamps_ns is None and by_number:
+        rows = np.arange(len(trajectory), dtype=np.int64)
+        stamps_ns = 10**9 * (rows if trajectory.number is None else trajectory.number)
+    if stamps_ns is None:
         raise FileFormatError(f'{path}: poses without times, expected a times.txt beside it')
     poses = [
         pose_matrix(xyz, q_xyzw)
         for xyz, q_xyzw in zip(trajectory.xyz, trajectory.q_xyzw, strict=True)
     ]
-    return trajectory.stamp_ns, np.array(poses).reshape(-1, 4, 4)
+    return stamps_ns, np.array(poses).reshape(-1, 4, 4)
 
 
 def true_poses(
-    path: Path, stamps_ns: npt.NDArray[np.int64]
+    path: Path, stamps_ns: npt.NDArray[np.int64], *, by_number: bool = False
 ) -> tuple[npt.NDArray[np.int64], Floats]:
     """
     Return true stamps and poses: of a file, or of the lidar of a simulated bag at given stamps.
@@ -126,6 +132,8 @@ def true_poses(
         A trajectory, or the directory of a simulated bag.
     stamps_ns : (S,) int64
         Stamps at which the poses of a simulated bag are wanted.
+    by_number : bool
+        Whether poses without times have their numbers as seconds.
 
     Returns
     -------
@@ -139,7 +147,7 @@ def true_poses(
 
     """
     if not path.is_dir():
-        return read_poses(path)
+        return read_poses(path, by_number=by_number)
     if not (path / SIMULATION_FILE).exists():
         raise FileFormatError(
             f'{path}: not a simulated bag, which has a {SIMULATION_FILE}; '

@@ -62,11 +62,18 @@ def text_layout(path: Path) -> TextLayout | None:
         words = [word.strip() for word in line.split(separator)]
         if line.lstrip().startswith(MARKS) or not all(map(is_number, words)):
             title = line.strip().lstrip('#/% ').split(separator)
-            names = [word.strip(' "').lower() for word in title]
+            names = [column_name(word) for word in title]
         elif len(words) >= 3:
             has_names = len(names) == len(words)
             return TextLayout(separator, number, len(words), names if has_names else [])
     return None
+
+
+def column_name(word: str) -> str:
+    """Return a name of a header in lower case without spaces; ParaView has Points:0 for x."""
+    name = re.sub(r'\W+', '_', word.strip(' "')).lower()
+    axis = re.fullmatch(r'points\w*_([012])', name)
+    return 'xyz'[int(axis[1])] if axis else name
 
 
 def is_number(word: str) -> bool:
@@ -110,7 +117,8 @@ def read_points(path: str | Path) -> Columns:
     except (ValueError, MemoryError) as error:
         raise FileFormatError(f'{path}: {error}') from error
     if layout.names:
-        return dict(zip(layout.names, np.ascontiguousarray(table.T), strict=True))
+        columns = dict(zip(layout.names, np.ascontiguousarray(table.T), strict=True))
+        return {name: values for name, values in columns.items() if name}  # pandas' index has none
     columns = named_columns(table)
     if Path(path).suffix.lower() == '.pts' and 'column_3' in columns:  # Leica's are negative
         columns['intensity'] = columns.pop('column_3')

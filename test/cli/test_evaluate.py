@@ -9,6 +9,7 @@ import pytest
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.files.ply import write_points
+from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.simulation import load_simulation
 from test import extras
 from test.cli.test_replay import strict_json
@@ -167,3 +168,19 @@ def test_trajectories_without_common_times_are_refused(street, tmp_path, capsys)
     truth = str(output.parent / 'poses.tum')
     assert main(['evaluate', str(tmp_path / 'early.tum'), '--truth', truth]) == 1
     assert '0 poses within 0.01 s of one another' in capsys.readouterr().err
+
+
+def test_poses_without_times_are_compared_by_their_numbers(tmp_path, capsys):
+    poses = [pose_matrix((k, 0.2 * k * k, 0.0), (0.0, 0.0, 0.0, 1.0)) for k in range(6)]
+    np.savetxt(tmp_path / 'truth.txt', [pose[:3].ravel() for pose in poses])
+    lines = [
+        f'VERTEX_SE3:QUAT {k} {poses[k][0, 3]} {poses[k][1, 3]} 0 0 0 0 1' for k in (1, 2, 3, 5)
+    ]
+    (tmp_path / 'some.g2o').write_text('\n'.join(lines))
+
+    command = ['evaluate', str(tmp_path / 'some.g2o'), '--truth', str(tmp_path / 'truth.txt')]
+    assert main([*command, '--json']) == 0
+
+    result = json.loads(capsys.readouterr().out)
+    assert result['num_poses'] == 4
+    assert result['absolute']['translation_m']['max'] < 1e-9

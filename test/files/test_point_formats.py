@@ -57,11 +57,16 @@ def test_text_of_numpy_is_read(tmp_path, name, width, options, columns):
     check(tmp_path / name, *columns)
 
 
-def test_columns_of_a_header_may_come_in_any_order(tmp_path):
+@pytest.mark.parametrize(
+    'header', ['intensity,z,x,y', '"intensity","Points:2","Points:0","Points:1"', ',z,x,y']
+)
+def test_columns_of_a_header_may_come_in_any_order(tmp_path, header):
     rows = TABLE[:, [3, 2, 0, 1]]
-    np.savetxt(tmp_path / 'a.csv', rows, '%.17g', ',', header='intensity,z,x,y', comments='')
+    np.savetxt(tmp_path / 'a.csv', rows, '%.17g', ',', header=header, comments='')
 
-    check(tmp_path / 'a.csv', 'intensity')
+    columns = check(tmp_path / 'a.csv', *(('intensity',) if header[0] != ',' else ()))
+
+    assert [*columns] == (['intensity'] if header[0] != ',' else [])
 
 
 def test_intensities_of_pts_may_be_negative(tmp_path):
