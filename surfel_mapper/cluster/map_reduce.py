@@ -19,7 +19,7 @@ import numpy as np
 from surfel_mapper.cluster.shards import map_shard, Shard, ShardResult
 from surfel_mapper.cluster.workers import never, Workers
 from surfel_mapper.errors import MapError
-from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline import Mapper, ScanOutcome
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +41,8 @@ class MappedBags:
     stamps_ns : list of int
     poses : list of (4, 4) float64
         T_map_sensor of each mapped scan.
+    outcomes : list of ScanOutcome
+        Outcomes of the scans.
     num_shards, repeated : int
         Shards added up, and bags that were mapped again as one.
     core_s : float
@@ -54,6 +56,7 @@ class MappedBags:
     counts: dict[str, Any] = field(default_factory=dict)
     stamps_ns: list[int] = field(default_factory=list)
     poses: list[Any] = field(default_factory=list)
+    outcomes: list[ScanOutcome] = field(default_factory=list)
     num_shards: int = 0
     repeated: int = 0
     core_s: float = 0.0
@@ -66,6 +69,7 @@ class MappedBags:
             self.counts = added(self.counts, result.counts)
             self.stamps_ns += result.stamps_ns.tolist()
             self.poses += list(result.poses)
+            self.outcomes += result.outcomes
             self.core_s += result.core_s
         self.num_shards += len(results)
 

@@ -179,6 +179,7 @@ def written(
     from surfel_mapper.offline.outputs import ScanTrajectory, write_files, write_maps
 
     mapper = mapped.mapper
+    mapper.outcomes = mapped.outcomes
     trajectory = ScanTrajectory(mapper)
     trajectory.stamps_ns, trajectory.poses = mapped.stamps_ns, mapped.poses
     write_maps(output, options.formats, mapper, trajectory)

@@ -30,6 +30,7 @@ from surfel_mapper.offline.outputs import ScanTrajectory
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import all_scans
 from surfel_mapper.offline.request import Request
+from surfel_mapper.pipeline import ScanOutcome
 from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s
 from surfel_mapper.pipeline.update import Update
 
@@ -104,6 +105,8 @@ class ShardResult:
         Stamps of the mapped scans.
     poses : (S, 4, 4) float64
         Their T_map_sensor.
+    outcomes : list of ScanOutcome
+        Outcomes of its scans.
 
     """
 
@@ -117,6 +120,7 @@ class ShardResult:
     core_s: float
     stamps_ns: npt.NDArray[np.int64]
     poses: npt.NDArray[np.float64]
+    outcomes: list[ScanOutcome]
 
 
 def shard_length_s(recorded_s: float, num_workers: int) -> float:
@@ -199,6 +203,7 @@ def map_shard(shard: Shard) -> ShardResult:
     keep_freed_memory()
     with open_recording(shard.request, shard.config) as recording:
         mapper = ShardMapper(recording.config)
+        mapper.outcomes, mapper.pose_source = [], recording.describe()['poses_from']
         trajectory = ScanTrajectory(mapper)
         start = ShardStart()
         if shard.is_whole:
@@ -225,6 +230,7 @@ def map_shard(shard: Shard) -> ShardResult:
         core_s=time.process_time() - began,
         stamps_ns=np.array(trajectory.stamps_ns, np.int64),
         poses=trajectory.matrices,
+        outcomes=mapper.outcomes or [],
     )
 
 
@@ -238,7 +244,7 @@ class ShardStart:
     def record(self, mapper: ShardMapper) -> None:
         """Take them from a mapper that maps from now on."""
         self.outlook, self.counts = mapper.outlook(), mapper.counters.summary()
-        mapper.passes_over = False
+        mapper.passes_over, mapper.outcomes = False, []
 
 
 def replay_middle(

@@ -9,6 +9,8 @@ So if summary.json is new, all other files are too.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import csv
+import io
 import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -23,12 +25,27 @@ if TYPE_CHECKING:
 
     from surfel_mapper.config import Config
     from surfel_mapper.layers.drawings import Drawing
-    from surfel_mapper.pipeline import Mapper, Update
+    from surfel_mapper.pipeline import Mapper, ScanOutcome, Update
     from surfel_mapper.pipeline.map_part import ApartMap
     from surfel_mapper.viz.history import History
 
+SCANS = 'scans.csv'
+"""File of the outcomes of all scans."""
+
 BAG = 'bag'
 """Format that is written while mapping: a bag of normals in the directory ``normals``."""
+
+COLUMNS = (
+    'stamp_ns',
+    'frame_id',
+    'topic',
+    'outcome',
+    'cause',
+    'reason',
+    'pose_source',
+    'num_points',
+)
+"""Columns of scans.csv before the times; the attributes of ScanOutcome."""
 
 TILES = 'tiles'
 """Format of a Parquet dataset in the directory ``map``."""
@@ -141,7 +158,7 @@ def check_distinct(
 
     directory = output_directory(recording, wanted)
     files = known_formats()
-    names = [*(files[name] for name in formats), TRAJECTORY, 'map.png', 'report.html']
+    names = [*(files[name] for name in formats), TRAJECTORY, SCANS, 'map.png', 'report.html']
     taken = {os.path.realpath(directory / n): str(directory / n) for n in (*names, 'summary.json')}
     for option, path in others.items():
         if path is None:
@@ -185,7 +202,7 @@ def check_formats(formats: Sequence[str], output: Path) -> None:
 
     files = known_formats()
     names = [files[name] for name in formats if name not in (BAG, TILES)]
-    for name in [*names, TRAJECTORY, 'map.png', 'report.html', 'summary.json']:
+    for name in [*names, TRAJECTORY, SCANS, 'map.png', 'report.html', 'summary.json']:
         if (output / name).exists():
             check_writable(output / name)
     if TILES in formats:
@@ -326,12 +343,12 @@ def write_files(
     history: History | None = None,
 ) -> list[Path]:
     """
-    Write layers, picture, report and summary, after the map.
+    Write scans, layers, picture, report and summary, after the map.
 
     Returns
     -------
     list of Path
-        The files of the formats, then trajectory, picture, report and summary.
+        The files of the formats, then trajectory, scans, picture, report and summary.
 
     """
     from surfel_mapper.files.atomic import write_json
@@ -367,10 +384,39 @@ def write_files(
     place = trajectory.positions[-1] if trajectory.stamps_ns else (0.0, 0.0, 0.0)
     in_view = drawn_surfels(mapper.map, mapper.config.map.min_points, place, most_shown(meshes))
     write_report(page, title, summary, surfels, history, picture, meshes, sections, in_view)
+    write_outcomes(output / SCANS, mapper.outcomes or [])
     write_json(figures, summary)
     files = known_formats()
     maps = [output / files[name] for name in formats]
-    return [*maps, output / TRAJECTORY, picture, page, figures]
+    return [*maps, output / TRAJECTORY, output / SCANS, picture, page, figures]
+
+
+def write_outcomes(path: Path, outcomes: Sequence[ScanOutcome]) -> None:
+    """Write the outcomes of scans as a table, one row a scan; the times are ms by stage."""
+    from dataclasses import asdict
+
+    from surfel_mapper.counters import STAGES
+    from surfel_mapper.errors import one_line
+    from surfel_mapper.files.atomic import replace_file
+    from surfel_mapper.offline.summary import in_order
+
+    seen = {stage: 0.0 for outcome in outcomes for stage in outcome.milliseconds}
+    stages = [stage for stage, _ in in_order(seen, STAGES)]
+    text = io.StringIO(newline='')
+    table = csv.writer(text, lineterminator='\n')
+    table.writerow([*COLUMNS, *(f'{stage}_ms' for stage in stages)])
+    for outcome in outcomes:
+        row = asdict(outcome)
+        times = [row['milliseconds'].get(stage) for stage in stages]
+        values = [row[name] for name in COLUMNS]
+        table.writerow(
+            [
+                *(one_line(value) if isinstance(value, str) else value for value in values),
+                *('' if time_ms is None else f'{time_ms:.3f}' for time_ms in times),
+            ]
+        )
+    with replace_file(path) as file:
+        file.write(text.getvalue().encode())
 
 
 def write_map(path: Path, name: str, mapper: Mapper, *, window: bool = False) -> None:

@@ -172,6 +172,7 @@ def replay(
     with no_empty_directory(directory), open_recording(request, settings) as recording:
         _log.info('%s: poses from %s', request.path, recording.describe()['poses_from'])
         mapper = started_mapper(with_loops(recording.config, options, directory))
+        mapper.outcomes, mapper.pose_source = [], recording.describe()['poses_from']
         history = History()
         with listeners(directory, options, mapper) as listening:
             listen: list[Callable[[Update], object]] = [partial(history.add, mapper), *listening]

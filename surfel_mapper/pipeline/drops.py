@@ -3,16 +3,20 @@
 """
 Drops: scans and messages that are not used are counted by cause and frame, and logged.
 
+ScanOutcome: the outcome of one scan, mapped or dropped; the log names some of them only.
+
 A bad cable drops ten scans a second for hours; the log gets one line a second for each cause, the
 counters get every drop.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 import logging
 import time
+from typing import Any
 
 from surfel_mapper.counters import Counters
 from surfel_mapper.errors import FilterError, MapError, one_line, PoseError, ScanRefusedError
@@ -69,6 +73,42 @@ def described(error: BaseException) -> str:
     return f'{type(error).__name__}: {text}' if text else type(error).__name__
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanOutcome:
+    """
+    Outcome of a scan: mapped, or left out with the cause.
+
+    Attributes
+    ----------
+    stamp_ns : int, optional
+        Its stamp; None of a cloud that was not decoded.
+    frame_id, topic : str
+        Its frame and topic, as far as they are known.
+    outcome : str
+        ``mapped``, ``localised`` (in a frozen map), ``gated`` (left out by the motion gate) or
+        ``dropped``.
+    cause, reason : str
+        Cause, as in the counts of the summary, and reason, if it was dropped or not reported.
+    pose_source : str
+        The source of its pose; empty if it was dropped before its pose was found.
+    num_points : int
+        Points of the scan that entered the map.
+    milliseconds : mapping of str to float
+        Time by stage, as far as it came.
+
+    """
+
+    stamp_ns: int | None
+    frame_id: str
+    topic: str
+    outcome: str
+    cause: str = ''
+    reason: str = ''
+    pose_source: str = ''
+    num_points: int = 0
+    milliseconds: Mapping[str, float] = field(default_factory=dict)
+
+
 class Drops:
     """
     Counts drops into the counters of a pipeline, and warns about them.
@@ -79,17 +119,47 @@ class Drops:
         The counters.
     is_silent : bool
         Count without warnings.
+    outcomes : list of ScanOutcome, optional
+        Outcomes of all scans, in the order of the decisions; None does not keep them.
+    pose_source : str
+        The source of the poses.
 
     """
 
     is_silent = False
 
-    def __init__(self, counters: Counters) -> None:
+    def __init__(self, counters: Counters, pose_source: str) -> None:
         self.counters = counters
+        self.outcomes: list[ScanOutcome] | None = None
+        self.pose_source = pose_source
         self._warned_s: dict[str, float] = {}
 
-    def scan(self, scan: Scan, cause: str, reason: str) -> None:
-        """Count a scan as dropped for a cause."""
+    def keep(self, scan: Scan, outcome: str, **details: Any) -> None:
+        """Keep the outcome of a scan, if outcomes are kept; see ScanOutcome for the details."""
+        if self.outcomes is not None:
+            of_scan = {name: getattr(scan, name) for name in ('stamp_ns', 'frame_id', 'topic')}
+            self.outcomes.append(ScanOutcome(**of_scan, outcome=outcome, **details))
+
+    def clouds(self, cause: str, topic: str, reason: str, number: int, frame_id: str) -> None:
+        """Count clouds as dropped that did not become scans."""
+        self.counters.drop(cause, frame_id or topic, number)
+        dropped = self.counters.dropped[cause]
+        text = f'cloud on {topic} dropped: {reason} ({dropped} dropped for this cause)'
+        self.warn(cause, text)
+        if self.outcomes is not None:
+            outcome = ScanOutcome(
+                stamp_ns=None,
+                frame_id=frame_id,
+                topic=topic,
+                outcome='dropped',
+                cause=cause,
+                reason=reason,
+            )
+            self.outcomes += [outcome] * number
+
+    def scan(self, scan: Scan, cause: str, reason: str, **details: Any) -> None:
+        """Count a scan as dropped for a cause; see ScanOutcome for further details."""
+        self.keep(scan, 'dropped', cause=cause, reason=reason, **details)
         counters = self.counters
         counters.drop(cause, scan.frame_id)
         remedy = REMEDIES.get(cause)
@@ -101,19 +171,31 @@ class Drops:
             f'{f"; {remedy}" if remedy else ""}',
         )
 
-    def failure(self, scan: Scan, error: Exception, *, is_mapped: bool = False) -> None:
+    def failure(
+        self,
+        scan: Scan,
+        error: Exception,
+        milliseconds: Mapping[str, float],
+        *,
+        is_mapped: bool = False,
+    ) -> None:
         """Count the error of a stage as the drop of a scan, unless the map has the scan."""
         cause = next((cause for kind, cause in CAUSES.items() if isinstance(error, kind)), '')
+        is_refused = isinstance(error, ScanRefusedError)
+        details = {'pose_source': self.pose_source, 'milliseconds': milliseconds}
         if is_mapped:
-            at = f'scan at {scan.stamp_ns / 1e9:.6f} s'
-            self.message(INTERNAL, f'{at} is mapped, but not reported: {described(error)}')
+            reason = f'mapped, but not reported: {described(error)}'
+            self.message(INTERNAL, f'scan at {scan.stamp_ns / 1e9:.6f} s is {reason}')
+            self.keep(scan, 'mapped', cause=INTERNAL, reason=reason, **details)
         elif not isinstance(error, ScanRefusedError):
-            self.scan(scan, cause or INTERNAL, str(error) if cause else described(error))
+            reason = str(error) if cause else described(error)
+            self.scan(scan, cause or INTERNAL, reason, **details)
         elif error.cause == GATED:
             self.counters.gated += 1
+            self.keep(scan, GATED, **details)
         else:
-            self.scan(scan, error.cause, str(error))
-        if is_mapped or not (cause or isinstance(error, ScanRefusedError)):
+            self.scan(scan, error.cause, str(error), **details)
+        if is_mapped or not (cause or is_refused):
             _log.debug('scan at %d ns', scan.stamp_ns, exc_info=error)
 
     def message(self, cause: str, reason: str, number: int = 1) -> None:

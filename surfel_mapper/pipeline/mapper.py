@@ -29,6 +29,7 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import checked_scans, WindowedScan
 from surfel_mapper.messages.poses import StampedPose
+from surfel_mapper.pipeline.drops import ScanOutcome
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.regions import Prism, Region
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
@@ -115,6 +116,28 @@ class Mapper:
     @knows_source.setter
     def knows_source(self, value: bool) -> None:
         self._pipeline.queue.is_open = value
+
+    @property
+    def outcomes(self) -> list[ScanOutcome] | None:
+        """
+        Outcomes of all scans received, in the order of the decisions.
+
+        None unless a list is set, which grows without end: a replay sets one, the node does not.
+        """
+        return self._pipeline.drops.outcomes
+
+    @outcomes.setter
+    def outcomes(self, value: list[ScanOutcome] | None) -> None:
+        self._pipeline.drops.outcomes = value
+
+    @property
+    def pose_source(self) -> str:
+        """The source of the poses, for ``outcomes``; ``pose.source`` until another is set."""
+        return self._pipeline.drops.pose_source
+
+    @pose_source.setter
+    def pose_source(self, value: str) -> None:
+        self._pipeline.drops.pose_source = value
 
     def register_scans(self) -> None:
         """
@@ -233,11 +256,7 @@ class Mapper:
 
         """
         self.counters.received += number
-        self.counters.drop(cause, frame_id or topic, number)
-        dropped = self.counters.dropped[cause]
-        self._pipeline.drops.warn(
-            cause, f'cloud on {topic} dropped: {reason} ({dropped} dropped for this cause)'
-        )
+        self._pipeline.drops.clouds(cause, topic, reason, number, frame_id)
 
     def guarded(self, task: str) -> AbstractContextManager[None]:
         """

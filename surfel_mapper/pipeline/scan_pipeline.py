@@ -45,7 +45,7 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
 from surfel_mapper.memory import machine_bytes
 from surfel_mapper.messages.poses import StampedPose
-from surfel_mapper.pipeline.drops import described, Drops
+from surfel_mapper.pipeline.drops import described, Drops, ScanOutcome
 from surfel_mapper.pipeline.layer_stack import LayerStack
 from surfel_mapper.pipeline.local_map import LocalMap
 from surfel_mapper.pipeline.look_ahead import LookAhead
@@ -92,7 +92,7 @@ class ScanPipeline:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.counters = Counters()
-        self.drops = Drops(self.counters)
+        self.drops = Drops(self.counters, config.pose.source)
         self.derives = True
         self.map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
         self.window = SlidingWindow(self.map)
@@ -164,7 +164,8 @@ class ScanPipeline:
                             results = self.layers.follow(inserted, laps)
                         update = self._recorded(prepared, inserted, alignment, results, laps)
                 except Exception as error:  # MemoryError too: the next scan may fit
-                    self.drops.failure(prepared.scan, error, is_mapped=inserted is not None)
+                    has_scan, times = inserted is not None, laps.milliseconds
+                    self.drops.failure(prepared.scan, error, times, is_mapped=has_scan)
                 if update is not None:
                     yield update
                 laps = Laps()
@@ -323,7 +324,7 @@ class ScanPipeline:
                 begun = self._look_ahead.take(scan, pose, self.config)
             ready = self.preparation.prepare(scan, pose, self.config, laps, begun)
         except Exception as error:  # MemoryError too: the next scan may fit
-            self.drops.failure(scan, error)
+            self.drops.failure(scan, error, laps.milliseconds)
         if not ready and len(laps.milliseconds) > 1:
             self.counters.add_times(laps.milliseconds)
         return ready
@@ -437,24 +438,37 @@ class ScanPipeline:
             else self.map.surfels_of(NO_ROWS)
         )
         laps.end('normals')
+        scan, num_points, milliseconds = prepared.scan, inserted.num_points, laps.milliseconds
+        outcome = ScanOutcome(
+            stamp_ns=scan.stamp_ns,
+            frame_id=scan.frame_id,
+            topic=scan.topic,
+            outcome='mapped',
+            pose_source=self.drops.pose_source,
+            num_points=num_points,
+            milliseconds=milliseconds,
+        )
         update = Update(
-            scan=prepared.scan,
+            scan=scan,
             filtered=prepared.filtered,
-            stamp_ns=prepared.scan.stamp_ns,
+            stamp_ns=scan.stamp_ns,
             frame_id=self.map_frame,
             T_map_sensor=inserted.T_map_sensor,
-            num_points=inserted.num_points,
+            num_points=num_points,
             changed=changed,
             removed_voxel_index=np.concatenate(removed)
             if alignment is None
             else removed_voxels(removed, alignment, changed),
             evictions=inserted.evictions,
-            milliseconds=laps.milliseconds,
+            outcome=outcome,
+            milliseconds=milliseconds,
             layers=results,
             alignment=alignment,
             registration=prepared.registration,
             T_fixed_body=prepared.T_fixed_body,
         )
+        if self.drops.outcomes is not None:
+            self.drops.outcomes.append(outcome)
         self._unreported = None
         self.counters.add_times(update.milliseconds)
         return update
@@ -462,18 +476,30 @@ class ScanPipeline:
     def _localised(self, prepared: Prepared, laps: Laps) -> Update:
         """Return the pose of a scan in a frozen map, which takes no scan."""
         self.counters.localised += 1
-        self.counters.add_times(laps.milliseconds)
+        scan, milliseconds = prepared.scan, laps.milliseconds
+        self.counters.add_times(milliseconds)
+        outcome = ScanOutcome(
+            stamp_ns=scan.stamp_ns,
+            frame_id=scan.frame_id,
+            topic=scan.topic,
+            outcome='localised',
+            pose_source=self.drops.pose_source,
+            milliseconds=milliseconds,
+        )
+        if self.drops.outcomes is not None:
+            self.drops.outcomes.append(outcome)
         return Update(
-            scan=prepared.scan,
+            scan=scan,
             filtered=prepared.filtered,
-            stamp_ns=prepared.scan.stamp_ns,
+            stamp_ns=scan.stamp_ns,
             frame_id=self.map_frame,
             T_map_sensor=prepared.T_map_sensor,
             num_points=0,
             changed=self.map.surfels_of(NO_ROWS),
             removed_voxel_index=NO_VOXELS,
             evictions=(),
-            milliseconds=laps.milliseconds,
+            outcome=outcome,
+            milliseconds=milliseconds,
             registration=prepared.registration,
             T_fixed_body=prepared.T_fixed_body,
         )
@@ -483,6 +509,7 @@ class ScanPipeline:
     def register(self) -> None:
         """Find the poses by registration from now on."""
         self.poses.register(self.config)
+        self.drops.pose_source = 'registration'
         self._keep_local_map()
 
     def _keep_local_map(self) -> None:

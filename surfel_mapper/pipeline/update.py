@@ -15,6 +15,7 @@ from surfel_mapper.alignment.registration import RegistrationResult
 from surfel_mapper.layers import names as layer_names
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction
+from surfel_mapper.pipeline.drops import ScanOutcome
 from surfel_mapper.pipeline.window_aligner import Alignment
 from surfel_mapper.scan import Scan
 
@@ -55,6 +56,8 @@ class Update:
     layers : mapping of str to object
         The results of layers that followed the scan, by name; ``update.models`` is that of
         ``models``, or None.
+    outcome : ScanOutcome
+        ``mapped``, or ``localised`` in a frozen map, with the source of the pose.
     milliseconds : dict of str to float
         Time by stage: filter (if there are any), reduce, insert (evictions included), one stage
         for each layer, normals, total.
@@ -70,6 +73,7 @@ class Update:
     changed: Surfels
     removed_voxel_index: npt.NDArray[np.int32]
     evictions: tuple[Eviction, ...]
+    outcome: ScanOutcome
     milliseconds: dict[str, float]
     alignment: Alignment | None = None
     registration: RegistrationResult | None = None

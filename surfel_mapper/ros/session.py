@@ -190,7 +190,7 @@ class Session:
         if choice.source == 'registration':
             self._tasks.submit(self._register_scans)  # compiles: signals end it there
         else:
-            self.thread.post(self._map_waiting)
+            self.thread.post(partial(self._map_waiting, choice.source))
 
     def _register_scans(self) -> bool:
         """Take the poses from registration; called in the main thread, as scans wait on."""
@@ -199,7 +199,7 @@ class Session:
             assert self.mapper.registered is not None
             run_stages([CompileStage('registration', self.mapper.registered.warm_up)])
             self.registration = registration_outputs(self._node, self.mapper, self.thread)
-            self.thread.post(self._map_waiting)
+            self.thread.post(partial(self._map_waiting, 'registration'))
         except CancelledError:
             return False  # the session has ended
         except Exception as error:
@@ -207,8 +207,9 @@ class Session:
             return False
         return True
 
-    def _map_waiting(self) -> None:
-        """Map scans from now on; called in the mapping thread."""
+    def _map_waiting(self, source: str) -> None:
+        """Map scans with poses of a source from now on; called in the mapping thread."""
+        self.mapper.pose_source = source
         self.mapper.knows_source = True
 
     def _reconfigure(self) -> None:

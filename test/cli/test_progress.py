@@ -84,6 +84,7 @@ def test_ctrl_c_while_files_are_written_leaves_all_of_them(tmp_path, monkeypatch
         'map.ply',
         'map.png',
         'report.html',
+        'scans.csv',
         'summary.json',
         'trajectory.tum',
     }

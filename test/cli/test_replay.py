@@ -21,7 +21,8 @@ from test.bags.recorded import (
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 
-FILES = {'map.npz', 'map.ply', 'map.png', 'report.html', 'summary.json', 'trajectory.tum'}
+MAPS = {'map.npz', 'map.ply', 'map.png'}
+FILES = {*MAPS, 'report.html', 'scans.csv', 'summary.json', 'trajectory.tum'}
 PNG_MAGIC = b'\x89PNG\r\n\x1a\n'
 
 

@@ -18,7 +18,8 @@ from test.cluster.bags import written
 
 pytestmark = [pytest.mark.usefixtures('undrawn'), extras.needs('pyarrow', 'distributed')]
 
-FILES = {'trajectory.tum', 'map.ply', 'map.npz', 'map.png', 'report.html', 'summary.json'}
+MAPS = {'map.ply', 'map.npz', 'map.png'}
+FILES = {*MAPS, 'trajectory.tum', 'scans.csv', 'report.html', 'summary.json'}
 TF = ['--pose-topic', '/tf']
 DONE = (0, 4)  # the bag of faults loses over 5 % of its scans
 

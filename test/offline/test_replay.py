@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``surfel_mapper.replay`` writes and returns what the verb replay does."""
 
+from collections import Counter
+import csv
 import json
 import re
 
@@ -47,6 +49,7 @@ def test_a_replay_in_python_is_that_of_the_verb(bag, tmp_path):
         'map.ply',
         'map.npz',
         'trajectory.tum',
+        'scans.csv',
         'map.png',
         'report.html',
         'summary.json',
@@ -58,6 +61,16 @@ def test_a_replay_in_python_is_that_of_the_verb(bag, tmp_path):
     assert result.mapper.map.digest() == expected['digest']
     ply = [(tmp_path / name / 'map.ply').read_bytes() for name in ('call', 'verb')]
     assert ply[0] == ply[1]
+    with open(tmp_path / 'call' / 'scans.csv', newline='') as file:
+        rows = list(csv.DictReader(file))
+    counts = Counter(row['outcome'] for row in rows)
+    dropped = sum(expected['scans']['dropped'].values())
+    assert counts == +Counter(mapped=expected['scans']['mapped'], dropped=dropped)
+    assert len(rows) == expected['scans']['received']
+    assert {row['pose_source'] for row in rows if row['outcome'] == 'mapped'} == {
+        expected['poses_from']
+    }
+    assert all(float(row['total_ms']) > 0.0 for row in rows if row['outcome'] == 'mapped')
 
 
 def test_options_and_a_part_are_followed(bag, tmp_path):
