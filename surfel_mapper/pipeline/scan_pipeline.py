@@ -146,9 +146,7 @@ class ScanPipeline:
             for prepared in self._prepared(*posed, laps):  # deskewed, filtered and registered
                 inserted, update, alignment, results = None, None, None, dict[str, Any]()
                 try:
-                    if self.config.map.mode == 'frozen':
-                        update = self._localised(prepared, laps)
-                    else:
+                    if self.config.map.mode != 'frozen':  # which takes no scan
                         if self.aligner.T_map_fixed is not T_map_fixed:
                             prepared = self._corrected(prepared, T_map_fixed)
                         windowed = self._reduced(prepared, laps)
@@ -162,7 +160,7 @@ class ScanPipeline:
                             inserted, alignment = self._aligned(inserted, laps)
                         if self.layers.following:
                             results = self.layers.follow(inserted, laps)
-                        update = self._recorded(prepared, inserted, alignment, results, laps)
+                    update = self._recorded(prepared, inserted, alignment, results, laps)
                 except Exception as error:  # MemoryError too: the next scan may fit
                     has_scan, times = inserted is not None, laps.milliseconds
                     self.drops.failure(prepared.scan, error, times, is_mapped=has_scan)
@@ -424,44 +422,44 @@ class ScanPipeline:
     def _recorded(
         self,
         prepared: Prepared,
-        inserted: InsertedScan,
+        inserted: InsertedScan | None,
         alignment: Alignment | None,
         results: dict[str, Any],
         laps: Laps,
     ) -> Update:
-        """Return the update of a mapped scan, with those before it that were not reported."""
-        assert self._unreported is not None, 'of the scan that was inserted'
-        version, removed = self._unreported
-        changed = (
-            self.map.surfels_changed(version, self.config.map.min_points)
-            if self.derives
-            else self.map.surfels_of(NO_ROWS)
-        )
+        """Return the update of a scan that was mapped, or localised in a frozen map."""
+        scan, T_map_sensor, num_points = prepared.scan, prepared.T_map_sensor, 0
+        version, removed = self._unreported or (self.map.version, [NO_VOXELS])
+        if inserted is not None:
+            T_map_sensor, num_points = inserted.T_map_sensor, inserted.num_points
+        if inserted is not None and self.derives:
+            changed = self.map.surfels_changed(version, self.config.map.min_points)
+        else:
+            changed = self.map.surfels_of(NO_ROWS)
         laps.end('normals')
-        scan, num_points, milliseconds = prepared.scan, inserted.num_points, laps.milliseconds
         outcome = ScanOutcome(
             stamp_ns=scan.stamp_ns,
             frame_id=scan.frame_id,
             topic=scan.topic,
-            outcome='mapped',
+            outcome='localised' if inserted is None else 'mapped',
             pose_source=self.drops.pose_source,
             num_points=num_points,
-            milliseconds=milliseconds,
+            milliseconds=laps.milliseconds,
         )
         update = Update(
             scan=scan,
             filtered=prepared.filtered,
             stamp_ns=scan.stamp_ns,
             frame_id=self.map_frame,
-            T_map_sensor=inserted.T_map_sensor,
+            T_map_sensor=T_map_sensor,
             num_points=num_points,
             changed=changed,
             removed_voxel_index=np.concatenate(removed)
             if alignment is None
             else removed_voxels(removed, alignment, changed),
-            evictions=inserted.evictions,
+            evictions=() if inserted is None else inserted.evictions,
             outcome=outcome,
-            milliseconds=milliseconds,
+            milliseconds=dict(outcome.milliseconds),
             layers=results,
             alignment=alignment,
             registration=prepared.registration,
@@ -470,39 +468,9 @@ class ScanPipeline:
         if self.drops.outcomes is not None:
             self.drops.outcomes.append(outcome)
         self._unreported = None
-        self.counters.add_times(update.milliseconds)
+        self.counters.localised += inserted is None
+        self.counters.add_times(outcome.milliseconds)
         return update
-
-    def _localised(self, prepared: Prepared, laps: Laps) -> Update:
-        """Return the pose of a scan in a frozen map, which takes no scan."""
-        self.counters.localised += 1
-        scan, milliseconds = prepared.scan, laps.milliseconds
-        self.counters.add_times(milliseconds)
-        outcome = ScanOutcome(
-            stamp_ns=scan.stamp_ns,
-            frame_id=scan.frame_id,
-            topic=scan.topic,
-            outcome='localised',
-            pose_source=self.drops.pose_source,
-            milliseconds=milliseconds,
-        )
-        if self.drops.outcomes is not None:
-            self.drops.outcomes.append(outcome)
-        return Update(
-            scan=scan,
-            filtered=prepared.filtered,
-            stamp_ns=scan.stamp_ns,
-            frame_id=self.map_frame,
-            T_map_sensor=prepared.T_map_sensor,
-            num_points=0,
-            changed=self.map.surfels_of(NO_ROWS),
-            removed_voxel_index=NO_VOXELS,
-            evictions=(),
-            outcome=outcome,
-            milliseconds=milliseconds,
-            registration=prepared.registration,
-            T_fixed_body=prepared.T_fixed_body,
-        )
 
     # Between two scans.
 
