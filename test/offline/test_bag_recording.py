@@ -67,17 +67,6 @@ def test_every_source_of_poses_gives_the_map_made_by_hand(tmp_path, source, moun
     assert mapper.map.digest() == expected_digest(entries)
 
 
-def test_with_identity_clouds_are_mapped_as_they_are(tmp_path):
-    entries = [row for row in drive() if row[1] == CLOUD]
-
-    mapper = mapped(write_rosbag2(tmp_path / 'a', entries), {'pose.source': 'identity'})
-
-    expected = SurfelMap(Config().map.voxel_size_m)
-    for *_, message in entries:
-        expected.add(points_of(message))
-    assert mapper.map.digest() == expected.digest()
-
-
 def test_transforms_under_a_name_of_their_own_are_used(tmp_path):
     names = {'/tf': '/robot/tf', '/tf_static': '/robot/tf_static'}
     entries = [(names.get(name, name), *rest) for name, *rest in drive()]

@@ -165,28 +165,6 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, clo
     assert saving.problem == ''
 
 
-def test_a_checkpoint_that_another_thread_writes_has_the_map_of_its_beginning(tmp_path, clock):
-    mapper = mapper_in(tmp_path, **{'layers.tsdf.enabled': True})
-    saving, (newest, _) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
-    drive(mapper, 1.0)
-    expected = mapper.map.digest()
-    clock.now_s += 10.0
-    jobs = []
-    assert saving.save_if_due(jobs.append) == newest
-    for stamp_s in (2.0, 3.0, 4.0, 5.0):  # evicts the scans of the checkpoint too
-        drive(mapper, stamp_s)
-        clock.now_s += 10.0
-        assert saving.save_if_due(jobs.append) is None
-    (write,) = jobs
-    write()
-
-    surfel_map, scans = load_map(newest)
-    assert surfel_map.digest() == expected
-    assert [scan.stamp_ns for scan in scans] == [10**9]
-    saving.save_if_due(jobs.append)
-    assert len(jobs) == 2
-
-
 def test_a_failure_without_any_checkpoint_says_so(tmp_path, clock):
     (tmp_path / 'maps').write_bytes(b'')
     mapper = mapper_in(tmp_path / 'maps')

@@ -20,7 +20,6 @@ from surfel_mapper.files.map_state import load_map
 from surfel_mapper.layers import Layer
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow
-from surfel_mapper.pipeline.layer_stack import LayerStack
 from surfel_mapper.pipeline.loop_closer import LoopCloser
 from surfel_mapper.pipeline.preparation import Preparation
 from surfel_mapper.pipeline.saved_state import save_mapper
@@ -32,11 +31,6 @@ BEFORE = {
     'reduce': (SurfelMap, 'reduce'),
     'window': (SlidingWindow, 'insert'),
     'map': (SurfelMap, 'insert'),
-}
-AFTER = {
-    'clear': (LayerStack, 'voxels_to_clear'),
-    'layers': (LayerStack, 'follow'),
-    'derive': (SurfelMap, 'surfels_changed'),
 }
 
 
@@ -90,27 +84,6 @@ def busy():
     layers.register('busy', f'{__name__}:Busy')
     yield
     layers.unregister('busy')
-
-
-@pytest.mark.usefixtures('busy')
-@pytest.mark.parametrize('stage', AFTER)
-@pytest.mark.parametrize('error', ERRORS, ids=lambda error: type(error).__name__)
-def test_changes_of_a_mapped_scan_whose_update_fails_come_with_the_next(monkeypatch, stage, error):
-    mapper, expected = mapper_with(window__max_scans=2), mapper_with(window__max_scans=2)
-    drive(mapper, 1.0, 2.0)
-    fail_once(monkeypatch, *AFTER[stage], error)
-    assert drive(mapper, 3.0) == []
-    (update,) = drive(mapper, 4.0)
-
-    _, _, third, fourth = drive(expected, 1.0, 2.0, 3.0, 4.0)
-    assert mapper.map.digest() == expected.map.digest()
-    changed = set(map(tuple, update.changed.voxel_index.tolist()))
-    removed = set(map(tuple, update.removed_voxel_index.tolist()))
-    assert changed >= set(map(tuple, fourth.changed.voxel_index.tolist()))
-    assert removed >= set(map(tuple, third.removed_voxel_index.tolist()))
-    assert mapper.counters.mapped == 4
-    assert mapper.counters.messages_ignored == {'internal_error': 1}
-    assert_counts_add_up(mapper)
 
 
 def test_a_scan_that_loops_cannot_keep_is_mapped_and_loops_are_off(monkeypatch, caplog):

@@ -4,15 +4,12 @@
 
 from __future__ import annotations
 
-from itertools import count
-
 import numpy as np
 import pytest
 
 from surfel_mapper.alignment.loop_search import LoopClosure
 from surfel_mapper.config import Config
-from surfel_mapper.errors import AlignmentError, ConfigError, FileFormatError
-from surfel_mapper.files.scan_spool import ScanSpool
+from surfel_mapper.errors import AlignmentError, ConfigError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
@@ -157,35 +154,6 @@ def test_later_scans_stay_at_their_poses_to_the_bit_if_no_scan_moves():
     np.testing.assert_array_equal(move.correction, np.eye(4))
     np.testing.assert_array_equal(updates[0].T_map_sensor, updates[1].T_map_sensor)
     assert mapper.map.digest() == expected.map.digest()
-
-
-def fail_at(monkeypatch, cls, name, number, error):
-    """Make a call of a method, by its number from 1, raise an error; later ones work."""
-    work, calls = getattr(cls, name), count(1)
-
-    def failing(self, *args, **kwargs):
-        if next(calls) == number:
-            raise error
-        return work(self, *args, **kwargs)
-
-    monkeypatch.setattr(cls, name, failing)
-
-
-@pytest.mark.parametrize('number', [1, 4, 9])
-def test_a_move_that_fails_changes_nothing(monkeypatch, number):
-    seen = circuit(SAME_WAY)
-    points, before = seen.scans[:6], seen.poses[:6]
-    mapper = mapper_of()
-    fed(mapper, points, before)
-    poses = mapper.loops.T_map_sensor
-
-    with monkeypatch.context() as patch:
-        fail_at(patch, ScanSpool, 'points', number, FileFormatError())
-        with pytest.raises(FileFormatError):
-            mapper.loops.move(closure_at(shifted(poses)), mapper.config)
-
-    assert mapper.map.digest() == digest_at(points, poses)
-    np.testing.assert_array_equal(mapper.loops.T_map_sensor, poses)
 
 
 def test_loops_close_among_the_scans_after_a_loaded_map(tmp_path, caplog):

@@ -5,13 +5,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from surfel_mapper.alignment.angles import transforms
 from surfel_mapper.alignment.edge_terms import weighted_terms
 from surfel_mapper.alignment.kernels import edges
-
-PAIR_MOMENTS = [edges.pair_moments, edges.pair_moments.py_func]
 
 
 def pairs_of(rng, dtype=np.float64, num=50, offset=0.0):
@@ -23,32 +20,6 @@ def pairs_of(rng, dtype=np.float64, num=50, offset=0.0):
 def spread_weights(rng, num):
     root = rng.normal(size=(num, 3, 3))
     return root @ root.swapaxes(1, 2)
-
-
-@pytest.mark.parametrize('kernel', PAIR_MOMENTS)
-@pytest.mark.parametrize('dtype', [np.float32, np.float64])
-@pytest.mark.parametrize('offset', [0.0, 1000.0])
-def test_means_and_second_moments_are_those_of_numpy(kernel, dtype, offset):
-    source, target, rows = pairs_of(np.random.default_rng(1), dtype, offset=offset)
-    source[3] = np.nan
-    found = np.empty(edges.NUM_MOMENTS)
-
-    kernel(source, target, rows, found)
-
-    a, b = source[rows[:, 0]].astype(float), target[rows[:, 1]].astype(float)
-    finite = np.isfinite(a).all(axis=1)
-    a, b = a[finite], b[finite]
-    da, db = a - a.mean(axis=0), b - b.mean(axis=0)
-    upper = np.triu_indices(3)
-    expected = [
-        len(a),
-        *a.mean(axis=0),
-        *b.mean(axis=0),
-        *(da.T @ da)[upper],
-        *(db.T @ db)[upper],
-        *(da.T @ db).ravel(),
-    ]
-    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-8)
 
 
 def test_weighted_terms_are_those_of_points_near_the_origin_if_they_are_far_away():

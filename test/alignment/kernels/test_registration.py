@@ -71,25 +71,3 @@ def test_equations_are_those_of_the_twin(call):
     np.testing.assert_allclose(gradient, expected[1], rtol=1e-10, atol=1e-9)
     assert met == expected[2]
     assert math.isclose(fit, expected[3], rel_tol=1e-12)
-
-
-@both
-def test_the_gradient_is_that_of_the_robust_cost(call):
-    # Geman and McClure: cost = k r^2 / (k + r^2) / 2, here for one cell and a flat variance
-    planes = np.array([[0.0, 0.0, 0.0, 0.6, 0.0, 0.8, 0.04, 0.0]])
-    cell, width_sq, delta = np.array([[1.0, 2.0, 3.0]]), 0.5, 1e-6
-    place = np.zeros(1, np.int32)
-    hessian, gradient = np.empty((6, 6)), np.empty(6)
-    call(sum_equations, cell, POSE, place, planes, width_sq, hessian, gradient)
-
-    def cost(pose):
-        r = planes[0, 3:6] @ (pose[:, :3] @ cell[0] + pose[:, 3])
-        return 0.5 * width_sq * r**2 / (width_sq + r**2) / 0.04
-
-    for axis in range(6):
-        step = np.zeros(6)
-        step[axis] = delta
-        moved = POSE.copy()
-        turn = se3_exp(np.concatenate([np.zeros(3), step[3:]]))[:3, :3]
-        moved[:, :3], moved[:, 3] = turn @ POSE[:, :3], POSE[:, 3] + step[:3]
-        assert math.isclose(gradient[axis], (cost(moved) - cost(POSE)) / delta, rel_tol=1e-3)

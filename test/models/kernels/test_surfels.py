@@ -16,10 +16,6 @@ from surfel_mapper.models.kernels.surfel_classes import (
     ROUGH,
     YOUNG,
 )
-from surfel_mapper.models.kernels.surfel_groups import (
-    find_doubtful,
-    mean_normals,
-)
 from test.kernels.modes import both
 
 PAIRS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
@@ -92,21 +88,3 @@ def test_sparse_voxels_are_flat_on_the_plane_of_all_points_around(call):
     own[1] = FLAT  # beside it they may get a host instead
     call(classify_sparse, rows, table, own, alone, rules, kind, normal)
     assert kind.tolist() == [YOUNG, FLAT, YOUNG, YOUNG]
-
-
-@both
-def test_mean_normals_ignore_signs_without_a_viewpoint(call):
-    up = np.tile([0.0, 0.6, 0.8], (10, 1))
-    mixed = up * np.where(np.arange(10) < 6, 1.0, -1.0)[:, None]
-    normal = np.concatenate([up, mixed, [[1.0, 0.0, 0.0]]])
-    flat = np.arange(21) < 20
-    means, starts = np.empty((2, 3)), np.array([0, 10, 21])
-    rows = np.arange(21, dtype=np.int32)
-    call(mean_normals, rows, starts, flat, normal, means)
-    np.testing.assert_allclose(means, np.tile([0.0, 0.6, 0.8], (2, 1)), atol=1e-12)
-    position, found = np.zeros((21, 3)), np.empty(2, bool)
-    call(find_doubtful, rows, starts, means, normal, position, (0.5, 1.0), found)
-    assert found.tolist() == [False, True]
-    position[3] = 1.01 * means[0]
-    call(find_doubtful, rows, starts, means, normal, position, (0.5, 1.0), found)
-    assert found.tolist() == [True, True]
