@@ -118,6 +118,7 @@ def replay_bags(
         'window': False,
         'interrupted': mapped.interrupted,
         'cut': [cut for survey in surveys for cut in survey.cuts],
+        'clock_offsets': [offset for survey in surveys for offset in survey.clock_offsets],
         **mapped.mapper.summary(),
         **mapped.counts,
         **({} if frame is None else frame.summary(mapped.counts['scans'])),
@@ -192,12 +193,13 @@ def written(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surveyed:
-    """Source of poses, duration and cut files of a recording that is not mapped yet."""
+    """Source of poses, duration, cut files and clocks of a recording that is not mapped yet."""
 
     request: Request
     recorded_s: float
     cuts: list[str]
     poses_from: str
+    clock_offsets: list[dict[str, Any]]
 
 
 def surveyed(requests: Sequence[Request], config: Config) -> list[Surveyed]:
@@ -207,12 +209,18 @@ def surveyed(requests: Sequence[Request], config: Config) -> list[Surveyed]:
     surveys = []
     for request in requests:
         with open_recording(request, config) as recording:
+            found = recording.describe()
+            offsets = [
+                {**offset, 'text': f'{request.path}: {offset["text"]}'}
+                for offset in found.get('clock_offsets', [])
+            ]
             surveys.append(
                 Surveyed(
                     request=request,
                     recorded_s=recording.recorded_s,
                     cuts=list(recording.cuts),
-                    poses_from=str(recording.describe()['poses_from']),
+                    poses_from=str(found['poses_from']),
+                    clock_offsets=offsets,
                 )
             )
     return surveys

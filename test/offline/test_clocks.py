@@ -11,6 +11,7 @@ from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.cli.main import main
 from surfel_mapper.offline.clocks import clock_offsets, ClockOffset, offset_s
 from surfel_mapper.offline.survey import survey
+from test import extras
 from test.bags.recorded import CLOUD, drive, NUM_SCANS, TF, write_rosbag2
 
 pytestmark = pytest.mark.usefixtures('undrawn')
@@ -147,3 +148,14 @@ def test_the_trajectory_is_written_in_the_order_of_time(tmp_path):
     code, summary = replayed(tmp_path, bag)
     assert (code, summary['digest']) == (0, right['digest'])
     assert (tmp_path / 'out' / 'trajectory.tum').read_text() == expected
+
+
+def test_several_bags_name_the_bag_of_an_offset(tmp_path, capsys):
+    extras.load('distributed')
+    right = write_rosbag2(tmp_path / 'right', drive())
+    bag = with_clouds_ahead(tmp_path / 'ahead', 37 * 10**9)
+    output = tmp_path / 'out'
+    assert main(['replay', str(right), str(bag), '--pose-topic', '/tf', '-o', str(output)]) == 4
+    summary = json.loads((output / 'summary.json').read_text())
+    assert f'{bag}: by the record times, stamps of /points are 37.000 s' in capsys.readouterr().err
+    assert len(summary['clock_offsets']) == 1
