@@ -7,10 +7,13 @@ import json
 import numpy as np
 import pytest
 
+from surfel_mapper import Config
 from surfel_mapper.cli.main import main
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.trajectory import Trajectory
 from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.offline.recording import open_recording
+from surfel_mapper.offline.request import Request
 
 PLACES = [(0.3 * k, -0.1 * k, 0.0, 0.0, 0.0, np.sin(0.05 * k), np.cos(0.05 * k)) for k in range(3)]
 
@@ -58,13 +61,14 @@ def test_viewpoints_that_differ_are_the_poses(scans, tmp_path, capsys):
     assert summary['scans']['mapped'] == 3
 
 
-def test_viewpoints_are_named_if_settings_of_frames_keep_them_from_use(scans, tmp_path, capsys):
-    replayed(scans, tmp_path / 'out', '--set', 'frames.base=robot')
+def test_viewpoints_are_named_if_settings_of_frames_keep_them_from_use(scans):
+    config = Config.from_mapping({'frames.base': 'robot'})
 
-    assert (
-        'VIEWPOINT of the PCD files differs, but pose.source or frames are set'
-        in capsys.readouterr().out
-    )
+    with open_recording(Request(path=scans), config) as recording:
+        described = recording.describe()
+
+    assert described['poses_from'] == 'registration'
+    assert 'VIEWPOINT of the PCD files differs, but pose.source' in described['poses_reason']
 
 
 @pytest.mark.parametrize('options', [(), ('--poses-from', 'identity')])
