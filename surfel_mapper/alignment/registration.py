@@ -47,6 +47,13 @@ between two steps: 3 % of the cells at most would meet another one."""
 LEAST_RATIO = 1e-12
 """Share of the information below which a direction is never determined: rounding."""
 
+LEAST_FINER = 0.45
+"""Overlap, as a share of that of the voxels twice as large, below which the pose of these is kept:
+few beams fill some voxels with single rings, which move with the sensor."""
+
+SPARSE = 0.35
+"""Overlap below which larger voxels are tried even if the prediction was right."""
+
 SEARCH_STEP_DEG = 7.5
 """Step of the heading search, deg."""
 
@@ -64,9 +71,9 @@ MAX_SEEN_THROUGH = 0.1
 """Share of surfaces seen through from which on a pose far from the prediction has to be searched
 for: at most 0.05 at right poses of a dense lidar, 0.14 and more at wrong ones."""
 
-SEEN_THROUGH_POWER = 6
-"""A place counts by its support times (1 - seen through) to this power: a surface in free space
-outweighs several cells that fit."""
+FIT_POWER, SEEN_THROUGH_POWER = 3, 12
+"""A place counts by its overlap, times its fit to the first power, times (1 - seen through) to the
+second: what contradicts a place outweighs cells that meet some surfel there."""
 
 AMBIGUOUS = 0.9
 """Places with this share of the best support fit equally well; the nearest is taken."""
@@ -135,8 +142,9 @@ class RegistrationResult:
 
     @property
     def score(self) -> float:
-        """Support, reduced if the scan sees through the map."""
-        return self.support * (1.0 - self.seen_through) ** SEEN_THROUGH_POWER
+        """How well a place explains the scan, to be compared with other places."""
+        agreement = self.fit**FIT_POWER * (1.0 - self.seen_through) ** SEEN_THROUGH_POWER
+        return self.overlap * agreement
 
 
 class Registration:
@@ -293,10 +301,11 @@ class Registration:
             most = self.config.max_iterations
             finer = self._converge(some, levels.planes(level), pose, width_m, tolerance_m, most)
             iterations += finer.iterations
-            # the first scans of few beams may only fill the larger voxels
-            if result is None or finer.overlap >= self.config.min_overlap_ratio:
+            if result is None or finer.overlap >= LEAST_FINER * result.overlap:
                 result = finer
         assert result is not None, 'there is always level 0'
+        if not coarsest and result.overlap < SPARSE:
+            return self._descend(cells, levels, start, levels.voxel_size_m(0))
         return replace(result, num_cells=len(cells), iterations=iterations)
 
     def _converge(
