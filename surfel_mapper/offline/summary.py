@@ -12,6 +12,14 @@ from surfel_mapper.counters import decimals
 LEAST_MAPPED = 0.95
 """Share of the scans that came which a map needs; with fewer, something is wrong."""
 
+STATES = {
+    'lost': 'had no certain place when they came',
+    'unconfirmed': 'waited for the next ones to agree with their place',
+    'ambiguous': 'fitted two places about equally well',
+    'degenerate': 'did not determine all directions of motion',
+}
+"""Statements about the scans in a state of tracking."""
+
 MOST_SURROUNDED = 5
 """Scans that may seem to be surrounded by what moves along, before a replay says so."""
 
@@ -47,7 +55,7 @@ def as_text(summary: Mapping[str, Any], written: Sequence[str]) -> str:
         f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
         f'surfels {summary["surfels"]}\n'
         f'{stages_text(summary)}\n'
-        f'{filters}{aligned}{errors}{f"{apart}{chr(10)}" if apart else ""}'
+        f'{filters}{tracking_text(summary)}{aligned}{errors}{f"{apart}{chr(10)}" if apart else ""}'
         f'digest {summary["digest"]}\n'
         f'{"   ".join(written)}'
     )
@@ -107,6 +115,18 @@ def missing_text(summary: Mapping[str, Any]) -> str:
     if cleared > 0:
         causes = ', '.join(filter(None, [causes, f'mapped before time was set back {cleared}']))
     return f'only {num_used} of {scans["received"]} scans are in the map: {causes}'
+
+
+def tracking_text(summary: Mapping[str, Any]) -> str:
+    """Return a line for each state of tracking with scans, which warnings named one by one."""
+    states = summary.get('registration', {}).get('tracking', {})
+    received = summary['scans']['received']
+    return ''.join(
+        f'registration: {found["scans"]} of {received} scans {statement} '
+        f'({found["first_s"]:.3f} to {found["last_s"]:.3f} s)\n'
+        for state, statement in STATES.items()
+        if (found := states.get(state)) and 'first_s' in found
+    )
 
 
 def surrounded_text(summary: Mapping[str, Any]) -> str:

@@ -54,6 +54,7 @@ class StateTimes:
         self._last_ns: int | None = None
         self._scans = dict.fromkeys(STATES, 0)
         self._seconds = dict.fromkeys(self._scans, 0.0)
+        self._spans_ns: dict[str, tuple[int, int]] = {}
 
     def add(self, stamp_ns: int, states: list[str]) -> None:
         """Count a scan, and the time since the one before, under its states."""
@@ -62,13 +63,21 @@ class StateTimes:
         for state in states:
             self._scans[state] += 1
             self._seconds[state] += min(max(step_s, 0.0), MAX_STEP_S)
+            self._spans_ns[state] = (self._spans_ns.get(state, (stamp_ns, 0))[0], stamp_ns)
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """Return scans and seconds by state."""
+        """Return scans and seconds by state, with the stamps of its first and last scan."""
         return {
-            state: {'scans': number, 'seconds': round(self._seconds[state], 3)}
+            state: {'scans': number, 'seconds': round(self._seconds[state], 3)} | self._span(state)
             for state, number in self._scans.items()
         }
+
+    def _span(self, state: str) -> dict[str, float]:
+        """Return the stamps of the first and last scan in a state, s; empty without one."""
+        if state not in self._spans_ns:
+            return {}
+        first_ns, last_ns = self._spans_ns[state]
+        return {'first_s': first_ns / 1e9, 'last_s': last_ns / 1e9}
 
 
 class RegisteredPoses:

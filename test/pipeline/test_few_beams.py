@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Registration of few beams: single rings in a voxel, which move with the sensor, stop no track."""
+"""Few beams are followed although single rings in voxels move with the sensor."""
 
 import numpy as np
 import pytest

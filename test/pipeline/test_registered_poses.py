@@ -12,8 +12,10 @@ import pytest
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw, se3_exp
+from surfel_mapper.offline.summary import tracking_text
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball
+from surfel_mapper.pipeline.registered_poses import StateTimes
 from surfel_mapper.scan import Scan
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.alignment.test_registration import CORRIDOR, map_of, NOISE_M, points_on, ROOM, TRUE
@@ -339,3 +341,16 @@ def test_an_initial_pose_that_cannot_be_used_changes_nothing(frame_id, q, reason
 def test_contradictory_settings_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         Config.from_mapping(settings)
+
+
+def test_the_text_names_scans_by_their_state_of_tracking():
+    states = StateTimes()
+    for number in range(6):
+        states.add(number * STEP_NS, ['degenerate'] if number in (2, 4) else [])
+
+    summary = {'registration': {'tracking': states.summary()}, 'scans': {'received': 6}}
+
+    assert tracking_text(summary) == (
+        'registration: 2 of 6 scans did not determine all directions of motion '
+        '(0.200 to 0.400 s)\n'
+    )
