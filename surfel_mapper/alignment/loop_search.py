@@ -41,6 +41,10 @@ Floats = npt.NDArray[np.float64]
 SCANS_A_MAP = 12
 """Maximum number of scans of a local map, evenly spaced on its part of the path."""
 
+LOCAL_SHARE = 0.25
+"""Maximum length of a local map, as a share of the path. A loop is at least two of them long, and
+a walk through a hall is shorter than two of a street."""
+
 REACH_M = 60.0
 """Points of a local map farther from their sensor are left out, m: their drift is largest."""
 
@@ -140,6 +144,7 @@ class LoopSearch:
         verifying = replace(registration, coarse_levels=COARSE_LEVELS, search_deg=0.0)
         self._registration = Registration(verifying, voxel_size_m)
         self._path_m = path_lengths(self._initial, frame_ids)
+        self._local_map_m = min(settings.local_map_m, LOCAL_SHARE * float(self._path_m[-1]))
         self.keys = key_numbers(self._path_m, settings.key_distance_m)
         self._maps: OrderedDict[int, SurfelMap] = OrderedDict()
         self._loops: dict[tuple[int, int], Loop] = {}
@@ -211,7 +216,7 @@ class LoopSearch:
     @property
     def _least_loop_m(self) -> float:
         """Minimum length of the path of a loop, m: local maps of its ends share no scan."""
-        return 2.0 * self._settings.local_map_m
+        return 2.0 * self._local_map_m
 
     def _path_between(self, source: int, target: int) -> float:
         return float(self._path_m[self.keys[source]] - self._path_m[self.keys[target]])
@@ -309,7 +314,7 @@ class LoopSearch:
             self._maps.move_to_end(key)
             return self._maps[key]
         centre = self.keys[key]
-        half_m = 0.5 * self._settings.local_map_m
+        half_m = 0.5 * self._local_map_m
         around = np.flatnonzero(np.abs(self._path_m - self._path_m[centre]) <= half_m)
         local = SurfelMap(self._voxel_size_m)
         T_key_map = inverse(self._initial[centre])

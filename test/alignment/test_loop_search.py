@@ -101,6 +101,16 @@ def test_an_earlier_visit_is_compared_although_later_ones_are_nearer():
     assert found == [(2, 0), (4, 0), (6, 0), (8, 0), (10, 0)]  # others within 170 m of path
 
 
+def test_a_short_walk_to_and_fro_has_loops():
+    # 45 m into a hall and 20 m back: less than two local maps of 40 m
+    poses = np.tile(np.eye(4), (14, 1, 1))
+    poses[:, 0, 3] = [*np.arange(0.0, 46.0, 5.0), 40.0, 35.0, 30.0, 25.0]
+
+    pairs = {(each.source, each.target) for each in search((), poses)._near(poses)}
+
+    assert (13, 5) in pairs  # at 25 m again, 40 m of path later
+
+
 def test_keyframes_of_two_sensors_follow_the_path_of_each():
     poses = np.tile(np.eye(4), (82, 1, 1))
     poses[:, 0, 3] = 0.25 * np.repeat(np.arange(41), 2)  # 10 m
