@@ -404,3 +404,21 @@ def test_real_bags_yield_as_many_messages_as_they_state(name):
         scans = [reader.decode(message) for message in reader.messages(['/points'])]
         assert len(scans) == reader.topics.num_messages(['/points']) > 20
     assert all(scan.width * scan.point_step == len(scan.data) for scan in scans)
+
+
+@pytest.mark.parametrize(
+    ('content', 'says'),
+    [
+        (': : :', 'not the metadata of a bag'),
+        ('{}', 'not the metadata of a bag: KeyError'),
+        ('rosbag2_bagfile_information: 3', 'not the metadata of a bag: TypeError'),
+        ('rosbag2_bagfile_information: {relative_file_paths: 3}', 'expected a list of names'),
+        ('rosbag2_bagfile_information: {relative_file_paths: [drive.mcap]}', 'KeyError'),
+    ],
+)
+def test_damaged_metadata_is_refused(tmp_path, content, says):
+    path = write_rosbag2(tmp_path / 'drive', drive())
+    (path / 'metadata.yaml').write_text(content)
+
+    with pytest.raises(BagError, match=f'drive.*: .*{says}'):
+        BagReader(path)

@@ -93,6 +93,18 @@ def test_without_an_origin_utm_is_beyond_the_range_of_the_map():
     assert mapper.map.num_points == 0
 
 
+def test_poses_of_the_fixed_frame_in_another_are_shifted_too():
+    # the tree is base_link -> utm, as some localisations publish it
+    expected = mapped(number=1)
+    for origin in (text_of(UTM), 'auto'):
+        mapper = Mapper(config_of({**SETTINGS, 'map.origin': origin}))
+        mapper.add_pose('earth', 'utm', 0, (5.0, 6.0, 7.0), (0, 0, 0, 1), static=True)
+        drive(mapper, UTM, 1)
+        place = mapper.T_map_of('earth', 0)[:3, 3]
+        np.testing.assert_allclose(place + mapper.map.origin_m, [-5.0, -6.0, -7.0], atol=1e-9)
+    assert mapped(text_of(UTM), UTM, number=1).map.digest() == expected.map.digest()
+
+
 @pytest.mark.parametrize('origin', [text_of(ECEF), 'auto'])
 def test_clouds_in_the_fixed_frame_are_moved_exactly(origin):
     rng = np.random.default_rng(3)
