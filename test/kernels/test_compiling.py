@@ -35,21 +35,3 @@ def test_a_part_is_compiled_with_the_options_of_its_kernel():
     reciprocals(np.array([4.0, 0.0, -0.0]), found)
 
     assert found.tolist() == [0.25, math.inf, -math.inf]  # Python would raise
-
-
-@needs_compiler
-def test_a_part_is_not_compiled_on_its_own():
-    reciprocals(np.ones(1), np.empty(1))
-
-    assert not reciprocal.overloads
-
-
-@needs_compiler
-def test_a_kernel_is_no_function_of_c():
-    reciprocals(np.ones(1), np.empty(1))
-    (compiled,) = reciprocals.overloads.values()
-
-    names = [function.name for function in compiled.library.get_defined_functions()]
-
-    assert any(name.startswith('_ZN7cpython') for name in names)
-    assert not any(name.startswith('cfunc.') for name in names)

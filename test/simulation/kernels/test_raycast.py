@@ -81,21 +81,6 @@ def test_the_nearest_surface_is_that_of_the_twin(seed):
     np.testing.assert_allclose(of_surface, distance_m, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize('seed', range(2))
-def test_surface_hit_is_the_nearest_to_the_end_of_the_ray(seed):
-    world = random_world(seed)
-    origins, ahead = random_rays(300 + seed)
-    range_m, surface, normal = world.raycast(origins, ahead)
-    hit = surface >= 0
-
-    found, distance_m, there = world.surface_at((origins + range_m[:, None] * ahead)[hit])
-
-    assert (found == surface[hit]).all()
-    assert distance_m.max() < 1e-12
-    np.testing.assert_array_equal(there, normal[hit])
-    np.testing.assert_allclose(np.linalg.norm(there, axis=1), 1.0, rtol=1e-14)
-
-
 def test_the_normal_is_how_the_distance_grows_outside_a_solid():
     world = random_world(5)
     rng = np.random.default_rng(6)
