@@ -76,7 +76,7 @@ def read_points(path: str | Path) -> Columns:
     -------
     dict of str to (N,) array
         x, y, z float64, m; intensity float32; classification, return_number, number_of_returns;
-        timestamp float64 if the file has GPS times, s; red, green, blue uint8 if it has colours;
+        timestamp float64 if the file has GPS times, s; red, green, blue if it has colours;
         extra columns by their names. Points that are marked as withheld are left out.
 
     Raises
@@ -116,9 +116,7 @@ def las_columns(path: str | Path, las: Any) -> Columns:
     if 'gps_time' in names:
         columns['timestamp'] = np.asarray(las.gps_time, np.float64)
     if set(RGB) <= names:
-        values = [np.asarray(las[name]) for name in RGB]
-        shift = 8 if max((int(v.max()) for v in values if v.size), default=0) > 255 else 0
-        columns |= {n: (v >> shift).astype(np.uint8) for n, v in zip(RGB, values, strict=True)}
+        columns |= {name: np.asarray(las[name]) for name in RGB}
     for name in las.point_format.extra_dimension_names:
         columns.setdefault(name, np.asarray(las[name]))
     return columns

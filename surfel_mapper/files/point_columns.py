@@ -77,11 +77,13 @@ def with_one_colour(columns: Mapping[str, npt.NDArray[Any]]) -> Columns:
 
 
 def as_bytes(channels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
-    """Return a colour (N, 3) as bytes: floats up to 1 times 255, numbers beyond 255 of 16 bits."""
+    """Return a colour (N, 3) as bytes: floats up to 1 times 255, the upper of 16 bits."""
     if channels.dtype == np.uint8:
         return channels
     values = np.nan_to_num(channels.astype(np.float64))
     top = values.max(initial=0.0)
-    scale = 255.0 if top <= 1.0 and channels.dtype.kind == 'f' else 1.0
-    scale = 255.0 / 65535.0 if top > 255.0 else scale
-    return np.rint(np.clip(values * scale, 0.0, 255.0)).astype(np.uint8)
+    if top > 255.0:
+        values = np.floor(values / 256.0)
+    elif top <= 1.0 and channels.dtype.kind == 'f':
+        values = 255.0 * values
+    return np.rint(np.clip(values, 0.0, 255.0)).astype(np.uint8)

@@ -23,6 +23,7 @@ PLAIN = ('red', 'green', 'blue')
         (PLAIN, 'f4', 1.0),
         (PLAIN, 'f8', 1 / 255),
         (PLAIN, 'u2', 257.0),
+        (PLAIN, 'u2', 256.0),
         (PLAIN, 'u2', 1.0),
         ([f'diffuse_{name}' for name in PLAIN], 'u1', 1.0),
         ('rgb', 'u1', 1.0),
