@@ -267,6 +267,13 @@ class E57Scans:
 
     They have no times that are used: they follow each other 0.1 s apart.
 
+    Parameters
+    ----------
+    path : Path
+        The file.
+    in_file_frame : bool
+        Whether scans are wanted in the frame of the file instead.
+
     Raises
     ------
     FileFormatError
@@ -278,8 +285,10 @@ class E57Scans:
 
     format = 'E57'
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, in_file_frame: bool = False) -> None:
         self._poses = e57_poses(path)
+        if in_file_frame:
+            self._poses[:] = np.eye(4)
         if not len(self._poses):
             raise FileFormatError(f'{path}: no scans in it')
         self.files = [path] * len(self._poses)

@@ -105,7 +105,8 @@ class ScanFolder:
         if suffix == ouster_pcap.SUFFIX:
             self.dataset = OusterPcap(self.path)
         elif suffix == '.e57':
-            self.dataset = E57Scans(self.path)
+            is_fixed = 'identity' in (request.poses_from, config.pose.source)
+            self.dataset = E57Scans(self.path, in_file_frame=is_fixed)
         else:
             self.dataset = find_dataset(self.path) or find_depth_folder(self.path)
         if isinstance(self.dataset, DepthFolder):

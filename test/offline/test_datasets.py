@@ -186,6 +186,12 @@ def test_scans_of_an_e57_file_are_in_the_frame_of_the_scanner_with_their_poses(t
         scan = recording.first_scan()
         found = recording.poses.trajectory
     np.testing.assert_allclose(scan.points, PLACES_OF_E57, atol=1e-6)
+    with open_recording(
+        Request(path=tmp_path / 'a.e57', poses_from='identity'), Config()
+    ) as fixed:
+        x, y, z = PLACES_OF_E57.T
+        places = np.column_stack([1 - y, 2 + x, 3 + z])
+        np.testing.assert_allclose(fixed.first_scan().points, places, atol=1e-6)
     half = np.sqrt(0.5)
     np.testing.assert_allclose(found.q_xyzw, [(0, 0, half, half), (half, 0, 0, half)], atol=1e-9)
     np.testing.assert_allclose(found.xyz, [(1, 2, 3), (-1, 0, 0.5)])
