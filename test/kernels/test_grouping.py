@@ -60,10 +60,3 @@ def test_an_enlarged_table_finds_the_same_rows(call):
     for key in keys + 1:
         if key not in keys:
             assert call(find_key, key, keys, larger, hash_shift(len(larger))) == -1
-
-
-@both
-def test_an_empty_table_finds_nothing(call):
-    keys, table = np.empty(0, np.int64), np.empty(2, np.int32)
-    call(build_table, keys, table)
-    assert call(find_key, np.int64(5), keys, table, hash_shift(2)) == -1

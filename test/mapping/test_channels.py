@@ -134,15 +134,3 @@ def test_maps_with_other_columns_do_not_mix():
         SurfelMap(0.5, columns=('intensity',)).merge(SurfelMap(0.5))
     with pytest.raises(ValueError, match='columns'):
         SurfelMap(0.5, columns=('ring',))
-
-
-def test_colours_of_another_byte_order_or_between_two_integers_are_read():
-    points, columns, colors = coloured(5)
-    expected = SurfelMap(0.5, columns=('rgb',))
-    expected.add(points, columns=columns)
-    packed = columns['rgb'].view(np.float32)
-    near = colors.astype(np.float64) + 0.4
-    for column in (packed.astype('>f4'), packed.view(np.uint32).astype('>u4'), near, near - 0.8):
-        surfel_map = SurfelMap(0.5, columns=('rgb',))
-        surfel_map.add(points, columns={'rgb': column})
-        assert surfel_map == expected

@@ -299,13 +299,6 @@ def test_columns_of_every_type_come_back_equal():
     np.testing.assert_array_equal(scan.points[:, 1], columns['y'])
 
 
-def test_four_byte_columns_are_packed_without_padding():
-    cloud = from_columns({name: np.ones(2, np.float32) for name in ('x', 'y', 'z', 'i')})
-    assert [field.offset for field in cloud.fields] == [0, 4, 8, 12]
-    assert (cloud.point_step, cloud.row_step, len(cloud.data)) == (16, 32, 32)
-    assert cloud.data.tobytes() == struct.pack('<8f', *[1.0] * 8)
-
-
 @pytest.mark.parametrize('value', [np.nan, np.inf])
 def test_a_number_that_is_not_finite_makes_a_cloud_not_dense(value):
     assert not from_columns({'x': np.array([0.0, value]), 'n': np.array([1, 2], 'u4')}).is_dense

@@ -11,7 +11,6 @@ from surfel_mapper.models.bspline import (
     axis_degree,
     basis,
     design,
-    fit_cells,
     fit_lsqr,
     fit_pspline,
     initial_field,
@@ -19,7 +18,6 @@ from surfel_mapper.models.bspline import (
     RIDGE,
 )
 from surfel_mapper.models.bspline_solvers import FieldSamples, second_differences, solve_band
-from surfel_mapper.models.grid import Cells
 
 SIZES = [1, 2, 3, 4, 5, 30]
 PITCH, ORIGIN = 0.3, np.array([-1.2, 0.6])
@@ -77,22 +75,6 @@ def test_quadrics_are_reproduced_and_holes_are_filled():
     np.testing.assert_allclose(usual.heights(hole), expected, atol=0.05 * np.ptp(z))
 
 
-def test_lsqr_equals_the_limit_of_gradient_descent():
-    start, xy, z = scene(lambda x, y: np.sin(2 * x) + y**2, (4, 3))
-    rows, weights, _ = design(start, xy)
-    matrix = np.zeros((len(z), start.control.size))
-    np.add.at(matrix, (np.arange(len(z))[:, None], rows), weights)
-    control = start.control.ravel().copy()
-    step = 1.0 / np.linalg.norm(matrix, 2) ** 2
-    for _ in range(200_000):
-        change = step * (matrix.T @ (z - matrix @ control))
-        control += change
-        if np.abs(change).max() < 1e-13:
-            break
-    found = fit_lsqr(start, xy, z).control.ravel()
-    np.testing.assert_allclose(found, control, atol=1e-6)
-
-
 @pytest.mark.parametrize('cells', [(9, 6), (1, 1), (2, 7), (1, 8)])
 def test_banded_fields_equal_the_dense_normal_equations(cells):
     rng = np.random.default_rng(4)
@@ -117,24 +99,6 @@ def test_banded_fields_equal_the_dense_normal_equations(cells):
     np.testing.assert_allclose(found.ravel(), control, rtol=1e-6, atol=1e-8)
 
 
-def test_cells_are_fitted_at_the_means_of_their_points_by_their_number():
-    rng = np.random.default_rng(6)
-    local = rng.uniform(0.0, [2.0, 1.5, 0.1], (400, 3))
-    local = local[~((local[:, 0] > 1.0) & (local[:, 1] > 1.0))]
-    cells = Cells.around(local, np.zeros(len(local), int), np.full(1, 0.25), 0.0, snapped=True)
-    field = fit_cells(cells, 0, 3, 1e-2)
-    cell = np.floor(local[:, :2] / 0.25).astype(int)
-    means, number = np.full((8, 6, 3), np.nan), np.zeros((8, 6))
-    for i, j in np.ndindex(8, 6):
-        own = local[(cell == [i, j]).all(axis=1)]
-        number[i, j] = len(own)
-        means[i, j] = own.mean(axis=0) if len(own) else np.nan
-    used = number > 0.0
-    start = initial_field(0.25, np.zeros(2), means[..., 2], used, 3)
-    expected = fit_pspline(start, means[used, :2], means[used, 2], number[used], 1e-2)
-    np.testing.assert_allclose(field.control, expected.control, rtol=1e-9)
-
-
 def test_slopes_are_the_derivatives_of_the_heights():
     start, xy, z = scene(lambda x, y: np.sin(2 * x) + y**2)
     field = fit_pspline(start, xy, z, np.ones(len(z)), 1e-3)
@@ -143,15 +107,6 @@ def test_slopes_are_the_derivatives_of_the_heights():
         by = step * np.eye(2)[axis]
         expected = (field.heights(xy + by) - field.heights(xy - by)) / (2 * step)
         np.testing.assert_allclose(field.slopes(xy)[:, axis], expected, atol=1e-6)
-
-
-@pytest.mark.parametrize('cells', [(1, 1), (5, 3), (9, 6)])
-def test_heights_and_slopes_are_nan_at_nan_only(cells):
-    start, xy, z = scene(lambda x, y: 0.3 * x - 0.2 * y, cells)
-    field = fit_pspline(start, xy, z, np.ones(len(z)), 1e-2)
-    places = np.array([[np.nan, xy[0, 1]], [xy[0, 0], np.nan], [np.nan, np.nan], xy[0]])
-    assert np.isnan(field.heights(places)).tolist() == [True, True, True, False]
-    assert np.isnan(field.slopes(places)).tolist() == [[True] * 2] * 3 + [[False] * 2]
 
 
 @pytest.mark.parametrize('cells', [(1, 2), (4, 5), (12, 3)])

@@ -48,9 +48,3 @@ def test_means_and_rows_are_those_of_a_dictionary(number, dtype, spread_m):
     for label, rows in enumerate(expected.values()):
         by_point[rows] = label
     assert thinned.point_labels(labels).tolist() == by_point.tolist()
-
-
-@pytest.mark.parametrize('points', [np.empty((0, 3)), np.full((4, 3), np.nan, np.float32)])
-def test_no_finite_point_gives_no_voxel(points):
-    thinned = thin(points, EDGE_M)
-    assert (len(thinned.means), len(thinned.rows), thinned.starts.tolist()) == (0, 0, [0])

@@ -141,24 +141,6 @@ def test_each_scan_has_the_pose_of_its_number_if_there_are_more_poses(tmp_path, 
     assert mapper.map.digest() == digest_of(range(6))
 
 
-def test_a_part_has_the_poses_of_its_numbers(tmp_path):
-    folder = scan_folder(tmp_path, '.bin', range(3, 9))
-    file = pose_file(tmp_path, 'kitti', range(-3, 7))
-
-    mapper = mapped(folder, MOUNTED, poses=file, start_s=0.1, every=2)
-
-    assert mapper.map.digest() == digest_of([1, 3, 5])
-
-
-def test_one_file_has_the_pose_of_its_number(tmp_path):
-    folder = scan_folder(tmp_path, '.bin', [f'{row:06}' for row in range(6)])
-    write_lines(folder / 'times.txt', ['of', 'others'])
-
-    mapper = mapped(folder / '000004.bin', MOUNTED, poses=pose_file(tmp_path, 'kitti'))
-
-    assert mapper.map.digest() == digest_of([4])
-
-
 @pytest.mark.parametrize('kind', ['g2o', 'kitti360'])
 def test_numbered_poses_are_those_of_the_scans_of_these_numbers(tmp_path, kind):
     folder, numbers = scan_folder(tmp_path, '.bin', range(10, 16)), [15, 11, 12, 10]

@@ -165,16 +165,6 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, clo
     assert saving.problem == ''
 
 
-def test_a_failure_without_any_checkpoint_says_so(tmp_path, clock):
-    (tmp_path / 'maps').write_bytes(b'')
-    mapper = mapper_in(tmp_path / 'maps')
-    drive(mapper, 1.0)
-    saving = Checkpoints(mapper)
-    with pytest.raises(FileFormatError):
-        saving.save()
-    assert saving.problem.endswith('expected a directory); there is no good one')
-
-
 def test_a_checkpoint_is_not_written_through_a_link(tmp_path, clock):
     mapper = mapper_in(tmp_path)
     newest, _ = checkpoint_paths(mapper.config.output)
