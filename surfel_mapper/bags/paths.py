@@ -160,9 +160,9 @@ def replaced_files(directory: Path, files: list[Path]) -> list[Path]:
         replaced = [*present]
     missing = ', '.join(file.name for file in files if not os.path.isfile(file))
     if None in replaced:
-        rest = f'; without {METADATA} the rest is read: {", ".join(sorted(by_name))}'
+        hint = f'; without {METADATA} the rest is read: {", ".join(sorted(by_name))}'
         raise BagError(
-            f'{directory}: {missing} of its {METADATA} is missing{rest if present else ""}'
+            f'{directory}: {missing} of its {METADATA} is missing{hint if present else ""}'
         )
     chosen = [file for file in replaced if file is not None]
     names = ', '.join(file.name for file in chosen)
@@ -182,8 +182,8 @@ def loose_files(directory: Path) -> list[Path]:
     files = [f for f in files if f.name == unpacked_name(f) or unpacked_name(f) not in names]
     if not files:
         endings = Counter(file.suffix for file in directory.iterdir() if file.is_file())
-        found = ', '.join(f'{n} {ending or "without ending"}' for ending, n in endings.items())
-        raise BagError(f'{directory}: files in it: {found or "none"}; expected {READ}')
+        listed = ', '.join(f'{n} {ending or "without ending"}' for ending, n in endings.items())
+        raise BagError(f'{directory}: files in it: {listed or "none"}; expected {READ}')
     return sorted(files, key=by_number)
 
 

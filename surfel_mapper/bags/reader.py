@@ -336,7 +336,7 @@ class BagReader:
         streamed = StreamedMcap(storage.path)
         self._files.callback(streamed.close)
         self._storages = [
-            (name, streamed if other is storage else other) for name, other in self._storages
+            (name, streamed if opened is storage else opened) for name, opened in self._storages
         ]
         for loss in streamed.losses(path):
             if loss not in self.cuts:  # of an iterator begun earlier

@@ -118,20 +118,20 @@ class Topics(list[Topic]):
             If there is no such topic, it has another type, or there are several to choose from.
 
         """
-        found = self.of_type(type_, *or_else)
+        offered = self.of_type(type_, *or_else)
         short = type_.rpartition('/')[2]
-        offers = f'{short} topics: {", ".join(found) or "none"}'
+        offers = f'{short} topics: {", ".join(offered) or "none"}'
         if name is not None:
-            if name in found:
+            if name in offered:
                 return name
             types = [topic.type for topic in self if topic.name == name]
             problem = f'{name} is of type {types[0]}, not {short}' if types else f'no topic {name}'
             raise BagError(f'{self.path}: {problem}; {offers}')
-        if default is not None and default in found:
+        if default is not None and default in offered:
             return default
-        if len(found) == 1:
-            return found[0]
-        if found:
+        if len(offered) == 1:
+            return offered[0]
+        if offered:
             raise BagError(f'{self.path}: several topics to choose from, name one; {offers}')
         every = ', '.join(f'{topic.name} ({topic.type})' for topic in self)
         advice = '; '.join(converters(self)) if type_ == CLOUD else ''

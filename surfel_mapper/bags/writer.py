@@ -284,10 +284,10 @@ class BagWriter:
             raise BagError(f'{self.path}: not a directory, so not a bag to overwrite')
         if not (self.path / METADATA).exists() and any(self.path.iterdir()):
             raise BagError(f'{self.path}: has files but no {METADATA}, so not a bag to overwrite')
-        other = next((file for file in sorted(self.path.iterdir()) if not is_of_bag(file)), None)
-        if other is not None:
+        stray = next((file for file in sorted(self.path.iterdir()) if not is_of_bag(file)), None)
+        if stray is not None:
             raise BagError(
-                f'{self.path}: {other.name} in it is no file of a bag, so not overwritten; move '
+                f'{self.path}: {stray.name} in it is no file of a bag, so not overwritten; move '
                 'it, or name another directory'
             )
 
