@@ -172,7 +172,7 @@ def finite_or_none(content: Any) -> Any:
 
 def by_number(file: Path) -> list[Any]:
     """Return a sort key of a file name: scan2 comes before scan10."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', file.name)]
+    return [int(token) if token.isdecimal() else token for token in re.split(r'(\d+)', file.name)]
 
 
 def cannot_write(path: str | Path, error: OSError) -> FileFormatError:

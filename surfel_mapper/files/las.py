@@ -268,8 +268,8 @@ def check_header(path: str | Path) -> None:
     if is_packed and (count > room or (room and not count)):
         raise FileFormatError(f'{path}: {count} points in chunks of {room}; damaged?')
     waveforms = struct.unpack_from('<Q', header, 227)[0] if header[24:26] >= b'\x01\x03' else 0
-    found = (size - start) // max(point_size, 1)
-    if not is_packed and (count > found or (count < found and not num_extended | waveforms)):
+    stored = (size - start) // max(point_size, 1)
+    if not is_packed and (count > stored or (count < stored and not num_extended | waveforms)):
         raise FileFormatError(
             f'{path}: {size} bytes, expected {start + count * point_size} for {count} points of '
             f'{point_size} bytes; truncated, or is its header damaged?'
@@ -358,5 +358,5 @@ def read_number(file: BinaryIO, at: int, code: str) -> int:
     """Return a number at a place of a file; bytes behind its end are 0."""
     length = struct.calcsize(code)
     file.seek(max(at, 0))
-    found: int = struct.unpack(code, file.read(length).ljust(length, b'\0'))[0]
-    return found
+    number: int = struct.unpack(code, file.read(length).ljust(length, b'\0'))[0]
+    return number

@@ -42,8 +42,8 @@ def map_in(directory: str | Path, forms: Sequence[str]) -> Path | None:
 
     """
     tiles = dataset_in(directory)
-    found = [tiles if form == TILES else Path(directory, form) for form in forms]
-    maps = [path for path in found if path is not None and (path == tiles or path.is_file())]
+    paths = [tiles if form == TILES else Path(directory, form) for form in forms]
+    maps = [path for path in paths if path is not None and (path == tiles or path.is_file())]
     return max(maps, key=modified_ns, default=None)
 
 

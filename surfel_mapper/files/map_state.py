@@ -144,15 +144,15 @@ def load_map(
         )
         surfel_map.insert(_moments(arrays, 'map', surfel_map))
         scans = _scans(arrays, attributes, surfel_map)
-        held = SurfelMap(
+        of_window = SurfelMap(
             found_m,
             columns=surfel_map.columns,
             level=surfel_map.level,
             origin_m=surfel_map.origin_m,
         )
         for scan in scans:
-            held.insert(scan.moments)
-        check_held(surfel_map.moments(), held.moments())
+            of_window.insert(scan.moments)
+        check_held(surfel_map.moments(), of_window.moments())
     digest = surfel_map.digest()
     if digest != attributes.get('digest'):
         raise FileFormatError(
@@ -161,22 +161,22 @@ def load_map(
     return surfel_map, scans
 
 
-def check_held(whole: ScanMoments, held: ScanMoments) -> None:
+def check_held(whole: ScanMoments, kept: ScanMoments) -> None:
     """
     Raise NotInMapError unless a map holds all points of its window, so that they can be evicted.
 
     Both are sorted by voxel, as ``SurfelMap.moments`` returns them.
     """
-    rows = np.minimum(np.searchsorted(whole.key, held.key), max(len(whole) - 1, 0))
-    is_held = np.zeros(len(held), np.bool_)
+    rows = np.minimum(np.searchsorted(whole.key, kept.key), max(len(whole) - 1, 0))
+    is_held = np.zeros(len(kept), np.bool_)
     if len(whole):
-        num_others = whole.count[rows] - held.count
-        is_equal = (whole.total[rows] == held.total).all(axis=1)
-        is_equal &= (whole.product[rows] == held.product).all(axis=1)
-        is_equal &= (whole.view[rows] == held.view).all(axis=1)
-        is_held = (whole.key[rows] == held.key) & ((num_others > 0) | (num_others == 0) & is_equal)
+        num_others = whole.count[rows] - kept.count
+        is_equal = (whole.total[rows] == kept.total).all(axis=1)
+        is_equal &= (whole.product[rows] == kept.product).all(axis=1)
+        is_equal &= (whole.view[rows] == kept.view).all(axis=1)
+        is_held = (whole.key[rows] == kept.key) & ((num_others > 0) | (num_others == 0) & is_equal)
     if not is_held.all():
-        voxel = held.voxel_index[np.argmin(is_held)].tolist()
+        voxel = kept.voxel_index[np.argmin(is_held)].tolist()
         raise NotInMapError(f'voxel {voxel} does not hold the points of its window')
 
 
@@ -246,8 +246,8 @@ def _num_scans(arrays: dict[str, npt.NDArray[Any]]) -> int:
     if poses.dtype != np.float64 or poses.shape != (len(stamps), 4, 4):
         raise ValueError(f'poses of scans: {poses.dtype} {poses.shape} for {len(stamps)} scans')
     prefixes = ['map', *(f'scan{number}' for number in range(len(stamps)))]
-    known = {f'{prefix}.{name}' for prefix in prefixes for name in (*NAMES, 'points')}
-    unknown = sorted({*arrays} - known - {'scans.stamp_ns', 'scans.pose'})
+    expected = {f'{prefix}.{name}' for prefix in prefixes for name in (*NAMES, 'points')}
+    unknown = sorted({*arrays} - expected - {'scans.stamp_ns', 'scans.pose'})
     if unknown or 'map.points' in arrays:
         raise ValueError(f'unknown arrays {unknown or ["map.points"]}')
     return len(stamps)
@@ -259,7 +259,7 @@ def _scans(
     """Return the scans of the window."""
     num_scans = _num_scans(arrays)
     frame_ids = attributes.get('frame_ids', [''] * num_scans)
-    if not (isinstance(frame_ids, list) and all(isinstance(each, str) for each in frame_ids)):
+    if not (isinstance(frame_ids, list) and all(isinstance(name, str) for name in frame_ids)):
         raise ValueError(f'frames of scans: {frame_ids!r:.60}, expected a list of names')
     if len(frame_ids) != num_scans:
         raise ValueError(f'{len(frame_ids)} frames for {num_scans} scans')
@@ -292,19 +292,19 @@ def _moments(
     arrays: dict[str, npt.NDArray[Any]], prefix: str, surfel_map: SurfelMap
 ) -> ScanMoments:
     """Return the moments under a prefix."""
-    parts = {name: arrays[f'{prefix}.{name}'] for name in NAMES}
-    return checked_moments(parts, surfel_map, prefix)
+    columns = {name: arrays[f'{prefix}.{name}'] for name in NAMES}
+    return checked_moments(columns, surfel_map, prefix)
 
 
 def checked_moments(
-    parts: dict[str, npt.NDArray[Any]], surfel_map: SurfelMap, prefix: str
+    columns: dict[str, npt.NDArray[Any]], surfel_map: SurfelMap, prefix: str
 ) -> ScanMoments:
     """
     Return moments from a file after checking that they are possible, as the kernels require.
 
     Parameters
     ----------
-    parts : dict of str to array
+    columns : dict of str to array
         The arrays of ScanMoments by name.
     surfel_map : SurfelMap
         The map into which they will be inserted.
@@ -317,13 +317,13 @@ def checked_moments(
         If shapes or types are wrong, a voxel occurs twice, or its counts and sums are impossible.
 
     """
-    key, count = parts['key'], parts['count']
+    key, count = columns['key'], columns['count']
     names = channel_names(surfel_map.columns)
     widths = {'total': (3,), 'product': (6,), 'view': (3,), 'channels': (len(names),)}
-    for name, array in parts.items():
+    for name, array in columns.items():
         if array.shape != (len(key), *widths.get(name, ())) or array.dtype.kind != 'i':
             raise ValueError(f'{prefix}.{name}: {array.dtype} {array.shape}')
-    if any(parts[name].dtype != np.int64 for name in ('key', 'product', 'channels')):
+    if any(columns[name].dtype != np.int64 for name in ('key', 'product', 'channels')):
         raise ValueError(f'{prefix}: keys, products or channels are not int64')
     in_order = key  # as save_map writes them; np.unique, by hashes, takes 80 times as long
     if not (key[1:] > key[:-1]).all():
@@ -337,9 +337,9 @@ def checked_moments(
         level=surfel_map.level,
         key=key,
         count=count,
-        total=parts['total'],
-        product=parts['product'],
-        view=parts['view'],
+        total=columns['total'],
+        product=columns['product'],
+        view=columns['view'],
         channel_names=names,
-        channels=parts['channels'],
+        channels=columns['channels'],
     )

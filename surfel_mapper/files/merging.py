@@ -48,10 +48,10 @@ def merged(sources: Sequence[Path]) -> SurfelMap:
 
 def warn_of_repeated_scans(sources: Sequence[Path]) -> None:
     """Log a warning if two maps contain scans of equal stamps, by the trajectories beside them."""
-    seen: dict[int, Path] = {}
+    source_of: dict[int, Path] = {}
     for source in sources:
         stamps_ns = stamps_of_map(source)
-        repeated = seen.keys() & stamps_ns
+        repeated = source_of.keys() & stamps_ns
         if repeated:
             _log.warning(
                 '%s: %d of its %d scans have stamps of scans in %s; the points of a drive that is '
@@ -59,9 +59,9 @@ def warn_of_repeated_scans(sources: Sequence[Path]) -> None:
                 source,
                 len(repeated),
                 len(stamps_ns),
-                seen[min(repeated)],
+                source_of[min(repeated)],
             )
-        seen |= dict.fromkeys(stamps_ns - seen.keys(), source)
+        source_of |= dict.fromkeys(stamps_ns - source_of.keys(), source)
 
 
 def stamps_of_map(source: Path) -> set[int]:

@@ -108,9 +108,9 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
     """
     moments, surfel_map, digest = _read(path, voxel_size_m)
     insert(surfel_map, moments, path)
-    found = surfel_map.digest()
-    if found != digest:
-        raise FileFormatError(f'{path}: damaged: digest {found}, expected {digest}')
+    actual = surfel_map.digest()
+    if actual != digest:
+        raise FileFormatError(f'{path}: damaged: digest {actual}, expected {digest}')
     return surfel_map
 
 
@@ -131,11 +131,11 @@ def read_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap]:
     moments, empty, digest = _read(path, None)
     if (moments.key[1:] < moments.key[:-1]).any():
         moments = moments.select(np.argsort(moments.key))
-    found = ''
+    actual = ''
 
     def hash_rows() -> None:
-        nonlocal found
-        found = digest_of(
+        nonlocal actual
+        actual = digest_of(
             empty.voxel_size_m,
             empty.level,
             len(moments),
@@ -145,16 +145,16 @@ def read_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap]:
 
     checks: list[Callable[[], None]] = [hash_rows, lambda: check_possible(moments)]
 
-    def check(part: slice) -> None:
-        for each in checks[part]:
-            each()
+    def check(chunk: slice) -> None:
+        for task in checks[chunk]:
+            task()
 
     try:
         share(check, len(checks), usable_cores())
     except MapError as error:
         raise FileFormatError(f'{path}: damaged: {error}') from error
-    if found != digest:
-        raise FileFormatError(f'{path}: damaged: digest {found}, expected {digest}')
+    if actual != digest:
+        raise FileFormatError(f'{path}: damaged: digest {actual}, expected {digest}')
     return moments, empty
 
 
@@ -173,8 +173,8 @@ def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, Su
             if unknown:
                 raise ValueError(f'unknown columns {sorted(unknown)}')
             check_size(content, names, path, os.fstat(opened.fileno()).st_size)
-            parts = read_rows(file, content.metadata, surfel_map)
-            moments = checked_moments(parts, surfel_map, 'rows')
+            columns = read_rows(file, content.metadata, surfel_map)
+            moments = checked_moments(columns, surfel_map, 'rows')
     except FileFormatError:
         raise
     except OSError as error:
@@ -197,7 +197,7 @@ def read_rows(file: Any, footer: Any, surfel_map: SurfelMap) -> Columns:
     names = moment_names(surfel_map)
     sizes = [footer.row_group(group).num_rows for group in range(footer.num_row_groups)]
     ends = list(itertools.accumulate(sizes))
-    parts = moment_arrays(footer.num_rows, surfel_map)
+    arrays = moment_arrays(footer.num_rows, surfel_map)
     if sum(sizes) != footer.num_rows or min(sizes, default=0) < 0:
         raise ValueError(f'{sum(sizes)} rows, {footer.num_rows} in the footer')
 
@@ -212,13 +212,13 @@ def read_rows(file: Any, footer: Any, surfel_map: SurfelMap) -> Columns:
             ):
                 columns = {name: int64_column(batch, name) for name in names}
                 rows = slice(filled, filled + len(columns['i']))
-                fill_rows(parts, rows, columns, surfel_map)
+                fill_rows(arrays, rows, columns, surfel_map)
                 filled = rows.stop
             if filled != ends[group]:
                 raise ValueError(f'{filled} rows to group {group}, expected {ends[group]}')
 
     share(read, len(sizes), usable_cores())
-    return parts
+    return arrays
 
 
 def check_size(content: Any, names: tuple[str, ...], path: str | Path, file_size: int) -> None:
@@ -326,10 +326,10 @@ def read_attributes(path: str | Path, metadata: Mapping[bytes, bytes]) -> dict[s
     if METADATA not in metadata:
         raise FileFormatError(f'{path}: a Parquet file, but not a map of surfel_mapper')
     attributes: dict[str, Any] = json.loads(metadata[METADATA])
-    found = (attributes['kind'], attributes['version'])
-    if found != (KIND, VERSION):
+    stated = (attributes['kind'], attributes['version'])
+    if stated != (KIND, VERSION):
         raise FileFormatError(
-            f'{path}: kind {found[0]!r}, version {found[1]!r}, expected {KIND!r}, '
+            f'{path}: kind {stated[0]!r}, version {stated[1]!r}, expected {KIND!r}, '
             f'version {VERSION}'
         )
     return attributes
@@ -378,14 +378,14 @@ def moment_arrays(num_rows: int, surfel_map: SurfelMap) -> Columns:
     return {'key': np.empty(num_rows, np.int64), 'count': np.empty(num_rows, np.int64), **arrays}
 
 
-def fill_rows(parts: Columns, rows: slice, columns: Columns, surfel_map: SurfelMap) -> None:
+def fill_rows(arrays: Columns, rows: slice, columns: Columns, surfel_map: SurfelMap) -> None:
     """Write columns of a file into some rows of the arrays of moments."""
-    parts['key'][rows] = pack_keys(np.stack([columns[name] for name in INDEX], axis=1))
-    parts['count'][rows] = columns['num_points']
+    arrays['key'][rows] = pack_keys(np.stack([columns[name] for name in INDEX], axis=1))
+    arrays['count'][rows] = columns['num_points']
     tables = {'total': SUMS, 'product': PRODUCTS, 'view': VIEWS}
-    for part, names in {**tables, 'channels': channel_columns(surfel_map)}.items():
+    for target, names in {**tables, 'channels': channel_columns(surfel_map)}.items():
         for number, name in enumerate(names):
-            parts[part][rows, number] = columns[name]
+            arrays[target][rows, number] = columns[name]
 
 
 def import_pyarrow() -> tuple[Any, Any]:

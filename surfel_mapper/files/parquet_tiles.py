@@ -48,18 +48,18 @@ class Tile(NamedTuple):
 
 def tiles_in(directory: str | Path) -> dict[Tile, Path]:
     """Return the files of a dataset by tile."""
-    found = {}
+    tiles = {}
     for path in sorted(Path(directory).glob(f'tile_i=*/tile_j=*/{FILE}')):
         match = TILE_PATH.fullmatch(path.relative_to(directory).as_posix())
         if match:
-            found[Tile(int(match[1]), int(match[2]))] = path
-    return found
+            tiles[Tile(int(match[1]), int(match[2]))] = path
+    return tiles
 
 
 def dataset_in(directory: str | Path) -> Path | None:
     """Return the dataset of tiles that a directory is, or has as ``map``; None without one."""
     both = (Path(directory) / 'map', Path(directory))
-    return next((each for each in both if tiles_in(each)), None)
+    return next((path for path in both if tiles_in(path)), None)
 
 
 def read_tiles(directory: str | Path, *, voxel_size_m: float | None = None) -> SurfelMap:
@@ -74,19 +74,19 @@ def read_tiles(directory: str | Path, *, voxel_size_m: float | None = None) -> S
         If pyarrow is not installed.
 
     """
-    found: SurfelMap | None = None
+    whole: SurfelMap | None = None
     for path in tiles_in(directory).values():
         tile = read_map(path, voxel_size_m=voxel_size_m)
-        if found is None:
-            found = tile
+        if whole is None:
+            whole = tile
             continue
         try:
-            found.merge(tile)
+            whole.merge(tile)
         except MapError as error:
             raise FileFormatError(f'{path}: {error}') from error
-    if found is None:
+    if whole is None:
         raise FileFormatError(f'{directory}: no tiles of a map in this directory')
-    return found
+    return whole
 
 
 def write_tiles(directory: str | Path, surfel_map: SurfelMap) -> None:

@@ -156,11 +156,11 @@ def read_points(path: str | Path) -> Columns:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             header = read_header(path, file)
-            left = size - file.tell()
+            num_bytes = size - file.tell()
             if header.encoding == 'binary_compressed':
                 return compressed_columns(path, header, file)
             if header.encoding == 'binary':
-                table = binary_table(path, header, file, left)
+                table = binary_table(path, header, file, num_bytes)
             else:
                 table = read_table(path, file, header.layout, header.num_points)
             names = header.layout.names or ()
@@ -209,8 +209,8 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
         if not is_pose or abs(math.hypot(*viewpoint[3:]) ** 2 - 1.0) > MAX_SQUARE_ERROR:
             viewpoint = ORIGIN  # some programs write zeros
         fields = [
-            field_of(*stated, place)
-            for place, stated in enumerate(zip(names, kinds, sizes, counts, strict=True))
+            field_of(*stated, number)
+            for number, stated in enumerate(zip(names, kinds, sizes, counts, strict=True))
         ]
         layout = np.dtype(fields)
         if not fields or layout.itemsize > MAX_POINT_BYTES:
@@ -225,30 +225,30 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
     return PcdHeader(layout, num_points, encoding, viewpoint)
 
 
-def field_of(name: str, kind: str, size: int, count: int, place: int) -> tuple[Any, ...]:
+def field_of(name: str, kind: str, size: int, count: int, number: int) -> tuple[Any, ...]:
     """Return a field for np.dtype; padding, named _, gets a unique name."""
     if size not in SIZES[kind] or not 1 <= count <= MAX_COUNT:
         raise ValueError(f'field {name} of type {kind}, size {size}, count {count}')
-    unique = f'_{place}' if name == '_' else name
+    unique = f'_{number}' if name == '_' else name
     code = f'<{kind.lower()}{size}'
     return (unique, code) if count == 1 else (unique, code, (count,))
 
 
 def binary_table(
-    path: str | Path, header: PcdHeader, file: BinaryIO, left: int
+    path: str | Path, header: PcdHeader, file: BinaryIO, num_bytes: int
 ) -> npt.NDArray[Any]:
     """Return the points of an uncompressed file."""
     size = header.num_points * header.layout.itemsize
-    if size > left:
+    if size > num_bytes:
         raise FileFormatError(
-            f'{path}: {left} bytes after the header, expected {size} for {header.num_points} '
+            f'{path}: {num_bytes} bytes after the header, expected {size} for {header.num_points} '
             'points; truncated?'
         )
     content = file.read(size)
-    is_padded = left - size <= PADDING and not any(file.read(PADDING))
-    if left - size >= header.layout.itemsize and not is_padded:
+    is_padded = num_bytes - size <= PADDING and not any(file.read(PADDING))
+    if num_bytes - size >= header.layout.itemsize and not is_padded:
         raise FileFormatError(
-            f'{path}: {left} bytes after the header, expected {size} for {header.num_points} '
+            f'{path}: {num_bytes} bytes after the header, expected {size} for {header.num_points} '
             'points; is its header damaged?'
         )
     return np.frombuffer(content, header.layout)

@@ -367,16 +367,16 @@ def text_row(file: BinaryIO, element: Element) -> list[Any]:
 
 
 def check_size(
-    path: str | Path, element: Element, left: int, *, is_text: bool, is_last: bool
+    path: str | Path, element: Element, num_bytes: int, *, is_text: bool, is_last: bool
 ) -> None:
-    """Raise FileFormatError if an element cannot have its rows in the bytes left."""
+    """Raise FileFormatError if an element cannot have its rows in the remaining bytes."""
     row_bytes = 2 * len(element.properties) - 1 if is_text else element.layout.itemsize
     size = element.count * row_bytes
     kind = 'vertices' if element.name == 'vertex' else f'x {element.name}'
-    expected = f'{left} bytes after the header, expected {size} for {element.count} {kind}'
-    if size > left and not (is_text and not element.has_lists):  # read_table counts the rows
+    expected = f'{num_bytes} bytes after the header, expected {size} for {element.count} {kind}'
+    if size > num_bytes and not (is_text and not element.has_lists):  # read_table counts the rows
         raise FileFormatError(f'{path}: {expected}; truncated?')
-    if is_last and not is_text and not element.has_lists and left - size >= row_bytes:
+    if is_last and not is_text and not element.has_lists and num_bytes - size >= row_bytes:
         raise FileFormatError(f'{path}: {expected}; is its header damaged?')
 
 

@@ -50,16 +50,16 @@ def quaternion_rows(rows: Rows, columns: list[int] | slice) -> Floats:
         1 +- 1e-2.
 
     """
-    found = rows.numbers(columns)
+    numbers = rows.numbers(columns)
     with np.errstate(over='ignore'):
-        x, y, z, w = np.square(found[:, 3:].T)
+        x, y, z, w = np.square(numbers[:, 3:].T)
         square = ((x + y) + z) + w  # in the order of pose_matrix, which refuses the same
     for row in np.flatnonzero(np.abs(square - 1.0) > MAX_SQUARE_ERROR)[:1].tolist():
         try:
-            pose_matrix(found[row, :3], found[row, 3:].tolist())
+            pose_matrix(numbers[row, :3], numbers[row, 3:].tolist())
         except ValueError as error:
             raise FileFormatError(f'{rows.lines.where(row)}: {error}') from error
-    return found
+    return numbers
 
 
 def matrix_rows(rows: Rows, columns: list[int] | slice) -> tuple[Floats, float]:

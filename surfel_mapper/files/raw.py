@@ -125,7 +125,7 @@ def is_ordinary(values: npt.NDArray[Any]) -> bool:
 
 def has_low_words(type_: str, values: Sequence[npt.NDArray[Any]]) -> bool:
     """Return whether float32 are halves of round float64: nearly all of every second one are 0."""
-    low, high = (np.concatenate([one[at::2] for one in values]) for at in (0, 1))
+    low, high = (np.concatenate([array[at::2] for array in values]) for at in (0, 1))
     return type_ == '<f4' and (low == 0.0).mean() > 0.9 and (high == 0.0).mean() < 0.5
 
 
@@ -141,7 +141,7 @@ def best(layouts: Sequence[RawLayout], values: Sequence[npt.NDArray[Any]]) -> Ra
             scores[layout] = information(table)
     enough = max(scores.values(), default=0.0) - CLEAR_NATS - FEW / sum(map(len, values))
     equal = [layout for layout in layouts if scores.get(layout, -np.inf) >= enough]
-    return preferred if preferred in equal else min(equal or layouts, key=lambda one: one.width)
+    return preferred if preferred in equal else min(equal or layouts, key=lambda raw: raw.width)
 
 
 def repeats(table: npt.NDArray[Any]) -> bool:

@@ -102,7 +102,7 @@ class ScanSpool:
     def columns(self, number: int) -> dict[str, npt.NDArray[Any]]:
         """Return the columns of a scan."""
         layout = self._layouts[number]
-        return {name[1:]: self._read(place) for name, place in layout.items() if name}
+        return {name[1:]: self._read(entry) for name, entry in layout.items() if name}
 
     def clear(self) -> None:
         """Forget all scans and free the disk."""
@@ -126,14 +126,14 @@ class ScanSpool:
             done = 0
             while done < len(buffer):
                 try:
-                    found = os.preadv(self._file.fileno(), [buffer[done:]], offset + done)
+                    num_read = os.preadv(self._file.fileno(), [buffer[done:]], offset + done)
                 except OSError as error:
                     reason = f'{self._directory}: points of scans cannot be read: {error.strerror}'
                     raise FileFormatError(reason) from error
-                if not found:
+                if not num_read:
                     raise FileFormatError(
                         f'{self._directory}: the points of a scan end {len(buffer) - done} bytes '
                         'early; was the disk full?'
                     )
-                done += found
+                done += num_read
         return array

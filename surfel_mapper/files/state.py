@@ -148,8 +148,8 @@ def write_npy(file: IO[bytes], array: npt.NDArray[Any]) -> None:
 
 def content_sha256(manifest: Mapping[str, Any], arrays: Iterable[npt.NDArray[Any]]) -> str:
     """Return the hash of a manifest, without its own hash, and of its arrays in order."""
-    rest = {key: value for key, value in manifest.items() if key != 'sha256'}
-    content = hashlib.sha256(json.dumps(rest, sort_keys=True, allow_nan=False).encode())
+    covered = {key: value for key, value in manifest.items() if key != 'sha256'}
+    content = hashlib.sha256(json.dumps(covered, sort_keys=True, allow_nan=False).encode())
     for array in arrays:
         content.update(array.reshape(-1).view(np.uint8).data)
     return content.hexdigest()
@@ -213,10 +213,10 @@ def read_archive(
             arrays[entry['name']] = read_array(archive, info)
             yield arrays[entry['name']]
 
-    found = content_sha256(manifest, read_arrays())
-    if found != manifest['sha256'] or members:
+    sha256 = content_sha256(manifest, read_arrays())
+    if sha256 != manifest['sha256'] or members:
         raise FileFormatError(
-            f'{path}: damaged: content has sha256 {found} and {len(members)} unknown members, '
+            f'{path}: damaged: content has sha256 {sha256} and {len(members)} unknown members, '
             f'expected {manifest["sha256"]} and none'
         )
     return arrays, dict(manifest['attributes'])
@@ -249,13 +249,13 @@ def array_header(content: bytes, name: str) -> tuple[tuple[int, ...], np.dtype[A
 
     numpy evaluates the header as a Python literal; here it has to be as ``save_state`` writes it.
     """
-    found = NPY_HEADER.match(content)
-    if found is None:
+    match = NPY_HEADER.match(content)
+    if match is None:
         raise ValueError(f'{name}: not an array of numbers of format 1.0, in C order')
-    size, dtype, shape = found.groups()
+    size, dtype, shape = match.groups()
     start = len(NPY_MAGIC) + 2 + int.from_bytes(size, 'little')
-    if found.end() != start:
-        raise ValueError(f'{name}: a header of {found.end()} bytes, expected {start}')
+    if match.end() != start:
+        raise ValueError(f'{name}: a header of {match.end()} bytes, expected {start}')
     numbers = tuple(int(number) for number in shape.decode().replace(' ', '').split(',') if number)
     return numbers, np.dtype(dtype.decode()), start
 
@@ -286,8 +286,8 @@ def read_stored(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> memoryview:
     offset = info.header_offset + len(header) + name_bytes + extra_bytes
     content = np.empty(info.file_size, np.uint8).data
     filled = 0
-    while found := os.preadv(file, [content[filled:]], offset + filled):
-        filled += found
+    while num_read := os.preadv(file, [content[filled:]], offset + filled):
+        filled += num_read
     if filled < len(content):
         raise EOFError(f'{info.filename}: {len(content) - filled} bytes missing')
     return content

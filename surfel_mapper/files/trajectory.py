@@ -98,10 +98,10 @@ class Trajectory:
     def __post_init__(self) -> None:
         """Turn lists into arrays; raise ValueError if shapes or types are not as above."""
         for name, width in (('xyz', 3), ('q_xyzw', 4)):
-            found = as_numbers(name, getattr(self, name))
-            if found.ndim != 2 or found.shape[1] != width:
-                raise ValueError(f'{name}: shape {found.shape}, expected (S, {width})')
-            object.__setattr__(self, name, found)
+            numbers = as_numbers(name, getattr(self, name))
+            if numbers.ndim != 2 or numbers.shape[1] != width:
+                raise ValueError(f'{name}: shape {numbers.shape}, expected (S, {width})')
+            object.__setattr__(self, name, numbers)
         lengths = [len(self.xyz), len(self.q_xyzw)]
         if self.stamp_ns is not None:
             stamps = as_array('stamp_ns', self.stamp_ns)
@@ -276,8 +276,8 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
 
 def trajectory_beside(path: Path) -> Path | None:
     """Return the trajectory in the directory of a map, or beside its file; None without one."""
-    found = (path if path.is_dir() else path.parent) / TRAJECTORY
-    return found if found.is_file() else None
+    file = (path if path.is_dir() else path.parent) / TRAJECTORY
+    return file if file.is_file() else None
 
 
 def guessed(path: str | Path, texts: Sequence[str]) -> str:
@@ -338,9 +338,9 @@ def csv_poses(lines: TextLines) -> Trajectory:
     header = [column_name(column) for column in lines.texts[0].lstrip('# ').split(',')]
     names = [name for name, _ in header]
     stamps = [column for column, name in enumerate(names) if name in STAMP_COLUMNS]
-    parts = [[names.index(alias) for alias in aliases if alias in names] for aliases in PARTS]
+    halves = [[names.index(alias) for alias in aliases if alias in names] for aliases in PARTS]
     aliased = [[names.index(a) for a in aliases if a in names] for aliases in POSE_COLUMNS]
-    if not (stamps or all(parts)) or not all(aliased):
+    if not (stamps or all(halves)) or not all(aliased):
         raise FileFormatError(
             f'{lines.where(0)}: columns {", ".join(names)}; expected a header with stamp_s or '
             'stamp_ns (or sec, nsec), x, y, z, qx, qy, qz, qw'
@@ -350,7 +350,7 @@ def csv_poses(lines: TextLines) -> Trajectory:
         unit = header[stamps[0]][1] or unit_of_column(rows, stamps[0])
         stamp_ns = column_ns(rows, stamps[0], unit)
     else:
-        stamp_ns = column_ns(rows, parts[0][0], 's') + column_ns(rows, parts[1][0], 'ns')
+        stamp_ns = column_ns(rows, halves[0][0], 's') + column_ns(rows, halves[1][0], 'ns')
     poses = quaternion_rows(rows, [columns[0] for columns in aliased])
     return stamped_poses(rows.lines, stamp_ns, poses)
 

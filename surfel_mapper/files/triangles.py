@@ -52,19 +52,19 @@ def read_triangles(path: Path) -> Mesh:
     trimesh = import_trimesh()
     try:
         scene = trimesh.load_scene(path, process=False)
-        found = scene.to_mesh() if scene.geometry else trimesh.Trimesh()
+        mesh = scene.to_mesh() if scene.geometry else trimesh.Trimesh()
     except MemoryError:
         raise
     except Exception as error:  # those of many decoders
         raise FileFormatError(f'{path}: no {path.suffix[1:]} file: {error}') from error
-    if not len(found.faces):
+    if not len(mesh.faces):
         raise FileFormatError(f'{path}: no triangles')
     if path.suffix.lower() in GLTF:
-        found.apply_transform(Y_UP.T)
+        mesh.apply_transform(Y_UP.T)
     return Mesh(
-        vertices=np.asarray(found.vertices, np.float64),
-        triangles=np.asarray(found.faces, np.int32),
-        colors=vertex_colors(found.visual),
+        vertices=np.asarray(mesh.vertices, np.float64),
+        triangles=np.asarray(mesh.faces, np.int32),
+        colors=vertex_colors(mesh.visual),
     )
 
 

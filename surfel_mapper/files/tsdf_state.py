@@ -103,10 +103,10 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
     if attributes.get('kind') != KIND:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
     for name in SHAPE:
-        found, wanted = attributes.get(name), getattr(config, name)
-        if found != wanted:
+        value, wanted = attributes.get(name), getattr(config, name)
+        if value != wanted:
             raise FileFormatError(
-                f'{path}: {name} {found}, expected layers.tsdf.{name} = {wanted}'
+                f'{path}: {name} {value}, expected layers.tsdf.{name} = {wanted}'
             )
     blocks = BlockMap(config)
     with refusing(path, FileFormatError):
