@@ -132,7 +132,7 @@ class MessageWriter:
     """Collects the members of a message in little-endian CDR, each aligned, and joins them."""
 
     def __init__(self) -> None:
-        self._parts: list[bytes | memoryview] = []
+        self._chunks: list[bytes | memoryview] = []
         self._size = 0
 
     def numbers(self, code: str, *values: float) -> None:
@@ -159,16 +159,16 @@ class MessageWriter:
     def append(self, content: bytes | memoryview, alignment: int) -> None:
         """Write serialised bytes at a multiple of ``alignment`` bytes."""
         padding = bytes(-self._size % alignment)
-        self._parts += [padding, content]
+        self._chunks += [padding, content]
         self._size += len(padding) + len(content)
 
     def content(self) -> bytes:
         """Return the members without the CDR header."""
-        return b''.join(self._parts)
+        return b''.join(self._chunks)
 
     def join(self) -> bytes:
         """Return the message with the CDR header."""
-        return b''.join([LITTLE_ENDIAN_CDR, *self._parts])
+        return b''.join([LITTLE_ENDIAN_CDR, *self._chunks])
 
 
 def read_header(reader: MessageReader) -> Header:

@@ -99,7 +99,7 @@ def unpacked(msg: Any, topic: str, *, exact: bool, size: tuple[int, int] | None 
     """
     if not hasattr(msg, 'format'):
         return msg
-    encoding, _, packing = (part.strip() for part in str(msg.format).partition(';'))
+    encoding, _, packing = (word.strip() for word in str(msg.format).partition(';'))
     try:
         data = bytes(memoryview(msg.data))
     except (TypeError, ValueError, BufferError) as error:
@@ -134,11 +134,11 @@ def depth_of(
     if len(data) < DEPTH_HEADER.itemsize:
         raise CloudFormatError(f'{topic}: {len(data)} bytes, expected a header and a PNG')
     header = np.frombuffer(data, DEPTH_HEADER, 1)[0]
-    found, steps = pixels_of(data[DEPTH_HEADER.itemsize :], topic, ('PNG',), size)
-    if found != '16UC1':
-        raise CloudFormatError(f'{topic}: a PNG of {found}, expected one of 16 bits')
+    actual, steps = pixels_of(data[DEPTH_HEADER.itemsize :], topic, ('PNG',), size)
+    if actual != '16UC1':
+        raise CloudFormatError(f'{topic}: a PNG of {actual}, expected one of 16 bits')
     if encoding != '32FC1':
-        return found, steps
+        return actual, steps
     scale, offset = header['quantum']
     with np.errstate(all='ignore'):
         depth = scale / (steps.astype(np.float32) - offset)
@@ -181,8 +181,8 @@ def checked_scans(data: bytes, topic: str) -> int:
 
 def bytes_of(mode: str, num_scans: int) -> int:
     """Return the memory that decoding takes per pixel, of an image in a mode of Pillow."""
-    known = COLOR_BYTES if mode == 'RGB' else GREY_BYTES
-    decoded = known if mode in ENCODINGS else CONVERTED_BYTES
+    plain = COLOR_BYTES if mode == 'RGB' else GREY_BYTES
+    decoded = plain if mode in ENCODINGS else CONVERTED_BYTES
     return decoded + SCANS_BYTES * (num_scans > 1)
 
 

@@ -120,8 +120,8 @@ def camera_in(msg: Any, topic: str = 'camera_info') -> PinholeCamera:
 
 def matrix_in(msg: Any, name: str) -> list[float]:
     """Return a matrix of a message, row by row; in ROS 1 its name is in capitals."""
-    found = getattr(msg, name) if hasattr(msg, name) else getattr(msg, name.upper(), ())
-    return [float(value) for value in found]
+    values = getattr(msg, name) if hasattr(msg, name) else getattr(msg, name.upper(), ())
+    return [float(value) for value in values]
 
 
 def depth_scan(image: CameraImage, topic: str = 'depth') -> Scan:
@@ -298,8 +298,8 @@ def scene_image(kind: str, image: CameraImage, topic: str) -> SceneImage:
 def colors_in(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
     """Return the colours of an image, (H, W, 3) uint8: red, green, blue."""
     if msg.encoding not in COLORS:
-        known = ', '.join(COLORS)
-        raise CloudFormatError(f'{topic}: encoding {msg.encoding!r}, expected one of {known}')
+        names = ', '.join(COLORS)
+        raise CloudFormatError(f'{topic}: encoding {msg.encoding!r}, expected one of {names}')
     channels, order = COLORS[msg.encoding]
     return np.ascontiguousarray(pixels_in(msg, topic, 'u1', channels)[:, :, order])
 
@@ -307,6 +307,6 @@ def colors_in(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
 def labels_in(msg: Any, topic: str) -> npt.NDArray[np.int32]:
     """Return the labels of an image, (H, W) int32."""
     if msg.encoding not in LABELS:
-        known = ', '.join(LABELS)
-        raise CloudFormatError(f'{topic}: encoding {msg.encoding!r}, expected one of {known}')
+        names = ', '.join(LABELS)
+        raise CloudFormatError(f'{topic}: encoding {msg.encoding!r}, expected one of {names}')
     return pixels_in(msg, topic, LABELS[msg.encoding])[:, :, 0].astype(np.int32)

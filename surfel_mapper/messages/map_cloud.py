@@ -162,7 +162,7 @@ def moments_in(columns: Columns, voxel_size_m: float, channels: tuple[str, ...])
     count = columns['num_points'].astype(np.int64)
     check_size(columns, index, count > 0, voxel_size_m)
     sums = np.stack([whole(columns[name]) for name in names], axis=1)
-    total, product, view, rest = np.split(sums, (3, 9, 12), axis=1)
+    total, product, view, channel_sums = np.split(sums, (3, 9, 12), axis=1)
     return ScanMoments(
         voxel_size_m=voxel_size_m,
         key=pack_keys(index),
@@ -171,7 +171,7 @@ def moments_in(columns: Columns, voxel_size_m: float, channels: tuple[str, ...])
         product=np.ascontiguousarray(product),
         view=np.ascontiguousarray(view),
         channel_names=channels,
-        channels=np.ascontiguousarray(rest),
+        channels=np.ascontiguousarray(channel_sums),
     )
 
 

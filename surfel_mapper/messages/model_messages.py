@@ -248,8 +248,8 @@ def quaternions(R: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return rotations (K, 3, 3) as quaternions xyzw (K, 4)."""
     if not len(R):  # older versions of scipy refuse empty arrays
         return np.empty((0, 4))
-    found: npt.NDArray[np.float64] = Rotation.from_matrix(R).as_quat()
-    return found
+    q_xyzw: npt.NDArray[np.float64] = Rotation.from_matrix(R).as_quat()
+    return q_xyzw
 
 
 def surfel_primitive_columns(surfels: Surfels, model: MultiModel) -> Columns:
@@ -273,12 +273,12 @@ def surfel_primitive_columns(surfels: Surfels, model: MultiModel) -> Columns:
         **{surface.id: SURFACE for surface in model.surfaces},
         **dict.fromkeys(model.gaussians.id.tolist(), GAUSSIAN),
     }
-    used, place = np.unique(model.labels, return_inverse=True)
-    found = np.array([kinds[number] for number in used.tolist()], np.uint8)
+    used, inverse = np.unique(model.labels, return_inverse=True)
+    used_kinds = np.array([kinds[number] for number in used.tolist()], np.uint8)
     columns = np.concatenate([surfels.position, surfels.normal], axis=1).astype(np.float32)
     names = (*'xyz', 'normal_x', 'normal_y', 'normal_z')
     return {
         **dict(zip(names, columns.T, strict=True)),
         'primitive': model.labels,
-        'kind': found[place] if len(used) else np.empty(0, np.uint8),
+        'kind': used_kinds[inverse] if len(used) else np.empty(0, np.uint8),
     }

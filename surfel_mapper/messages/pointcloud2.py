@@ -196,8 +196,8 @@ def checked_fields(msg: Any, topic: str) -> dict[str, Field]:
     if len(msg.fields) > MAX_FIELDS:
         raise CloudFormatError(f'{topic}: {len(msg.fields)} fields, expected at most {MAX_FIELDS}')
     fields: dict[str, Field] = {}
-    for found in msg.fields:
-        field = Field(found.name, int(found.offset), int(found.datatype), int(found.count) or 1)
+    for raw in msg.fields:
+        field = Field(raw.name, int(raw.offset), int(raw.datatype), int(raw.count) or 1)
         if field.datatype not in DTYPES:
             raise CloudFormatError(
                 f'{topic}: field {field.name!r} has datatype {field.datatype}, '
@@ -332,16 +332,16 @@ def packed(
     views: tuple[npt.NDArray[Any], ...], num_points: int, dtype: np.dtype[Any]
 ) -> npt.NDArray[Any]:
     """Return three views of all points as a new (N, 3) array in Fortran order."""
-    found: npt.NDArray[Any] = np.empty((num_points, 3), dtype, order='F')
+    points: npt.NDArray[Any] = np.empty((num_points, 3), dtype, order='F')
     if views[0].ndim > 1:
         for axis, values in enumerate(views):
-            found[:, axis].reshape(values.shape)[...] = values
-        return found
+            points[:, axis].reshape(values.shape)[...] = values
+        return points
     for start in range(0, num_points, BLOCK):
         rows = slice(start, start + BLOCK)
         for axis, values in enumerate(views):
-            found[rows, axis] = values[rows]
-    return found
+            points[rows, axis] = values[rows]
+    return points
 
 
 def from_columns(columns: Mapping[str, npt.NDArray[Any]]) -> CloudBytes:

@@ -53,8 +53,8 @@ def scan_with_normals(
         Voxels with fewer points are no surfels.
 
     """
-    seen = surfel_map.reduce(scan.points, T_map_sensor, columns=scan.columns).key
-    rows = surfel_map.find(seen)
+    keys = surfel_map.reduce(scan.points, T_map_sensor, columns=scan.columns).key
+    rows = surfel_map.find(keys)
     surfels = surfel_map.surfels_of(rows[rows >= 0])
     surfels = surfels.select(surfels.num_points >= min_points)
     added = surfels_of_points(scan, T_map_sensor, surfels, surfel_map.voxel_size_m)
@@ -112,15 +112,15 @@ def extended_cloud(msg: Any, added: npt.NDArray[np.float32]) -> CloudBytes:
         From surfels_of_points, one row per point.
 
     """
-    taken = {field.name for field in msg.fields}
+    names = {field.name for field in msg.fields}
     types = [FLOAT32] * (len(ADDED) - 1) + [UINT32]
-    fields = [(unused(name, taken), type_, 1) for name, type_ in zip(ADDED, types, strict=True)]
+    fields = [(unused(name, names), type_, 1) for name, type_ in zip(ADDED, types, strict=True)]
     return replace(append_fields(msg, added.view(np.uint32), fields), is_dense=False)
 
 
-def unused(name: str, taken: set[str]) -> str:
-    """Return a field name with as many prefixes as it takes to be none of those taken."""
-    while name in taken:
+def unused(name: str, names: set[str]) -> str:
+    """Prefix a field name until it is none of the names."""
+    while name in names:
         name = f'surfel_{name}'
     return name
 

@@ -177,10 +177,10 @@ def disc_colors(
         return normal_colors(surfels.normal)
     if kind == 'planarity':
         return shades(surfels.planarity)
-    held = list(scans)
-    stamps = [scan.stamp_ns for scan in held] or [0]
+    window = list(scans)
+    stamps = [scan.stamp_ns for scan in window] or [0]
     span_ns = max(max(stamps) - min(stamps), 1)
-    last_ns = (ages or Ages()).last_seen_ns(surfels.voxel_index, held)
+    last_ns = (ages or Ages()).last_seen_ns(surfels.voxel_index, window)
     return shades((last_ns - min(stamps)) / span_ns)
 
 

@@ -31,7 +31,7 @@ def attach_surfels(xyz, quantisation, surfels, keys, table, floats, counts):
     x, y, z = xyz
     shift = hash_shift(len(table))
     chunk_keys = np.empty(CHUNK, np.int64)
-    places = np.empty(CHUNK, np.int64)
+    packed = np.empty(CHUNK, np.int64)
     for start in range(0, len(x), CHUNK):
         end = min(start + CHUNK, len(x))
         quantise(
@@ -42,7 +42,7 @@ def attach_surfels(xyz, quantisation, surfels, keys, table, floats, counts):
             scale,
             range_sq,
             chunk_keys,
-            places,
+            packed,
         )
         key, row = np.int64(-1), np.int64(-1)
         for i in range(start, end):
