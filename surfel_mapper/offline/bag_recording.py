@@ -41,7 +41,7 @@ from surfel_mapper.offline.pose_sources import (
     static_topics,
     static_transforms,
 )
-from surfel_mapper.offline.request import part, Request, Span, WHOLE
+from surfel_mapper.offline.request import Request, Span, span_of, WHOLE
 from surfel_mapper.offline.survey import depth_topics
 
 if TYPE_CHECKING:  # they load the compiler, which `info` does not need
@@ -102,7 +102,7 @@ class BagRecording:
         if self.poses.kinds or (config.pose.source == 'registration' and path is None):
             self.clocks = clock_offsets(sample(), self.topics, self.poses.kinds or None)
         self.config = config
-        self.span = part(
+        self.span = span_of(
             str(request.path),
             reader.start_ns,
             reader.end_ns,
@@ -136,21 +136,21 @@ class BagRecording:
         """Return the source of the poses."""
         topics = self.reader.topics
         if path is None:
-            found = pose_topics(topics, config, name, self.topics, request.static_topics)
+            chosen = pose_topics(topics, config, name, self.topics, request.static_topics)
         elif request.pose_topic is not None:
             raise BagError(f'{request.path}: poses of {request.pose_topic} or of {path.path}?')
         elif not path.has_stamps and len(self.topics) > 1:
             raise BagError(f'{path.path}: poses without times, for several topics of clouds')
         else:
             static = static_topics(topics, self.topics, request.static_topics)
-            found = PoseTopics({}, () if config.frames.base_to_sensor else static, path)
+            chosen = PoseTopics({}, () if config.frames.base_to_sensor else static, path)
         if request.mounts and config.pose.source != 'tf':
-            found = replace(found, static=())  # two poses of one sensor might disagree
+            chosen = replace(chosen, static=())  # two poses of one sensor might disagree
         unstamped = frozenset(
-            name for name in (*self.topics, *found.kinds) if is_unstamped(self.reader, name)
+            name for name in (*self.topics, *chosen.kinds) if is_unstamped(self.reader, name)
         )
         own_ns = {topic: round(1e9 * seconds) for topic, seconds in request.time_offsets.items()}
-        return replace(found, mounts=request.mounts, offsets_ns=own_ns, unstamped=unstamped)
+        return replace(chosen, mounts=request.mounts, offsets_ns=own_ns, unstamped=unstamped)
 
     @property
     def num_scans(self) -> int:
@@ -301,7 +301,7 @@ def feed(
     clouds = {cloud_topics} if isinstance(cloud_topics, str) else set(cloud_topics)
     static = add_static(reader, mapper, poses)
     first = numbers_before(reader, clouds, poses, span)
-    seen: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
 
     def add(message: BagMessage, number: int, decode: Decode = to_scan) -> None:
         add_cloud(reader, mapper, message, poses, number, decode)
@@ -310,10 +310,10 @@ def feed(
     infos = images.info_topics if images else {}
     scenes = scene_feed(mapper)
     scene_topics = scenes.topics if scenes else set()
-    found = messages(reader, {*clouds, *infos, *scene_topics}, poses, span)
+    stream = messages(reader, {*clouds, *infos, *scene_topics}, poses, span)
     while not stopped():
         with mapper.counters.timed('read'):
-            message = next(found, None)
+            message = next(stream, None)
         if message is None:
             break
         if scenes and message.topic in scene_topics:
@@ -324,10 +324,10 @@ def feed(
             with mapper.counters.timed('poses'):
                 add_poses(reader, mapper, message, poses, static)
         elif span.holds(message.record_ns):
-            if seen[message.topic] % span.every == 0:
-                number = first[message.topic] + seen[message.topic]
+            if counts[message.topic] % span.every == 0:
+                number = first[message.topic] + counts[message.topic]
                 (images.add_image if images else add)(message, number)
-            seen[message.topic] += 1
+            counts[message.topic] += 1
         yield from mapper.insert_ready(more_follows=True)
     if scenes:
         mapper.end_images()

@@ -133,9 +133,9 @@ def find_dataset(path: Path) -> Dataset | None:
     if not path.is_dir():
         return None
     for recognise in LAYOUTS:
-        found = recognise(path)
-        if found is not None:
-            return found
+        dataset = recognise(path)
+        if dataset is not None:
+            return dataset
     return None
 
 
@@ -144,20 +144,20 @@ def kitti_odometry(path: Path) -> Dataset | None:
     files, times = scans_in(path / 'velodyne', '.bin'), path / 'times.txt'
     if not files or not times.is_file():
         return None
-    stamps_ns = taken(times, read_times(times), files).tolist()
+    stamps_ns = scan_rows(times, read_times(times), files).tolist()
     candidates = (path / 'poses.txt', path.parent.parent / 'poses' / f'{path.name}.txt')
-    poses_path = next((each for each in candidates if each.is_file()), None)
+    poses_path = next((file for file in candidates if file.is_file()), None)
     mount = calibration(path / 'calib.txt').get('Tr')
     if poses_path is None:
         return Dataset('KITTI odometry', files, stamps_ns)
     if mount is None:
         missing = f'{poses_path} is not used: {lacking(path / "calib.txt", "Tr")}'
         return Dataset('KITTI odometry', files, stamps_ns, missing=missing)
-    cameras = taken(poses_path, read_trajectory(poses_path, 'kitti').matrices, files)
+    cameras = scan_rows(poses_path, read_trajectory(poses_path, 'kitti').matrices, files)
     T_cam_velo = rigid(path / 'calib.txt', mount)
     poses = np.linalg.inv(T_cam_velo) @ cameras @ T_cam_velo
-    found = trajectory(times, stamps_ns, poses)
-    return Dataset('KITTI odometry', files, stamps_ns, found, poses_path)
+    motion = trajectory(times, stamps_ns, poses)
+    return Dataset('KITTI odometry', files, stamps_ns, motion, poses_path)
 
 
 def kitti_raw(path: Path) -> Dataset | None:
@@ -166,7 +166,7 @@ def kitti_raw(path: Path) -> Dataset | None:
     files, times = scans_in(folder / 'data', '.bin'), folder / 'timestamps.txt'
     if not files or not times.is_file():
         return None
-    stamps_ns = taken(times, read_dates(times), files).tolist()
+    stamps_ns = scan_rows(times, read_dates(times), files).tolist()
     drive = folder.parent
     measured = drive / 'oxts' / 'data'
     names = {file.name for file in scans_in(measured, '.txt')}
@@ -187,8 +187,8 @@ def kitti_raw(path: Path) -> Dataset | None:
         )
     T_velo_imu = rigid(calibrated, np.column_stack([R.reshape(3, 3), t]).ravel())
     lidar = np.array(oxts_poses(oxts)) @ np.linalg.inv(T_velo_imu)
-    found = trajectory(times, stamps_ns, lidar)
-    return Dataset('KITTI raw', files, stamps_ns, found, measured)
+    motion = trajectory(times, stamps_ns, lidar)
+    return Dataset('KITTI raw', files, stamps_ns, motion, measured)
 
 
 def nuscenes(path: Path) -> Dataset | None:
@@ -206,8 +206,8 @@ def nuscenes(path: Path) -> Dataset | None:
     if tables is None:
         return Dataset('nuScenes', files, stamps_ns, read=read_scan)
     poses = np.array(nuscenes_poses(tables, files))
-    found = trajectory(tables, stamps_ns, poses)
-    return Dataset('nuScenes', files, stamps_ns, found, tables, read_scan)
+    motion = trajectory(tables, stamps_ns, poses)
+    return Dataset('nuScenes', files, stamps_ns, motion, tables, read_scan)
 
 
 def nuscenes_poses(tables: Path, files: Sequence[Path]) -> list[Floats]:
@@ -351,10 +351,10 @@ def newer_college(path: Path) -> Dataset | None:
         return None
     stamps_ns = []
     for file in files:
-        second, _, rest = file.stem.removeprefix('cloud_').partition('_')
-        if not (second.isdecimal() and rest.isdecimal() and len(second) < 11 and len(rest) < 10):
+        second, _, nano = file.stem.removeprefix('cloud_').partition('_')
+        if not (second.isdecimal() and nano.isdecimal() and len(second) < 11 and len(nano) < 10):
             raise FileFormatError(f'{file}: expected a name cloud_SECONDS_NANOSECONDS.pcd')
-        stamps_ns.append(int(second) * 10**9 + int(rest))
+        stamps_ns.append(int(second) * 10**9 + int(nano))
     return Dataset('Newer College', files, stamps_ns)
 
 
@@ -449,18 +449,18 @@ def json_of(path: Path) -> list[dict[str, Any]]:
 
 def calibration(path: Path) -> dict[str, Floats]:
     """Return the numbers of a file of lines NAME: NUMBERS; empty without the file."""
-    found: dict[str, Floats] = {}
+    numbers: dict[str, Floats] = {}
     if not path.is_file():
-        return found
+        return numbers
     if path.stat().st_size > MAX_CALIBRATION_BYTES:
         raise FileFormatError(f'{path}: larger than {MAX_CALIBRATION_BYTES} bytes')
     for line in read_lines(path).texts:
-        name, _, rest = line.partition(':')
+        name, _, values = line.partition(':')
         try:
-            found[name.strip()] = np.array(rest.split(), np.float64)
+            numbers[name.strip()] = np.array(values.split(), np.float64)
         except ValueError:  # the date of the calibration
             continue
-    return found
+    return numbers
 
 
 def lacking(path: Path, names: str) -> str:
@@ -480,7 +480,7 @@ def rigid(path: Path, numbers: npt.ArrayLike) -> Floats:
     return np.asarray(poses[0], np.float64)
 
 
-def taken(path: Path, rows: npt.NDArray[Any], files: Sequence[Path]) -> npt.NDArray[Any]:
+def scan_rows(path: Path, rows: npt.NDArray[Any], files: Sequence[Path]) -> npt.NDArray[Any]:
     """Return the row of each scan; raise FileFormatError if not all scans have one."""
     numbers = rows_of(files, len(rows))
     if numbers is None:

@@ -110,7 +110,7 @@ def filter_clouds(
 
     """
     work = _Work(chain, topics, T_base_sensor, show)
-    pairs = list(outputs_of([Path(each) for each in inputs], Path(output)))
+    pairs = list(outputs_of([Path(path) for path in inputs], Path(output)))
     sources: dict[Path, Path] = {}
     for source, target in pairs:
         if target in sources:
@@ -151,14 +151,14 @@ def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
             raise FileFormatError(f'{output}: expected a file ending in {" or ".join(WRITTEN)}')
         yield inputs[0], output
         return
-    for each in inputs:
-        if is_bag(each):
-            yield each, output / (each.name if each.is_dir() else each.stem)
+    for source in inputs:
+        if is_bag(source):
+            yield source, output / (source.name if source.is_dir() else source.stem)
             continue
-        files = scan_files(each) if each.is_dir() else [each]
+        files = scan_files(source) if source.is_dir() else [source]
         if not files:
             raise FileFormatError(
-                f'{each}: no bag, no scans in it; expected files ending in {", ".join(SUFFIXES)}'
+                f'{source}: no bag, no scans in it; expected files ending in {", ".join(SUFFIXES)}'
             )
         for file in files:
             suffix = file.suffix if file.suffix.lower() in WRITTEN else '.ply'
@@ -175,13 +175,13 @@ def definitions_of(reader: BagReader) -> dict[str, tuple[str, str] | None]:
     for topic in reader.topics:
         if topic.count:
             topics.setdefault(topic.type, []).append(topic.name)
-    found: dict[str, tuple[str, str] | None] = {}
+    definitions: dict[str, tuple[str, str] | None] = {}
     for type_, names in topics.items():
         try:
-            found |= dict.fromkeys(names, reader.definition(type_))
+            definitions |= dict.fromkeys(names, reader.definition(type_))
         except BagError as error:
             log.warning('%s; topics left out: %s', error, ', '.join(names))
-    return found
+    return definitions
 
 
 class _Work:
@@ -260,15 +260,15 @@ class _Work:
 
     def _filtered(self, scan: Scan) -> Scan:
         """Return the scan filtered, and count it."""
-        found, steps = self.chain.run(replace(scan, T_base_sensor=self.pose))
+        filtered, steps = self.chain.run(replace(scan, T_base_sensor=self.pose))
         for step in steps:
             self.counters.add_filter(
                 step.name, step.points_in, step.points_out, step.milliseconds, step.not_finite
             )
         self.done.scans += 1
         self.done.points_in += len(scan)
-        self.done.points_out += len(found)
-        return found
+        self.done.points_out += len(filtered)
+        return filtered
 
     def _cloud_topics(self, reader: BagReader) -> tuple[str, ...]:
         """Return the topics of a bag to filter."""

@@ -99,7 +99,7 @@ class OusterPcap:
         """
         try:
             frame = self._frames.frame(number)
-            points = np.asarray(self._frames.place(frame)).reshape(-1, 3)
+            points = np.asarray(self._frames.to_points(frame)).reshape(-1, 3)
             fields = {name: frame.field(name).ravel() for name in frame.fields}
             is_valid = (np.asarray(frame.status) & 1).astype(bool)
             times_ns = np.asarray(frame.timestamp).astype(np.int64)
@@ -127,7 +127,7 @@ class Frames(NamedTuple):
     stamps_ns: list[int]
     frame: Callable[[int], Any]
     """Returns the columns of the scan of a number."""
-    place: Callable[[Any], npt.NDArray[Any]]
+    to_points: Callable[[Any], npt.NDArray[Any]]
     """Returns the points of such a scan, m, in the frame of the sensor."""
 
 

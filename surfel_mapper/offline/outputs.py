@@ -86,9 +86,9 @@ def check_layer_formats(names: Sequence[str], config: Config) -> None:
     """
     from surfel_mapper.layers import formats, load
 
-    found = formats()
-    for name in (name for name in names if name in found):
-        layer = found[name]
+    by_format = formats()
+    for name in (name for name in names if name in by_format):
+        layer = by_format[name]
         if layer.switch and not config.to_mapping()[layer.switch]:
             raise ConfigError(
                 f'formats: {name} is written by the layer {layer.name}, expected {layer.switch}: '
@@ -137,7 +137,7 @@ def check_not_scans(recording: Path, directory: Path) -> None:
 
 
 def check_distinct(
-    recording: Path, wanted: Path | None, formats: Sequence[str], others: Mapping[str, Path | None]
+    recording: Path, wanted: Path | None, formats: Sequence[str], extra: Mapping[str, Path | None]
 ) -> None:
     """
     Raise FileFormatError if two outputs of a replay have the same path.
@@ -150,7 +150,7 @@ def check_distinct(
         The output directory asked for.
     formats : sequence of str
         Formats of the map and of layers.
-    others : mapping of str to Path
+    extra : mapping of str to Path
         Files beside the directory, by their options.
 
     """
@@ -159,16 +159,16 @@ def check_distinct(
     directory = output_directory(recording, wanted)
     files = known_formats()
     names = [*(files[name] for name in formats), TRAJECTORY, SCANS, 'map.png', 'report.html']
-    taken = {os.path.realpath(directory / n): str(directory / n) for n in (*names, 'summary.json')}
-    for option, path in others.items():
+    paths = {os.path.realpath(directory / n): str(directory / n) for n in (*names, 'summary.json')}
+    for option, path in extra.items():
         if path is None:
             continue
         full = os.path.realpath(path)
-        if full in taken:
+        if full in paths:
             raise FileFormatError(
-                f'{option} {path}: this replay writes {taken[full]} too, expected another file'
+                f'{option} {path}: this replay writes {paths[full]} too, expected another file'
             )
-        taken[full] = f'{path} for {option}'
+        paths[full] = f'{path} for {option}'
 
 
 def check_writable(path: Path) -> None:
@@ -257,10 +257,10 @@ class ScanTrajectory:
         """Replace the poses of scans that loops or the alignment of the window have moved."""
         if mapper.loops is not None and mapper.loops.stamps_ns == self.stamps_ns:
             self.poses = list(mapper.loops.T_map_sensor)
-        for place, scan in enumerate(reversed(list(mapper.window)), start=1):
-            if place > len(self.stamps_ns) or self.stamps_ns[-place] != scan.stamp_ns:
+        for back, scan in enumerate(reversed(list(mapper.window)), start=1):
+            if back > len(self.stamps_ns) or self.stamps_ns[-back] != scan.stamp_ns:
                 break
-            self.poses[-place] = scan.T_map_sensor
+            self.poses[-back] = scan.T_map_sensor
 
     def write(self, path: Path) -> None:
         """Write the poses in the fixed frame as TUM text."""
@@ -319,19 +319,19 @@ def write_maps(
     trajectory.write(output / TRAJECTORY)
     for old in (*output.glob('apart_*.npz'), *output.glob('apart_*.tum')):
         old.unlink()
-    for number, part in enumerate(mapper.registered.apart if mapper.registered else (), start=1):
-        write_apart(output / f'apart_{number}', part)
+    for number, apart in enumerate(mapper.registered.apart if mapper.registered else (), start=1):
+        write_apart(output / f'apart_{number}', apart)
 
 
-def write_apart(path: Path, part: ApartMap) -> None:
+def write_apart(path: Path, apart: ApartMap) -> None:
     """Write a part of the map that stayed apart, and the poses on it, to path.npz and .tum."""
     import numpy as np
 
     from surfel_mapper.files.map_state import save_map
     from surfel_mapper.files.trajectory import write_tum
 
-    save_map(path.with_suffix('.npz'), part.map)
-    write_tum(path.with_suffix('.tum'), list(part.stamps_ns), np.array(part.poses))
+    save_map(path.with_suffix('.npz'), apart.map)
+    write_tum(path.with_suffix('.tum'), list(apart.stamps_ns), np.array(apart.poses))
 
 
 def write_files(
@@ -381,8 +381,8 @@ def write_files(
     )
     origin_m = mapper.map.origin_m
     draw_map(surfels, picture, title, trajectory=trajectory.positions, origin_m=origin_m)
-    place = trajectory.positions[-1] if trajectory.stamps_ns else (0.0, 0.0, 0.0)
-    in_view = drawn_surfels(mapper.map, mapper.config.map.min_points, place, most_shown(meshes))
+    target = trajectory.positions[-1] if trajectory.stamps_ns else (0.0, 0.0, 0.0)
+    in_view = drawn_surfels(mapper.map, mapper.config.map.min_points, target, most_shown(meshes))
     write_report(page, title, summary, surfels, history, picture, meshes, sections, in_view)
     write_outcomes(output / SCANS, mapper.outcomes or [])
     write_json(figures, summary)

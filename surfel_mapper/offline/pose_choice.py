@@ -230,7 +230,7 @@ def source_of(offer: Offer) -> str:
     return str(offer.settings['pose.source'])
 
 
-def is_usable(offer: Offer, found: Survey) -> bool:
+def is_usable(offer: Offer, surveyed: Survey) -> bool:
     """
     Return whether a source gives poses of a moving sensor.
 
@@ -242,8 +242,8 @@ def is_usable(offer: Offer, found: Survey) -> bool:
     fixed = offer.settings['frames.fixed']
     if source_of(offer) != 'tf' or fixed in ('odom', 'map'):
         return True
-    frames = [frame for clouds, frame in found.stamps if clouds == offer.clouds]
-    static = found.static_for(offer.clouds, offer.poses)
+    frames = [frame for clouds, frame in surveyed.stamps if clouds == offer.clouds]
+    static = surveyed.static_for(offer.clouds, offer.poses)
     return not any(fixed == frame or mounting(static, fixed, frame) for frame in frames)
 
 
@@ -251,9 +251,9 @@ def sampled(reader: BagReader, offsets_ns: Mapping[str, int]) -> Survey:
     """Return a survey of the first clouds of a bag, with offsets added to their stamps."""
     length_ns = SAMPLE_NS
     while True:
-        found = survey(reader, stop_ns=reader.start_ns + length_ns, offsets_ns=offsets_ns)
-        if found.stamps or reader.start_ns + length_ns > reader.end_ns:
-            return found
+        first_clouds = survey(reader, stop_ns=reader.start_ns + length_ns, offsets_ns=offsets_ns)
+        if first_clouds.stamps or reader.start_ns + length_ns > reader.end_ns:
+            return first_clouds
         length_ns *= 4
 
 

@@ -252,8 +252,8 @@ def static_topics(
         return tuple(topics.choose(TF, name) for name in chosen)
     own = [topic for topic in static if any(shares_namespace(topic, name) for name in names)]
     foreign = [cloud for cloud in topics.of_type(*topics.clouds) if names and cloud not in names]
-    rest = [t for t in static if not any(shares_namespace(t, cloud) for cloud in foreign)]
-    return tuple(own or rest)
+    unowned = [t for t in static if not any(shares_namespace(t, cloud) for cloud in foreign)]
+    return tuple(own or unowned)
 
 
 def shares_namespace(topic: str, name: str) -> bool:
@@ -282,12 +282,12 @@ def static_transforms(
                 first.setdefault((message.topic, pose.child), pose._replace(stamp_ns=0))
     by_child: dict[str, tuple[str, StampedPose]] = {}
     for (topic, child), pose in first.items():
-        other, agreed = by_child.setdefault(child, (topic, pose))
+        first_topic, agreed = by_child.setdefault(child, (topic, pose))
         if agreed.parent != pose.parent or not np.allclose(
             [*agreed.xyz, *agreed.q_xyzw], [*pose.xyz, *pose.q_xyzw], atol=SAME_PLACE, rtol=0.0
         ):
             raise BagError(
-                f'{reader.path}: {other} and {topic} disagree about the frame {child}: '
+                f'{reader.path}: {first_topic} and {topic} disagree about the frame {child}: '
                 f'{placed(agreed)}, {placed(pose)}; --static-topic chooses one, --mount gives the '
                 'place of a sensor'
             )
@@ -301,9 +301,9 @@ def placed(pose: StampedPose) -> str:
 
 def offered_sources(topics: Topics) -> str:
     """Return the pose sources that a bag has messages for, for an error."""
-    found = [
+    sources = [
         f'{source} ({", ".join(topics.of_type(*types))})'
         for source, types in TYPES.items()
         if topics.of_type(*types)
     ]
-    return ', '.join(found) or 'no poses at all; identity maps clouds that are in a fixed frame'
+    return ', '.join(sources) or 'no poses at all; identity maps clouds that are in a fixed frame'

@@ -187,7 +187,7 @@ def replay(
             trajectory.follow_alignment(mapper)
             write_maps(directory, options.formats, mapper, trajectory, window=options.window)
             mapper.finish_layers()
-        found = {
+        figures = {
             **recording.describe(),
             'recorded_s': recording.recorded_s,
             'replay_s': replay_s,
@@ -200,7 +200,7 @@ def replay(
             **mapper.summary(),
             'settings': mapper.config.to_mapping(),
         }
-        summary = finite_or_none(found)
+        summary = finite_or_none(figures)
     if options.poses_out is not None:
         trajectory.write(options.poses_out)
     written = write_files(directory, options.formats, mapper, trajectory, summary, history)
@@ -219,10 +219,10 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
             'Config.from_mapping(settings) takes a dict'
         )
     settings = config if isinstance(config, Config) else load_config(config)
-    known = known_formats()
-    unknown = [name for name in options.formats if name not in known]
+    formats = known_formats()
+    unknown = [name for name in options.formats if name not in formats]
     if unknown:
-        raise ConfigError(f'formats: {unknown[0]!r}, expected some of {", ".join(known)}')
+        raise ConfigError(f'formats: {unknown[0]!r}, expected some of {", ".join(formats)}')
     check_layer_formats(options.formats, settings)
     if options.align:
         settings = settings.replace({'window.keep_points': True})
@@ -322,9 +322,9 @@ def listeners(
     from surfel_mapper.offline.outputs import BAG
 
     with ExitStack() as files:
-        found = viewers(options, mapper, files)
+        callbacks = viewers(options, mapper, files)
         if BAG not in options.formats:
-            yield found
+            yield callbacks
             return
         bag, errors = normals_bag(directory, mapper, files), list[BagError]()
 
@@ -336,7 +336,7 @@ def listeners(
                 _log.warning('%s; the rest is mapped without it', error)
                 errors.append(error)
 
-        yield [*found, add]
+        yield [*callbacks, add]
         if errors:
             raise errors[0]  # the map is written by now
         bag.finish()
@@ -411,8 +411,8 @@ def mapped(
     for update in recording.replay(mapper, stopped):
         with mapper.counters.timed('record'):
             trajectory.add(update)
-            for each in listen:
-                each(update)
+            for callback in listen:
+                callback(update)
             progress(mapper.counters.received, total)
     return trajectory, stopped()
 
@@ -422,13 +422,13 @@ def refuse_empty(recording: Recording, mapper: Mapper, was_stopped: bool) -> Non
     counters = mapper.counters
     if counters.mapped or counters.localised:
         return
-    found = recording.describe()
+    description = recording.describe()
     if was_stopped:
-        raise MapError(f'{found["bag"]}: stopped before a scan was mapped')
-    of = f' of {", ".join(found["topics"])}' if 'topics' in found else ''
-    look = f'; `surfel-mapper info {found["bag"]}` shows what poses it has'
+        raise MapError(f'{description["bag"]}: stopped before a scan was mapped')
+    of = f' of {", ".join(description["topics"])}' if 'topics' in description else ''
+    look = f'; `surfel-mapper info {description["bag"]}` shows what poses it has'
     raise BagError(
-        f'{found["bag"]}: none of {counters.received} clouds{of} was mapped '
+        f'{description["bag"]}: none of {counters.received} clouds{of} was mapped '
         f'({causes_text(counters.dropped)}){look if "no_pose" in counters.dropped else ""}'
     )
 

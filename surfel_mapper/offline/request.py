@@ -3,7 +3,7 @@
 """
 The recording to map, and the part of it.
 
-A ``Request`` names both in plain values, so that it can be sent to another process; ``part``
+A ``Request`` names both in plain values, so that it can be sent to another process; ``span_of``
 turns its times into a ``Span`` of record times. A part needs poses from a little before its first
 cloud, to interpolate, and from after its last, because poses come late. Static transforms hold
 for all time, wherever they were recorded.
@@ -49,7 +49,7 @@ class Request:
     time_offsets : mapping of str to float
         Seconds added to the stamps of clouds of a topic, beside ``input.time_offset_s``.
     start_s, duration_s, every : float, float, int
-        The part to map; see ``part``.
+        The part to map; see ``span_of``.
     bin_columns : int, optional
         Number of columns of .bin files; without, that which fits their values.
 
@@ -114,7 +114,7 @@ WHOLE = Span()
 """All of a recording."""
 
 
-def part(
+def span_of(
     name: str,
     first_ns: int,
     last_ns: int,

@@ -35,7 +35,7 @@ from surfel_mapper.offline.pose_choice import (
     why_not_deskewed,
 )
 from surfel_mapper.offline.pose_sources import PosePath
-from surfel_mapper.offline.request import part, Request, Span
+from surfel_mapper.offline.request import Request, Span, span_of
 from surfel_mapper.offline.scan_times import (
     is_gapless,
     numbered,
@@ -136,7 +136,7 @@ class ScanFolder:
         if is_alone and (seen_from := with_viewpoint(config, viewpoints)):
             self.config, self.pose_reason = seen_from, PLACE
         self.deskew_reason = why_not_deskewed(self.config, [first] if first else [])
-        self.span: Span = part(
+        self.span: Span = span_of(
             str(self.path),
             self.stamps[0],
             self.stamps[-1],
@@ -155,8 +155,8 @@ class ScanFolder:
     @property
     def _numbers(self) -> list[int]:
         """Numbers of the scans in the part that is mapped."""
-        held = [n for n, stamp_ns in enumerate(self.stamps) if self.span.holds(stamp_ns)]
-        return held[:: self.span.every]
+        numbers = [n for n, stamp_ns in enumerate(self.stamps) if self.span.holds(stamp_ns)]
+        return numbers[:: self.span.every]
 
     @property
     def recorded_s(self) -> float:
@@ -236,9 +236,9 @@ class ScanFolder:
         times = times_in_names(self.files)
         if times:
             return list(times.values()), 'names'
-        found = times_beside(self.path, self.files) if self.path.is_dir() else None
-        if found is not None:
-            return found[0], str(found[1])
+        listed = times_beside(self.path, self.files) if self.path.is_dir() else None
+        if listed is not None:
+            return listed[0], str(listed[1])
         return [PERIOD_NS * at for at in range(len(self.files))], ASSUMED
 
     def _stamps(self) -> tuple[list[int], str]:

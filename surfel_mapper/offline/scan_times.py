@@ -79,7 +79,7 @@ def times_beside(folder: Path, files: Sequence[Path]) -> tuple[list[int], Path] 
 
     """
     around = Path(os.path.abspath(folder)).parent
-    paths = [place / name for place in (folder, around) for name in TIME_FILES]
+    paths = [directory / name for directory in (folder, around) for name in TIME_FILES]
     path = next(filter(Path.is_file, paths), None)
     if path is None:
         return None

@@ -74,14 +74,14 @@ def stages_text(summary: Mapping[str, Any]) -> str:
 
     of_workers = summary.get('wall_s')
     stages = of_workers.items() if of_workers else in_order(summary['stage_s'], STAGES)
-    found = {stage: s for stage, s in stages if stage != 'total'}
-    found['other'] = summary['replay_s'] - sum(found.values())
-    found['total'] = summary['replay_s']
+    seconds = {stage: s for stage, s in stages if stage != 'total'}
+    seconds['other'] = summary['replay_s'] - sum(seconds.values())
+    seconds['total'] = summary['replay_s']
     speed = f'{summary["recorded_s"] / summary["replay_s"]:.1f} times real time'
     if of_workers:
-        return '   '.join([*(f'{stage} {s:.1f} s' for stage, s in found.items()), speed])
+        return '   '.join([*(f'{stage} {s:.1f} s' for stage, s in seconds.items()), speed])
     share = 1e3 / max(summary['scans']['received'], 1)
-    means = '   '.join(f'{stage} {share * s:.1f} ms' for stage, s in found.items())
+    means = '   '.join(f'{stage} {share * s:.1f} ms' for stage, s in seconds.items())
     mapping = summary['milliseconds'].get('total')
     if mapping:
         speed = f'mapping {mapping["median"]:.1f} ms, p99 {mapping["p99"]:.1f}   {speed}'
@@ -131,11 +131,11 @@ def tracking_text(summary: Mapping[str, Any]) -> str:
 
 def surrounded_text(summary: Mapping[str, Any]) -> str:
     """Return a sentence about surroundings that moved along; empty if they hardly did."""
-    found = summary.get('registration', {}).get('tracking', {}).get('surrounded')
-    if found is None or found['scans'] < MOST_SURROUNDED:
+    spent = summary.get('registration', {}).get('tracking', {}).get('surrounded')
+    if spent is None or spent['scans'] < MOST_SURROUNDED:
         return ''
     return (
-        f'in {found["scans"]} of {summary["scans"]["received"]} scans ({found["seconds"]:.1f} s) '
+        f'in {spent["scans"]} of {summary["scans"]["received"]} scans ({spent["seconds"]:.1f} s) '
         'most of what is seen seems to move along with the sensor: their poses may be wrong'
     )
 
@@ -143,15 +143,15 @@ def surrounded_text(summary: Mapping[str, Any]) -> str:
 def apart_text(summary: Mapping[str, Any]) -> str:
     """Return the parts that stayed apart, and why; empty if there are none."""
     tracking = summary.get('registration', {})
-    parts = tracking.get('apart', [])
-    if not parts:
+    maps = tracking.get('apart', [])
+    if not maps:
         return ''
     counted = summary['scans']['dropped'].get('apart', 0)
-    num_scans = max(counted, sum(part['scans'] for part in parts))
+    num_scans = max(counted, sum(entry['scans'] for entry in maps))
     spans = ', '.join(
-        f'{part.get("map", f"apart_{number}")} ({part["scans"]} scans from '
-        f'{part["first_s"]:.3f} to {part["last_s"]:.3f} s: {part["reason"]})'
-        for number, part in enumerate(parts, start=1)
+        f'{entry.get("map", f"apart_{number}")} ({entry["scans"]} scans from '
+        f'{entry["first_s"]:.3f} to {entry["last_s"]:.3f} s: {entry["reason"]})'
+        for number, entry in enumerate(maps, start=1)
     )
     return (
         f'{num_scans} of {summary["scans"]["received"]} scans have no certain place on the map; '

@@ -172,19 +172,19 @@ def survey(
         If the bag is damaged.
 
     """
-    found = Survey({topic.name: TopicSurvey(topic) for topic in reader.topics}, reader.topics)
+    content = Survey({topic.name: TopicSurvey(topic) for topic in reader.topics}, reader.topics)
     static = static_topics(reader.topics)
     moving = [name for name in surveyed_topics(reader) if name not in static]
     for message in chain(reader.all_messages(static), reader.messages(moving, None, stop_ns)):
         try:
             offset_ns = (offsets_ns or {}).get(message.topic, 0)
-            frames = note_message(found, reader, message, static, offset_ns)
+            frames = note_message(content, reader, message, static, offset_ns)
         except (BagError, CloudFormatError, PoseError):
-            found.undecodable += 1
+            content.undecodable += 1
             frames = []
-        found.topics[message.topic].add(message.record_ns, frames)
+        content.topics[message.topic].add(message.record_ns, frames)
         on_message()
-    return found
+    return content
 
 
 def surveyed_topics(reader: BagReader) -> list[str]:
@@ -218,7 +218,7 @@ def is_depth(reader: BagReader, topic: str) -> bool:
 
 
 def note_message(
-    found: Survey,
+    content: Survey,
     reader: BagReader,
     message: BagMessage,
     static: Collection[str],
@@ -229,27 +229,27 @@ def note_message(
         decoded = reader.decode(message)
         frame = frame_name(decoded.header.frame_id)
         stamp = (stamp_ns(decoded.header) or message.record_ns) + offset_ns
-        found.stamps.setdefault((message.topic, frame), []).append(stamp)
-        found.leads_ns.setdefault(message.topic, []).append(stamp - message.record_ns)
+        content.stamps.setdefault((message.topic, frame), []).append(stamp)
+        content.leads_ns.setdefault(message.topic, []).append(stamp - message.record_ns)
         return [frame]
     kind, base = SOURCES[message.type], DEFAULTS.frames.base
     poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
     if message.topic in static:
-        found.static.setdefault(message.topic, []).extend(poses)
+        content.static.setdefault(message.topic, []).extend(poses)
     else:
         poses = [p if p.stamp_ns else p._replace(stamp_ns=message.record_ns) for p in poses]
-        found.poses.setdefault(message.topic, []).extend(poses)
-        leads = found.leads_ns.setdefault(message.topic, [])
+        content.poses.setdefault(message.topic, []).extend(poses)
+        leads = content.leads_ns.setdefault(message.topic, [])
         leads += [pose.stamp_ns - message.record_ns for pose in poses]
     return [f'{pose.parent} -> {pose.child}' for pose in poses]
 
 
-def offers(found: Survey) -> list[Offer]:
+def offers(content: Survey) -> list[Offer]:
     """Return every source of poses tried on every topic of clouds, the best of each first."""
     made = [
-        tried(source, found.static_for(clouds, source.topic), clouds, frame, stamps)
-        for (clouds, frame), stamps in found.stamps.items()
-        for source in of_namespace(found.sources, clouds)
+        tried(source, content.static_for(clouds, source.topic), clouds, frame, stamps)
+        for (clouds, frame), stamps in content.stamps.items()
+        for source in of_namespace(content.sources, clouds)
     ]
     kinds = list(SOURCES.values())
     return sorted(
