@@ -183,8 +183,8 @@ def _with_known_types(set_parameters: Callable[..., Any], request: Any, response
     unknown = [p for p in request.parameters if p.value.type not in PARAMETER_TYPES]
     if not unknown:
         return set_parameters(request, response)
-    found = unknown[0].value.type
-    reason = f'{unknown[0].name}: a value of type {found}, expected 1 to {max(PARAMETER_TYPES)}'
+    kind = unknown[0].value.type
+    reason = f'{unknown[0].name}: a value of type {kind}, expected 1 to {max(PARAMETER_TYPES)}'
     refused = SetParametersResult(successful=False, reason=reason)
     if isinstance(response, SetParametersAtomically.Response):
         response.result = refused

@@ -131,11 +131,11 @@ class ChangeTracker:
         since = 0 if publishes_more else self._version
         surfels = surfel_map.surfels_changed(since, min_points)
         keys = self._keys()
-        before = np.empty(0, np.int64) if self._published is None else self._published.keys()
+        published = np.empty(0, np.int64) if self._published is None else self._published.keys()
         self._published = PublishedKeys(keys)
         self._version = surfel_map.version
         self._num_mapped = self._mapper.counters.mapped
-        return MapChange(surfels, unpack_keys(np.setdiff1d(before, keys, assume_unique=True)))
+        return MapChange(surfels, unpack_keys(np.setdiff1d(published, keys, assume_unique=True)))
 
     def _keys(self) -> Keys:
         """Return the keys of all voxels to be published."""

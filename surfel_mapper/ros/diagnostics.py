@@ -107,16 +107,16 @@ class Diagnostics:
         session = self._session
         if session is None:
             return
-        last, now = self._last, Totals.of(self._node, session)
-        self._last = now
+        last, totals = self._last, Totals.of(self._node, session)
+        self._last = totals
         problems = []
         if self._node.state == 'active':
-            interval = now.since(last, self._node, session)
+            interval = totals.since(last, self._node, session)
             problems = list(findings(interval, session.config.diagnostics))
         level = max((level for level, _ in problems), default=OK)
         text = '; '.join(text for _, text in problems)
         healthy = 'ok' if self._node.state == 'active' else self._node.state
-        values = {'state': self._node.state, **now.rates(last), **figures(session)}
+        values = {'state': self._node.state, **totals.rates(last), **figures(session)}
         self._publish(level, text or healthy, values)
 
     def _publish(self, level: int, text: str, values: Mapping[str, Any]) -> None:
@@ -141,18 +141,18 @@ class Totals:
     @classmethod
     def of(cls, node: Node, session: Session) -> Totals:
         """Return the present counts of a session."""
-        now = cls()
+        totals = cls()
         counters = session.mapper.counters
-        now.received = counters.received
-        now.mapped = counters.mapped + counters.gated + counters.localised
-        now.lost = session.inputs.clouds_lost
-        now.dropped = Counter(counters.dropped)
-        now.published = {
+        totals.received = counters.received
+        totals.mapped = counters.mapped + counters.gated + counters.localised
+        totals.lost = session.inputs.clouds_lost
+        totals.dropped = Counter(counters.dropped)
+        totals.published = {
             publisher.topic_name: publisher.num_published
             for publisher in list(node.publishers)
             if isinstance(publisher, CountedPublisher)
         }
-        return now
+        return totals
 
     def since(self, last: Totals, node: Node, session: Session) -> Interval:
         """Return the interval since an earlier count; of several topics, the most silent one."""
@@ -185,8 +185,8 @@ class Totals:
         """Return the rates since an earlier count, received and published, in Hz."""
         seconds = self.time_s - last.time_s
 
-        def rate_hz(number: int, before: int) -> float:
-            return round(max(number - before, 0) / seconds, 2)
+        def rate_hz(number: int, earlier: int) -> float:
+            return round(max(number - earlier, 0) / seconds, 2)
 
         return {
             'received_hz': rate_hz(self.received, last.received),
@@ -199,12 +199,14 @@ class Totals:
 
 def publishers(node: Node, topic: str) -> tuple[int, str]:
     """Return the number of publishers of a subscribed topic, and why they are not heard."""
-    found = subscription_to(node, topic)
-    if found is None:
+    subscription = subscription_to(node, topic)
+    if subscription is None:
         return node.count_publishers(topic), ''
-    number = len(publishers_of(node, topic, found.msg_type))
-    unheard = mismatch(node, topic, found.msg_type, found.qos_profile)
-    return number, unheard or ('' if number else of_other_types(node, topic, found.msg_type))
+    number = len(publishers_of(node, topic, subscription.msg_type))
+    unheard = mismatch(node, topic, subscription.msg_type, subscription.qos_profile)
+    return number, unheard or (
+        '' if number else of_other_types(node, topic, subscription.msg_type)
+    )
 
 
 def of_another_user(node: Node) -> str:
@@ -224,10 +226,10 @@ def of_another_user(node: Node) -> str:
 
 def subscription_to(node: Node, topic: str) -> Subscription | None:
     """Return the newest subscription to a topic, if there is one."""
-    for found in reversed(list(node.subscriptions)):
+    for subscription in reversed(list(node.subscriptions)):
         with suppress(InvalidHandle):  # another thread may destroy it
-            if found.topic_name == topic:
-                return found
+            if subscription.topic_name == topic:
+                return subscription
     return None
 
 
@@ -246,8 +248,8 @@ def figures(session: Session) -> dict[str, Any]:
         'queue': session.thread.num_clouds,
         'waiting': counters.received - finished,
         'latency_ms': {
-            name: None if found is None else round(found * 1e3, 1)
-            for name, found in (('median', latency(session, 50)), ('p99', latency(session, 99)))
+            name: None if value is None else round(value * 1e3, 1)
+            for name, value in (('median', latency(session, 50)), ('p99', latency(session, 99)))
         },
         **counters.summary(),
         'pose_source': session.inputs.poses.source,
@@ -267,8 +269,8 @@ def latency(session: Session, percentile: float) -> float | None:
     """Return a percentile of the latest latencies, s; None without any or if clocks differ."""
     if not session.latencies_s:
         return None
-    found = float(np.percentile(session.latencies_s, percentile))
-    return found if abs(found) < OFF_S else None
+    latency_s = float(np.percentile(session.latencies_s, percentile))
+    return latency_s if abs(latency_s) < OFF_S else None
 
 
 def process_bytes() -> int:

@@ -302,19 +302,19 @@ class Inputs:
             with suppress(CloudFormatError):  # counted when it is decoded
                 self.poses.note_cloud(frame_name(msg.header.frame_id))
 
-    def _on_lost(self, topic: str, before: int, number: int) -> None:
-        """Take the number that a subscription has lost; those of earlier ones are ``before``."""
-        self.lost[topic] = before + number
+    def _on_lost(self, topic: str, earlier: int, number: int) -> None:
+        """Take the number that a subscription has lost, after the losses of earlier ones."""
+        self.lost[topic] = earlier + number
         self._node.get_logger().warning(self.loss(), throttle_duration_sec=10.0)
 
 
 def cloud_topics(node: BaseNode, config: Config) -> list[str]:
     """Return the full names of the topics of clouds or depth images; raise if two are the same."""
-    given = config.input.topics
-    names = given or (DEFAULT_TOPICS[config.input.kind],)
+    configured = config.input.topics
+    names = configured or (DEFAULT_TOPICS[config.input.kind],)
     topics = [resolved(node, 'input.topics', name) for name in names]
     if len(set(topics)) < len(topics):  # the configuration compares them as they are written
-        raise ConfigError(f'input.topics: {given} are {topics}, expected names that differ')
+        raise ConfigError(f'input.topics: {configured} are {topics}, expected names that differ')
     return topics
 
 

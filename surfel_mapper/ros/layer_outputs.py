@@ -63,7 +63,7 @@ class LayerOutputs:
         self._moment = Moment()
         self._timers: list[Timer] = []
         self._topics = [
-            LayerTopic(node, layer, publication, thread, self._now)
+            LayerTopic(node, layer, publication, thread, self._current)
             for layer in mapper.layers.values()
             for publication in layer.publications()
         ]
@@ -104,7 +104,7 @@ class LayerOutputs:
         for topic in self._topics:
             topic.close()
 
-    def _now(self) -> Moment:
+    def _current(self) -> Moment:
         """Return stamp, frame and place of the newest scan; before the first, of an empty map."""
         return self._moment if self._moment.frame_id else Moment(frame_id=self._mapper.map_frame)
 
@@ -134,13 +134,13 @@ class LayerTopic:
         layer: Layer,
         publication: Publication,
         thread: MappingThread,
-        now: Callable[[], Moment],
+        current: Callable[[], Moment],
     ) -> None:
         self.layer = layer
         self._node = node
         self._publication = publication
         self._thread = thread
-        self._now = now
+        self._current = current
         self._published: object = None
         self._background: ThreadPoolExecutor | None = None
         if publication.in_background:
@@ -182,7 +182,7 @@ class LayerTopic:
     def post_if_due(self) -> None:
         """Post publishing to the mapping thread if the content changed and is subscribed to."""
         version = self._publication.version
-        newest = version(self._now()) if version is not None else None
+        newest = version(self._current()) if version is not None else None
         is_new = version is None or self._published != newest
         is_busy = self._pending is not None and not self._pending.done()
         if is_new and not is_busy and (self._publication.is_eager or self._is_read()):
@@ -216,7 +216,7 @@ class LayerTopic:
 
     def _newest(self) -> bytes:
         """Return the serialised message of the present state."""
-        (message,) = self._publication.messages(self._now())
+        (message,) = self._publication.messages(self._current())
         return message
 
     def _publish(self) -> None:
@@ -225,7 +225,7 @@ class LayerTopic:
         if self.has_rate and publication.prepare is not None and not publication.prepare():
             self._thread.post(self._publish)
             return
-        self._send(publication.messages(self._now()))
+        self._send(publication.messages(self._current()))
 
     def _publish_for_new(self) -> None:
         """Make missing content, one step at a time between scans, and then publish."""
@@ -233,7 +233,7 @@ class LayerTopic:
         if publication.prepare is not None and not publication.prepare():
             self._thread.post(self._publish_for_new)
             return
-        self._send((publication.all_messages or publication.messages)(self._now()))
+        self._send((publication.all_messages or publication.messages)(self._current()))
 
     def _send(self, messages: Iterable[bytes]) -> None:
         if self._background is not None:

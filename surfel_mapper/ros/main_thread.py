@@ -41,19 +41,19 @@ class Signals:
 
     def __init__(self) -> None:
         self._received = False
-        self._before: dict[int, Any] = {}
+        self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> Signals:
         """Install the signal handlers."""
         numbers = (*NUMBERS, signal.SIGALRM)
-        self._before = {number: signal.signal(number, self._interrupt) for number in numbers}
+        self._handlers = {number: signal.signal(number, self._interrupt) for number in numbers}
         return self
 
     def __exit__(self, *_: object) -> None:
         """Restore the previous handlers; after an interrupt, signals stay ignored."""
         signal.setitimer(signal.ITIMER_REAL, 0)
         if not self._received:
-            for number, handler in self._before.items():
+            for number, handler in self._handlers.items():
                 signal.signal(number, handler)
 
     def check(self) -> None:

@@ -169,12 +169,12 @@ def path_inside(directory: Path, url: str) -> Path:
     if len(url) > MAX_PATH:
         raise ConfigError(f'map_url: {len(url)} characters, expected {MAX_PATH} at most')
     try:
-        parts = urlsplit(url)
+        address = urlsplit(url)
     except ValueError as error:
         raise ConfigError(f'map_url: {url!r}: {error}') from error
-    if parts.scheme not in ('', 'file') or parts.netloc or '\0' in url:
+    if address.scheme not in ('', 'file') or address.netloc or '\0' in url:
         raise ConfigError(f'map_url: {url!r}, expected a file in output.directory, {directory}')
-    wanted = unquote(parts.path) if parts.scheme else url
+    wanted = unquote(address.path) if address.scheme else url
     path = directory / wanted
     if not path.name:
         raise ConfigError(f'map_url: {url!r}, expected the name of a map in {directory}')

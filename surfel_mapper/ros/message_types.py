@@ -62,9 +62,9 @@ def message_type(name: str) -> Any:
 
 def packages_with_messages() -> frozenset[str]:
     """Return the packages that the ament index lists with ROS interfaces; none without ament."""
-    found = set[str]()
+    packages = set[str]()
     for prefix in [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]:
         folder = Path(prefix, 'share', 'ament_index', 'resource_index', 'rosidl_interfaces')
         if prefix and folder.is_dir():
-            found.update(path.name for path in folder.iterdir())
-    return frozenset(found)
+            packages.update(path.name for path in folder.iterdir())
+    return frozenset(packages)

@@ -215,13 +215,13 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
             f'of {self._config.map.voxel_size_m:g} m'
         )
         if self._config.pose.source == 'identity':
-            place = standing_sensor(self._config)
+            position = standing_sensor(self._config)
             self.get_logger().info(
                 'pose.source identity gives no position of the sensor, so normals are not '
                 'oriented towards it: their component of largest magnitude is positive; '
                 'frames.base_to_sensor gives that of a sensor that does not move'
-                if place is None
-                else f'normals are oriented towards a sensor that stands at {place.tolist()} m '
+                if position is None
+                else f'normals are oriented towards a sensor that stands at {position.tolist()} m '
                 f'in {self._config.frames.fixed}: frames.base_to_sensor with pose.source identity'
             )
 
@@ -258,7 +258,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         for entities, destroy in (
             (self.timers, self.destroy_timer),
             (
-                (each for each in self.subscriptions if each.msg_type is not Clock),
+                (reader for reader in self.subscriptions if reader.msg_type is not Clock),
                 self.destroy_subscription,
             ),
             (self.publishers, self.destroy_publisher),
@@ -291,13 +291,13 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
     def _transit(self, request: ChangeState.Request, response: ChangeState.Response) -> bool:
         """Make a requested transition, in the main thread; return whether it succeeded."""
         number, label = request.transition.id, request.transition.label
-        before, self.refusal = self.state, None
+        old_state, self.refusal = self.state, None
         possible = self._state_machine.available_transitions
-        done = (label or number) in [found[bool(label)] for found in possible]
+        done = (label or number) in [transition[bool(label)] for transition in possible]
         if done:  # rcl would write the names of others to the log as they are
             done = bool(self._change_state(request, response).success)
         if not done:
-            reason = self.refusal or f'not possible while {before}'
+            reason = self.refusal or f'not possible while {old_state}'
             self.get_logger().error(f'transition {label or number} refused: {reason}')
         return done
 

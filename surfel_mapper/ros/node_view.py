@@ -178,10 +178,10 @@ def silence(node: Any, name: str) -> str:
     if node.count_publishers(topic):
         return f'{topic}: no map yet; the node waits for its input, see /diagnostics'
     kind = 'sensor_msgs/msg/PointCloud2'
-    found = [each for each, kinds in node.get_topic_names_and_types() if kind in kinds]
-    maps = [each.removesuffix('/normals') for each in found if each.endswith('/normals')]
-    others = ', '.join(each for each in maps if each != name) or 'none'
-    return f'{topic}: nothing publishes it; nodes that publish such a map: {others}'
+    clouds = [cloud for cloud, kinds in node.get_topic_names_and_types() if kind in kinds]
+    maps = [cloud.removesuffix('/normals') for cloud in clouds if cloud.endswith('/normals')]
+    nodes = ', '.join(cloud for cloud in maps if cloud != name) or 'none'
+    return f'{topic}: nothing publishes it; nodes that publish such a map: {nodes}'
 
 
 def places_of(marker: Marker, corners: int) -> npt.NDArray[np.float64]:
@@ -205,20 +205,20 @@ def places_of(marker: Marker, corners: int) -> npt.NDArray[np.float64]:
 
 def colours_of(marker: Marker) -> npt.NDArray[np.uint8]:
     """Return the colours of the points of a marker, (N, 3)."""
-    each = [(c.r, c.g, c.b) for c in marker.colors] or [
+    rgb = [(c.r, c.g, c.b) for c in marker.colors] or [
         (marker.color.r, marker.color.g, marker.color.b)
     ] * len(marker.points)
-    shares = np.clip(np.nan_to_num(np.array(each).reshape(-1, 3)), 0.0, 1.0)
-    found: npt.NDArray[np.uint8] = np.rint(255.0 * shares).astype(np.uint8)
-    return found
+    shares = np.clip(np.nan_to_num(np.array(rgb).reshape(-1, 3)), 0.0, 1.0)
+    colours: npt.NDArray[np.uint8] = np.rint(255.0 * shares).astype(np.uint8)
+    return colours
 
 
 def marker_mesh(marker: Marker) -> Mesh:
     """Return the triangles of a marker."""
-    places = places_of(marker, 3)
-    number = len(places) // 3
+    corners = places_of(marker, 3)
+    number = len(corners) // 3
     return Mesh(
-        vertices=places,
+        vertices=corners,
         triangles=np.arange(3 * number, dtype=np.int32).reshape(-1, 3),
         colors=colours_of(marker),
     )

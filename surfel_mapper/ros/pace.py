@@ -88,9 +88,9 @@ class Pace:
                     f'no answer on {self._topic} to the cloud at {self._stamps[0] / 1e9:.6f} s '
                     f'within {self._timeout_s:g} s; does the node map it?'
                 )
-            before = len(self._stamps)
+            num_open = len(self._stamps)
             self._executor.spin_once(timeout_sec=SPIN_S)
-            if len(self._stamps) < before:
+            if len(self._stamps) < num_open:
                 end_s = time.monotonic() + self._timeout_s
 
     def _on_answer(self, raw: bytes) -> None:

@@ -59,10 +59,10 @@ def declare_settings(node: Node) -> Config:
 
 def overrides(node: Node) -> dict[str, Any]:
     """Return the parameters set by the user, without those of rclpy."""
-    found = node._parameter_overrides  # rclpy has no public access to overrides
+    values = node._parameter_overrides  # rclpy has no public access to overrides
     return {
         name: [] if parameter.value is None else parameter.value  # an empty list has no type
-        for name, parameter in found.items()
+        for name, parameter in values.items()
         if not name.startswith(QOS_OVERRIDES) and not node.has_parameter(name)
     }
 
@@ -85,27 +85,27 @@ def declare(node: Node, declared: Declaration, value: Any) -> None:
 def descriptor(declared: Declaration) -> ParameterDescriptor:
     """Return the descriptor of a setting, which ``ros2 param describe`` prints."""
     low, high = declared.low, declared.high
-    found = ParameterDescriptor(
+    result = ParameterDescriptor(
         description=declared.meaning,
         read_only=not declared.live,
         additional_constraints=f'one of {", ".join(declared.choices)}' if declared.choices else '',
     )
     if isinstance(declared.default, float):
         largest = sys.float_info.max
-        found.floating_point_range = [
+        result.floating_point_range = [
             FloatingPointRange(
                 from_value=-largest if math.isinf(low) else low,
                 to_value=largest if math.isinf(high) else high,
             )
         ]
     elif isinstance(declared.default, int) and not isinstance(declared.default, bool):
-        found.integer_range = [
+        result.integer_range = [
             IntegerRange(
                 from_value=-INT64_MAX if math.isinf(low) else int(low),
                 to_value=INT64_MAX if math.isinf(high) else int(high),
             )
         ]
-    return found
+    return result
 
 
 def settings_among(parameters: Iterable[Parameter]) -> dict[str, Any]:

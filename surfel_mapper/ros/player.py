@@ -158,14 +158,14 @@ class Player:
 
     def _make_publishers(self, node: Node, names: Collection[str] | None) -> None:
         """Create a publisher for every topic whose type is installed."""
-        known = {topic.name: topic for topic in self._reader.topics}
-        for name in known if names is None else names:
-            if name not in known:
+        topics = {topic.name: topic for topic in self._reader.topics}
+        for name in topics if names is None else names:
+            if name not in topics:
                 raise BagError(
-                    f'{self._reader.path}: no topic {name}; its topics: {", ".join(known)}'
+                    f'{self._reader.path}: no topic {name}; its topics: {", ".join(topics)}'
                 )
             try:
-                message = message_type(known[name].type)
+                message = message_type(topics[name].type)
             except DependencyError as error:
                 self.skipped[name] = str(error)
                 continue

@@ -39,8 +39,8 @@ def publishers_of(node: Node, topic: str, message: Any) -> list[TopicEndpointInf
     """Return the publishers of a topic that send messages of a class."""
     package = message.__module__.partition('.')[0]
     kind = f'{package}/msg/{message.__name__}'
-    found = node.get_publishers_info_by_topic(topic)
-    return [publisher for publisher in found if publisher.topic_type == kind]
+    endpoints = node.get_publishers_info_by_topic(topic)
+    return [publisher for publisher in endpoints if publisher.topic_type == kind]
 
 
 def full_name(publisher: TopicEndpointInfo) -> str:
@@ -99,8 +99,8 @@ def mismatch(node: Node, topic: str, message: Any, qos: QoSProfile) -> str:
     for publisher in publishers_of(node, topic, message):
         name = full_name(publisher)
         for policy, (offered, wanted) in UNHEARD.items():
-            found = getattr(publisher.qos_profile, policy), getattr(qos, policy)
-            if found != (offered, wanted):
+            policies = getattr(publisher.qos_profile, policy), getattr(qos, policy)
+            if policies != (offered, wanted):
                 continue
             offer, wish = offered.name.lower(), wanted.name.lower()
             if is_overridden(node, topic, policy):

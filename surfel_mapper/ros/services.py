@@ -237,10 +237,10 @@ class Services:
 
     def _clear_region(self, region: Region, where: str) -> str:
         """Clear a region of the map; return the number of voxels removed."""
-        before = self._mapper.map.num_voxels
+        num_voxels = self._mapper.map.num_voxels
         self._mapper.clear_region(region)
         self._outputs.expire()
-        return f'cleared {before - self._mapper.map.num_voxels} voxels in {where}'
+        return f'cleared {num_voxels - self._mapper.map.num_voxels} voxels in {where}'
 
     def _load(self, url: str) -> str:
         """Replace the map by the one in a file."""

@@ -116,7 +116,7 @@ class TopicReader:
     follows: bool
     subscription: Subscription | None = None
     retiring: Subscription | None = None
-    seen: set[int] = field(default_factory=set)
+    source_stamps: set[int] = field(default_factory=set)
     reliability: ReliabilityPolicy = RELIABLE
     follow_until_s: float = -math.inf
     lost: int = 0
@@ -124,7 +124,7 @@ class TopicReader:
 
     def subscriptions(self) -> list[Subscription]:
         """Return the open subscriptions, oldest first."""
-        return [found for found in (self.retiring, self.subscription) if found is not None]
+        return [opened for opened in (self.retiring, self.subscription) if opened is not None]
 
     def on_publishers_changed(self, _: object) -> None:
         """Check the QoS of the publishers soon."""
@@ -161,7 +161,7 @@ class SubscriptionExecutor:
         self._on_failure = on_failure
         self._group = KeptFromExecutor()
         self._eager: list[TopicReader] = []
-        self._others: list[TopicReader] = []
+        self._lazy: list[TopicReader] = []
         self._end_s = math.inf
         self._thread: threading.Thread | None = None
         self.on_turn: Callable[[], object] | None = None
@@ -209,29 +209,29 @@ class SubscriptionExecutor:
         if reader.follows:
             reader.qos.reliability = self._offered(reader, default=qos.reliability)
         self._open(reader)
-        (self._eager if eager else self._others).append(reader)
+        (self._eager if eager else self._lazy).append(reader)
 
     def unsubscribe(self, name: str) -> None:
         """End the subscription to a topic; called in the thread, or while it does not run."""
         topic = self._node.resolve_topic_name(name)
-        for readers in (self._eager, self._others):
+        for readers in (self._eager, self._lazy):
             for reader in [reader for reader in readers if reader.topic == topic]:
                 readers.remove(reader)
                 self._close(reader)
 
     def topics(self) -> list[str]:
         """Return the full names of the topics subscribed to."""
-        return [reader.topic for reader in (*self._eager, *self._others)]
+        return [reader.topic for reader in (*self._eager, *self._lazy)]
 
     def reliabilities(self) -> dict[str, str]:
         """Return the reliability of each subscription, by topic."""
         return {
-            reader.topic: name_of(reader.reliability) for reader in (*self._eager, *self._others)
+            reader.topic: name_of(reader.reliability) for reader in (*self._eager, *self._lazy)
         }
 
     def publishers(self, topic: str) -> list[TopicEndpointInfo]:
         """Return the publishers of a topic, by its full name; if it is read, those of its type."""
-        for reader in (*self._eager, *self._others):
+        for reader in (*self._eager, *self._lazy):
             if reader.topic == topic:
                 return publishers_of(self._node, topic, reader.message)
         return list(self._node.get_publishers_info_by_topic(topic))
@@ -259,7 +259,7 @@ class SubscriptionExecutor:
             self._thread.join()
             self._stop.destroy()
             self._thread = None
-        for readers in (self._eager, self._others):
+        for readers in (self._eager, self._lazy):
             for reader in readers:
                 self._close(reader)
             readers.clear()
@@ -309,12 +309,12 @@ class SubscriptionExecutor:
         if reader.retiring is not None:
             self._node.destroy_subscription(reader.retiring)
             reader.retiring = None
-            reader.seen.clear()
+            reader.source_stamps.clear()
 
     def _offered(self, reader: TopicReader, *, default: ReliabilityPolicy) -> ReliabilityPolicy:
         """Return the best reliability that all publishers of a topic offer."""
         publishers = publishers_of(self._node, reader.topic, reader.message)
-        offered = {found.qos_profile.reliability for found in publishers}
+        offered = {publisher.qos_profile.reliability for publisher in publishers}
         if not offered:
             return default
         return BEST_EFFORT if BEST_EFFORT in offered else RELIABLE
@@ -322,7 +322,7 @@ class SubscriptionExecutor:
     def _follow_publishers(self) -> None:
         """Subscribe again to topics whose publishers now offer another reliability."""
         now_s = time.monotonic()
-        for reader in (*self._eager, *self._others):
+        for reader in (*self._eager, *self._lazy):
             if reader.retiring is not None:
                 self._finish_switch(reader, now_s)
                 continue
@@ -382,9 +382,9 @@ class SubscriptionExecutor:
 
     def _wait(self) -> None:
         """Return when a message has arrived, or the thread has to end; call event callbacks."""
-        readers = (*self._eager, *self._others)
-        subscriptions = [found for reader in readers for found in reader.subscriptions()]
-        events = [event for found in subscriptions for event in found.event_handlers]
+        readers = (*self._eager, *self._lazy)
+        subscriptions = [opened for reader in readers for opened in reader.subscriptions()]
+        events = [event for opened in subscriptions for event in opened.event_handlers]
         wait_set = rclpy_implementation.WaitSet(
             len(subscriptions), 1, 0, 0, 0, len(events), self._node.context.handle
         )
@@ -394,7 +394,7 @@ class SubscriptionExecutor:
         for event in events:
             event.add_to_wait_set(wait_set)
         wait_set.add_guard_condition(self._stop.handle)
-        follow_until_s = max((found.follow_until_s for found in readers), default=-math.inf)
+        follow_until_s = max((reader.follow_until_s for reader in readers), default=-math.inf)
         is_following = self.on_turn is not None or follow_until_s > time.monotonic()
         wait_set.wait(int(FOLLOW_PERIOD_S * 1e9) if is_following else -1)
         # all are taken before a callback is called, since the wait set holds their order
@@ -406,30 +406,30 @@ class SubscriptionExecutor:
 
     def _take_turn(self) -> bool:
         """Take a message of each other topic, all eager ones before it; False if none was left."""
-        taken = False
-        for reader in self._others:
+        any_taken = False
+        for reader in self._lazy:
             for eager in self._eager:
                 while self._take(eager):
                     pass
-            taken |= self._take(reader)
-        return taken
+            any_taken |= self._take(reader)
+        return any_taken
 
     def _take(self, reader: TopicReader) -> bool:
         """Take a message and call the callback; return whether there was one."""
         if time.monotonic() > self._end_s:
             return False
         for subscription in reader.subscriptions():
-            taken = None
+            received = None
             with self._node.surviving(f'a message on {reader.topic}'):
                 handle = subscription.handle
-                taken = handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is None:
+                received = handle.take_message(subscription.msg_type, subscription.raw)
+            if received is None:
                 continue
-            message, info = taken
+            message, info = received
             if reader.retiring is not None:
-                if info['source_timestamp'] in reader.seen:
+                if info['source_timestamp'] in reader.source_stamps:
                     return True
-                reader.seen.add(info['source_timestamp'])
+                reader.source_stamps.add(info['source_timestamp'])
             with self._node.surviving(f'a message on {reader.topic}'):
                 reader.callback(message)
             return True
