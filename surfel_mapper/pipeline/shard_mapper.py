@@ -55,7 +55,7 @@ class ShardMapper(Mapper):
         if expected:
             back_ns = round(self.config.input.reset_after_s * 1e9)
             since_ns = min(*expected, max(expected) - back_ns) - round(sweep_s(self.config) * 1e9)
-        state = [guard.state(), waiting, self.transforms.held(since_ns)]
+        state = [guard.state(), waiting, self.transforms.content(since_ns)]
         return hashlib.sha256(repr(state).encode()).hexdigest()
 
     def insert_ready(self, *, more_follows: bool = False) -> Iterator[Update]:

@@ -305,15 +305,15 @@ class TransformBuffer:
         if edge is None or edge.is_static or edge.parent != parent:
             edge = self._edge(parent, child, is_static=False)
         transform = T_parent_child if is_checked else rigid(parent, child, T_parent_child)
-        before, is_back = len(edge.stamps), False
+        num_before, is_back = len(edge.stamps), False
         if edge.stamps and stamp_ns < edge.stamps[-1] - self._reset_after_ns:
-            edge.forget_oldest(before)
+            edge.forget_oldest(num_before)
             is_back = edge is self._newest
         if not edge.stamps or (edge.parent != parent and stamp_ns >= edge.stamps[-1]):
             self._note_move(edge, parent, transform)
         edge.insert(stamp_ns, parent, transform)
         edge.forget_before(edge.stamps[-1] - self._history_ns)
-        self.num_transforms += len(edge.stamps) - before
+        self.num_transforms += len(edge.stamps) - num_before
         self._enter(edge, parent)
         if is_back:
             self._newest = self._edge_of_newest()
@@ -389,10 +389,10 @@ class TransformBuffer:
 
     def stamps(self, target: str, source: str, start_ns: int, end_ns: int) -> list[int]:
         """Return the stamps of transforms between two frames in a span, ends included."""
-        held = (edge.stamps for edge in self._dynamic(target, source, start_ns))
-        return sorted({s for stamps in held for s in _within(stamps, start_ns, end_ns)})
+        per_edge = (edge.stamps for edge in self._dynamic(target, source, start_ns))
+        return sorted({s for stamps in per_edge for s in _within(stamps, start_ns, end_ns)})
 
-    def held(
+    def content(
         self, since_ns: int | None = None
     ) -> list[tuple[str, list[tuple[str, int]], list[int], bytes]]:
         """
@@ -410,15 +410,15 @@ class TransformBuffer:
             (none if static), transforms.
 
         """
-        found = []
+        edges = []
         for child, edge in sorted(self._edges.items()):
             first = 0
             if since_ns is not None and not edge.is_static:
                 first = max(bisect_right(edge.stamps, since_ns) - 1, 0)
             content = b''.join(transform.tobytes() for transform in edge.transforms[first:])
             parents = [(name, len([*rows])) for name, rows in groupby(edge.parents[first:])]
-            found.append((child, parents, edge.stamps[first:], content))
-        return found
+            edges.append((child, parents, edge.stamps[first:], content))
+        return edges
 
     def clear(self) -> None:
         """Drop the dynamic edges; static ones stay."""
@@ -484,8 +484,8 @@ class TransformBuffer:
         edge = self._edges.get(child)
         if edge is not None and edge.parent == parent:
             if edge.is_static != is_static:
-                held, came = ('static', 'dynamic') if edge.is_static else ('dynamic', 'static')
-                raise PoseError(f'{name}: known as {held}, a {came} transform came')
+                kind, came = ('static', 'dynamic') if edge.is_static else ('dynamic', 'static')
+                raise PoseError(f'{name}: known as {kind}, a {came} transform came')
             return edge
         above = [upper.child for upper in self._edges_above(parent)]
         if len(above) >= MAX_DEPTH:
@@ -526,10 +526,10 @@ class TransformBuffer:
 
     def _why_not_connected(self, target: str, source: str) -> str:
         """Return which of two frames is unknown, or that they are in two trees."""
-        seen = self._frames
-        first = sorted(islice(seen, MAX_NAMES))
-        names = ', '.join(first) + (', ...' if len(seen) > MAX_NAMES else '')
-        unseen = ' and '.join(frame for frame in (target, source) if frame not in seen)
+        frames = self._frames
+        first = sorted(islice(frames, MAX_NAMES))
+        names = ', '.join(first) + (', ...' if len(frames) > MAX_NAMES else '')
+        unseen = ' and '.join(frame for frame in (target, source) if frame not in frames)
         if unseen:
             return f'no transform of {unseen} yet; frames seen: {names or "none"}'
         return f'no transforms lead from one to the other yet; frames seen: {names}'
