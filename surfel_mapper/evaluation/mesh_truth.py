@@ -64,20 +64,20 @@ class MeshTruth:
         self._tree = cKDTree(self._middles)
 
     def nearest(self, position: Floats) -> Nearest:
-        """Return the places of the faces nearest to positions (K, 3), m."""
-        place, face = np.empty_like(position), np.empty(len(position), np.int64)
+        """Return the points of the faces nearest to positions (K, 3), m."""
+        point, face = np.empty_like(position), np.empty(len(position), np.int64)
         number = min(CANDIDATES, len(self._middles))
         for first in range(0, len(position), CHUNK):
             some = slice(first, first + CHUNK)
             _, near = self._tree.query(position[some], k=[*range(1, number + 1)])
             faces = self._face[near]
             asked = np.repeat(position[some], number, axis=0)
-            places = self._closest(self._corners[faces.ravel()], asked)
-            off_sq = ((places - asked) ** 2).sum(axis=1).reshape(-1, number)
+            candidates = self._closest(self._corners[faces.ravel()], asked)
+            off_sq = ((candidates - asked) ** 2).sum(axis=1).reshape(-1, number)
             rows = np.arange(len(faces)), off_sq.argmin(axis=1)
-            place[some], face[some] = places.reshape(-1, number, 3)[rows], faces[rows]
-        distance_m = np.sqrt(((place - position) ** 2).sum(axis=1))
-        return Nearest(distance_m, distance_m, self._normal[face], place)
+            point[some], face[some] = candidates.reshape(-1, number, 3)[rows], faces[rows]
+        distance_m = np.sqrt(((point - position) ** 2).sum(axis=1))
+        return Nearest(distance_m, distance_m, self._normal[face], point)
 
     def samples(self) -> Floats:
         """Return the middles of the pieces."""
