@@ -367,8 +367,8 @@ class SurfelMap(MomentMap):
             If the file cannot be read, is damaged or not exact.
 
         """
-        found: SurfelMap = map_formats.registered('files').load_surfel_map(as_path(path))
-        return found
+        surfel_map: SurfelMap = map_formats.registered('files').load_surfel_map(as_path(path))
+        return surfel_map
 
     def save(self, path: str | Path) -> str:
         """
