@@ -89,9 +89,9 @@ def copied_rows(array: npt.NDArray[Any], rows: Int64) -> Any:
 
 def block_keys(index: npt.NDArray[Any]) -> Int64:
     """Return the keys of blocks, (...,) int64; -1 for an index beyond 20 bits."""
-    place = index.astype(np.int64) + INDEX_OFFSET
-    within = ((place >= 0) & (place <= INDEX_MASK)).all(axis=-1)
-    x, y, z = (place[..., axis] for axis in range(3))
+    shifted = index.astype(np.int64) + INDEX_OFFSET
+    within = ((shifted >= 0) & (shifted <= INDEX_MASK)).all(axis=-1)
+    x, y, z = (shifted[..., axis] for axis in range(3))
     keys: Int64 = np.where(within, x << 2 * INDEX_BITS | y << INDEX_BITS | z, -1)
     return keys
 
@@ -321,10 +321,10 @@ class BlockMap(BlockArrays):
     def touch(self, rows: Int64, stamp_ns: int) -> None:
         """Mark blocks as changed in any way at a stamp; increments the version."""
         self._mark(rows, stamp_ns)
-        known = self.weight[rows] > 0.0
+        observed = self.weight[rows] > 0.0
         self.head[rows, SURFACE] = self.version
         self.head[rows, DRIFT] = self.head[rows, FREE_VISITS] = 0
-        self.head[rows, INSIDE] = (known & (self.distance[rows] < 0.0)).sum(axis=1)
+        self.head[rows, INSIDE] = (observed & (self.distance[rows] < 0.0)).sum(axis=1)
 
     def touch_fused(
         self, rows: Int64, stamp_ns: int, moved_um: Int64, solid: Int64, inside: Int64
@@ -454,11 +454,11 @@ class BlockMap(BlockArrays):
         local = np.indices((side, side, side)).reshape(3, -1)[::-1].T
         rows = self.rows() if rows is None else rows
         for first in range(0, len(rows), PART):
-            part = rows[first : first + PART]
-            centers = (self.index(part)[:, None] * side + local + 0.5).astype(np.float64) * size_m
+            batch = rows[first : first + PART]
+            centers = (self.index(batch)[:, None] * side + local + 0.5).astype(np.float64) * size_m
             points: npt.NDArray[np.float64] = centers.reshape(-1, 3)
-            inside = np.asarray(contains(points)).reshape(len(part), -1)
-            changed, hit = part[inside.any(axis=1)], inside[inside.any(axis=1)]
+            inside = np.asarray(contains(points)).reshape(len(batch), -1)
+            changed, hit = batch[inside.any(axis=1)], inside[inside.any(axis=1)]
             if not len(changed):
                 continue
             for array in (self.field, self.color, self.votes):

@@ -82,7 +82,7 @@ class EuclideanField:
         self._blocks = blocks
         self._low: Int64 = np.zeros(3, np.int64)
         self._squared: npt.NDArray[np.uint16] = np.empty((0, 0, 0), np.uint16)
-        self._known: Flags = np.empty((0, 0, 0), bool)
+        self._observed: Flags = np.empty((0, 0, 0), bool)
         self._state: tuple[float, ...] = ()
 
     def update(self, center: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
@@ -92,7 +92,7 @@ class EuclideanField:
         Parameters
         ----------
         center : (3,) float
-            Place about which distances are computed, map frame, m; needed with ``radius_m``.
+            Distances are computed about it, map frame, m; needed with ``radius_m``.
 
         Raises
         ------
@@ -113,11 +113,11 @@ class EuclideanField:
         index = blocks.index(rows)
         low, high = extent(blocks, index)
         size = checked_size(high - low)
-        seen = blocks.weight[rows] > 0.0
-        occupied = seen & (blocks.distance[rows] <= 0.5 * blocks.config.voxel_size_m)
-        places = (index - low // side)[:, ::-1]
-        self._known = dense(seen & within[:, None], places, size, side)
-        self._squared = self._transform(dense(occupied, places, size, side))
+        observed = blocks.weight[rows] > 0.0
+        occupied = observed & (blocks.distance[rows] <= 0.5 * blocks.config.voxel_size_m)
+        offsets = (index - low // side)[:, ::-1]
+        self._observed = dense(observed & within[:, None], offsets, size, side)
+        self._squared = self._transform(dense(occupied, offsets, size, side))
         self._low, self._state = low, state
 
     def _transform(self, occupied: Flags) -> npt.NDArray[np.uint16]:
@@ -151,22 +151,22 @@ class EuclideanField:
             If points are of another shape.
 
         """
-        places = np.floor(in_voxels(self._blocks, points)[0]) - self._low
+        scaled = np.floor(in_voxels(self._blocks, points)[0]) - self._low
         shape = self._squared.shape[::-1]
-        inside = np.all((places >= 0.0) & (places < shape), axis=1)
-        x, y, z = places[inside].astype(np.int64).T
-        found = np.full(len(places), np.nan, np.float32)
+        inside = np.all((scaled >= 0.0) & (scaled < shape), axis=1)
+        x, y, z = scaled[inside].astype(np.int64).T
+        distances = np.full(len(scaled), np.nan, np.float32)
         metres = self._metres(self._squared[z, y, x])
-        found[inside] = np.where(self._known[z, y, x], metres, np.nan)
-        return found
+        distances[inside] = np.where(self._observed[z, y, x], metres, np.nan)
+        return distances
 
     def known(self) -> KnownDistances:
         """Return the distances of all observed voxels within the radius."""
-        places = np.nonzero(self._known)
-        voxels = np.stack(places[::-1], axis=1) + self._low
+        index = np.nonzero(self._observed)
+        voxels = np.stack(index[::-1], axis=1) + self._low
         return KnownDistances(
             points=np.asarray((voxels + 0.5) * self._blocks.config.voxel_size_m, np.float64),
-            distance=self._metres(self._squared[places]),
+            distance=self._metres(self._squared[index]),
         )
 
     def _metres(self, squared: npt.NDArray[np.uint16]) -> npt.NDArray[np.float32]:
@@ -174,8 +174,8 @@ class EuclideanField:
         return np.asarray(np.minimum(metres, self.max_m), np.float32)
 
 
-def dense(values: Flags, places: Int64, size: Int64, side: int) -> Flags:
-    """Return the voxels of blocks (K, N) at places (K, 3), z y x, in a box of voxels, x y z."""
+def dense(values: Flags, offsets: Int64, size: Int64, side: int) -> Flags:
+    """Return the voxels of blocks (K, N) at offsets (K, 3), z y x, in a box of voxels, x y z."""
     box = np.zeros((*size[::-1] // side, side, side, side), bool)
-    box[tuple(places.T)] = values.reshape(-1, side, side, side)
+    box[tuple(offsets.T)] = values.reshape(-1, side, side, side)
     return box.transpose(0, 3, 1, 4, 2, 5).reshape(tuple(size[::-1]))

@@ -138,27 +138,27 @@ class Integrator:
         thin = self._thin_points(image, T)
         selected = self._selection.blocks(image, T, thin)
         index, blocks = selected.index, self.blocks
-        before = blocks.num_blocks
+        num_before = blocks.num_blocks
         rows = blocks.place(index)
         try:
             skipped = ~selected.near & self._free_for_long(rows)
             blocks.head[rows[skipped], STAMP] = stamp_ns
             fused = ~skipped
             sums = self._thin_sums(thin, selected.thin, image, T)
-            found = self._fuse(image, T, stamp_ns, index[fused], rows[fused], sums)
-            observed = found[:, OBSERVED]
+            figures = self._fuse(image, T, stamp_ns, index[fused], rows[fused], sums)
+            observed = figures[:, OBSERVED]
             changed = observed > 0
             updated = rows[fused][changed]
             if len(updated):
-                figures = (found[changed, column] for column in (MOVED, SOLID, INSIDE))
-                blocks.touch_fused(updated, stamp_ns, *figures)
+                columns = (figures[changed, column] for column in (MOVED, SOLID, INSIDE))
+                blocks.touch_fused(updated, stamp_ns, *columns)
         finally:
             blocks.drop_new(rows)
         return Integrated(
             num_blocks=len(index),
             num_updated=len(updated),
             num_skipped=int(skipped.sum()),
-            num_added=blocks.num_blocks - before,
+            num_added=blocks.num_blocks - num_before,
             num_voxels=int(observed.sum()),
         )
 
@@ -168,8 +168,8 @@ class Integrator:
         thin = image.thin(size_m, THIN_VOXELS * size_m)
         range_m = image.range_m[:, : sensor.columns][thin].astype(np.float64)
         local = sensor.directions[thin] * range_m[:, None]
-        found: Float64 = (local @ T_map_sensor[:3, :3].T + T_map_sensor[:3, 3]) / size_m
-        return found
+        points: Float64 = (local @ T_map_sensor[:3, :3].T + T_map_sensor[:3, 3]) / size_m
+        return points
 
     def _thin_sums(
         self, points: Float64, index: Int64, image: RangeImage, T_map_sensor: Float64
@@ -207,9 +207,9 @@ class Integrator:
         corner = index * config.block_size_m + 0.5 * config.voxel_size_m
         corners = ((corner - T_map_sensor[:3, 3]) @ R_sensor_map.T).astype(np.float32)
         offsets = (R_sensor_map @ self._voxels).astype(np.float32)
-        found = np.empty((len(rows), NUM_FOUND), np.int64)
+        figures = np.empty((len(rows), NUM_FOUND), np.int64)
         slots, sums = thin
-        each = rows, corners, self.blocks.forgetting_rates(rows, stamp_ns), slots[rows]
+        per_block = rows, corners, self.blocks.forgetting_rates(rows, stamp_ns), slots[rows]
         common = (
             offsets,
             self.blocks.field,
@@ -221,12 +221,12 @@ class Integrator:
             (self.blocks.color, self.blocks.votes),
         )
 
-        def fuse(part: slice) -> None:
-            where = tuple(values[part] for values in each)
-            integrate_blocks(where, *common, found[part])
+        def fuse(chunk: slice) -> None:
+            where = tuple(values[chunk] for values in per_block)
+            integrate_blocks(where, *common, figures[chunk])
 
         share(fuse, len(rows), self._threads)
-        return found
+        return figures
 
     def _free_for_long(self, rows: Int64) -> npt.NDArray[np.bool_]:
         """
@@ -267,8 +267,8 @@ class Integrator:
     def _images(self, image: RangeImage) -> tuple[npt.NDArray[Any], ...]:
         """Return ranges in pairs, cosines, colours, labels, mask; missing ones have no rows."""
         mask, label = image.mask, image.label
-        rows, (left, right) = kernels.BORDER
-        edges = [rows, (left, right - image.sensor.wraps)]
+        rows, (first, last) = kernels.BORDER
+        edges = [rows, (first, last - image.sensor.wraps)]
         return (
             paired(np.pad(image.range_m, edges)),
             NO_COSINE if image.cosine is None else np.pad(image.cosine, edges),
@@ -289,11 +289,11 @@ def paired(range_m: Float32) -> Int64:
 def image_settings(config: TsdfConfig, image: RangeImage) -> Float32:
     """Return the settings of the integration of an image, in the order of kernels/lookup.py."""
     sensor, is_lidar = image.sensor, isinstance(image.sensor, LidarModel)
-    found = settings(config)
-    found[kernels.MIN_RANGE] = sensor.min_range_m
-    found[kernels.MAX_RANGE] = sensor.max_range_m
-    found[kernels.LIMIT] = image.largest_m + reach_behind_m(config, image)
-    found[kernels.MAX_DIFFERENCE] = config.max_difference_m
-    found[kernels.MAX_OFFSET] = config.ray_offset_voxels * config.voxel_size_m * is_lidar
-    found[kernels.COLUMN_RAD] = sensor.pitch_rad[1]
-    return found
+    values = settings(config)
+    values[kernels.MIN_RANGE] = sensor.min_range_m
+    values[kernels.MAX_RANGE] = sensor.max_range_m
+    values[kernels.LIMIT] = image.largest_m + reach_behind_m(config, image)
+    values[kernels.MAX_DIFFERENCE] = config.max_difference_m
+    values[kernels.MAX_OFFSET] = config.ray_offset_voxels * config.voxel_size_m * is_lidar
+    values[kernels.COLUMN_RAD] = sensor.pitch_rad[1]
+    return values

@@ -62,29 +62,29 @@ class Integrated:
 
 def settings(config: TsdfConfig) -> Float32:
     """Return the settings that any integration needs, in the order of kernels/lookup.py."""
-    found = np.zeros(kernels.NUM_SETTINGS, np.float32)
-    found[kernels.TAU] = config.truncation_m
-    found[kernels.MIN_RANGE] = config.min_range_m
-    found[kernels.MAX_RANGE] = config.max_range_m
-    found[kernels.DROPOFF] = config.voxel_size_m
-    found[kernels.MIN_WEIGHT] = config.min_measurement_weight
-    found[kernels.MAX_WEIGHT] = config.max_weight
-    found[kernels.CONTRADICTS] = 0.5 * config.voxel_size_m
-    found[kernels.LEAST] = max(config.least_mesh_weight, 1e-30)
-    return found
+    values = np.zeros(kernels.NUM_SETTINGS, np.float32)
+    values[kernels.TAU] = config.truncation_m
+    values[kernels.MIN_RANGE] = config.min_range_m
+    values[kernels.MAX_RANGE] = config.max_range_m
+    values[kernels.DROPOFF] = config.voxel_size_m
+    values[kernels.MIN_WEIGHT] = config.min_measurement_weight
+    values[kernels.MAX_WEIGHT] = config.max_weight
+    values[kernels.CONTRADICTS] = 0.5 * config.voxel_size_m
+    values[kernels.LEAST] = max(config.least_mesh_weight, 1e-30)
+    return values
 
 
 def checked_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
     """Return points (N, 3) as float32 or float64; raise CloudFormatError for other shapes."""
     try:
-        found = as_array('points', points)
+        array = as_array('points', points)
     except ValueError as error:
         raise CloudFormatError(str(error)) from None
-    if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in 'fiu':
-        raise CloudFormatError(f'points: {found.dtype} {found.shape}, expected (N, 3) float')
-    if found.dtype == np.float16:
-        return found.astype(np.float32)
-    return found if found.dtype in (np.float32, np.float64) else found.astype(np.float64)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in 'fiu':
+        raise CloudFormatError(f'points: {array.dtype} {array.shape}, expected (N, 3) float')
+    if array.dtype == np.float16:
+        return array.astype(np.float32)
+    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
 
 
 def checked_column(
@@ -94,13 +94,13 @@ def checked_column(
     if values is None:
         return None
     try:
-        found = as_array(name, values)
+        array = as_array(name, values)
     except ValueError as error:
         raise CloudFormatError(str(error)) from None
-    if found.shape not in shapes or not np.issubdtype(found.dtype, kind):
+    if array.shape not in shapes or not np.issubdtype(array.dtype, kind):
         expected = f'{kind.__name__} {" or ".join(map(str, shapes))}, one for each point'
-        raise CloudFormatError(f'{name}: {found.dtype} {found.shape}, expected {expected}')
-    return found
+        raise CloudFormatError(f'{name}: {array.dtype} {array.shape}, expected {expected}')
+    return array
 
 
 @cache
@@ -135,9 +135,9 @@ def checked_pose(T_map_sensor: Float64) -> Float64:
         raise PoseError(f'pose of the sensor: {R.tolist()} is not a rotation')
     if skew > EXACT:
         warn_of_skew()
-        left, _, right = np.linalg.svd(R)
+        u, _, vt = np.linalg.svd(R)
         T = T.copy()
-        T[:3, :3] = left @ right
+        T[:3, :3] = u @ vt
     if np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
         raise PoseError(f'pose of the sensor: last row {T[3].tolist()}, expected 0 0 0 1')
     return T

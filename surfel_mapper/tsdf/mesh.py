@@ -191,7 +191,7 @@ class Mesher:
         emptied = self._keys.intersection(keys[~has_inside].tolist())
         self._keys -= emptied
         self._keys.update(keys[has_inside].tolist())
-        needed, place = np.unique(around[has_inside], return_inverse=True)
+        needed, inverse = np.unique(around[has_inside], return_inverse=True)
         missing = int(len(needed) > 0 and needed[0] < 0)
         needed = needed[missing:]
         return Changes(
@@ -199,7 +199,7 @@ class Mesher:
             emptied=list(gone | emptied),
             keys=keys[has_inside],
             index=blocks.index(rows[has_inside]),
-            neighbours=place.reshape(-1, 8) - missing,
+            neighbours=inverse.reshape(-1, 8) - missing,
             field=blocks.field[needed],
             color=copied_rows(blocks.color, needed),
             votes=copied_rows(blocks.votes, needed),
@@ -259,11 +259,11 @@ class Mesher:
         config = self._blocks.config
         bits = np.empty((len(changes.field), changes.field.shape[2]), np.uint8)
         describe(changes.field, config.least_mesh_weight, bits)
-        found: list[BlockMesh | None] = []
+        meshes: list[BlockMesh | None] = []
         for first in range(0, len(changes.keys), BATCH):
-            part = slice(first, first + BATCH)
-            found += self._batch(changes, changes.neighbours[part], changes.index[part], bits)
-        return found
+            batch = slice(first, first + BATCH)
+            meshes += self._batch(changes, changes.neighbours[batch], changes.index[batch], bits)
+        return meshes
 
     def _batch(
         self, changes: Changes, neighbours: Int64, index: Int64, bits: UInt8
@@ -277,19 +277,19 @@ class Mesher:
         starts = np.cumsum([0, *counts.tolist()])
         triangles = np.empty((starts[-1], 3), np.int32)
         edges = np.empty((3 * starts[-1], 4), np.int32)
-        places, num_vertices = np.empty(3 * starts[-1]), np.empty(num, np.int64)
-        march(neighbours, index, *content, cases, starts, triangles, edges, places, num_vertices)
+        along, num_vertices = np.empty(3 * starts[-1]), np.empty(num, np.int64)
+        march(neighbours, index, *content, cases, starts, triangles, edges, along, num_vertices)
         bounds = np.cumsum([0, *num_vertices.tolist()])
-        edges, places = edges[: bounds[-1]].copy(), places[: bounds[-1]]
+        edges, along = edges[: bounds[-1]].copy(), along[: bounds[-1]]
         vertices = edges[:, :3] + 0.5
-        vertices[np.arange(len(edges)), edges[:, 3]] += places
+        vertices[np.arange(len(edges)), edges[:, 3]] += along
         vertices *= config.voxel_size_m
         colors, labels = EMPTY.colors, EMPTY.labels
         if config.color or config.semantics != 'none':
             block = np.repeat(np.arange(num), num_vertices)
             ends = ends_of(edges, neighbours[block], index[block], side)
-            labels = self._labels(changes, ends, places)
-            colors = self._colors(changes, ends, places) if config.color else label_colors(labels)
+            labels = self._labels(changes, ends, along)
+            colors = self._colors(changes, ends, along) if config.color else label_colors(labels)
         return [
             BlockMesh(
                 vertices=vertices[bounds[i] : bounds[i + 1]],
@@ -303,24 +303,24 @@ class Mesher:
             for i in range(num)
         ]
 
-    def _colors(self, changes: Changes, ends: tuple[Int64, Int64], places: Float64) -> UInt8:
+    def _colors(self, changes: Changes, ends: tuple[Int64, Int64], along: Float64) -> UInt8:
         """Return colours interpolated between the voxels at the ends of edges."""
         rows, voxels = ends
         color = changes.color[rows, :, voxels].astype(np.float64)
-        share = np.stack([1.0 - places, places], axis=1) * (color[..., 3] > 0.0)
+        share = np.stack([1.0 - along, along], axis=1) * (color[..., 3] > 0.0)
         total = share.sum(axis=1, keepdims=True)
         share = np.divide(share, total, out=np.zeros_like(share), where=total > 0.0)
         mixed = (share[..., None] * color[..., :3]).sum(axis=1)
         return np.asarray(np.rint(mixed), np.uint8)
 
-    def _labels(self, changes: Changes, ends: tuple[Int64, Int64], places: Float64) -> Int32:
+    def _labels(self, changes: Changes, ends: tuple[Int64, Int64], along: Float64) -> Int32:
         """Return the label at the nearer end of each edge that has one."""
         config = self._blocks.config
         if config.semantics == 'none':
             return np.empty(0, np.int32)
         votes = np.moveaxis(changes.votes[ends[0], :, ends[1]], -1, 0)
         labels, _ = labels_of(votes)
-        second = places > 0.5
+        second = along > 0.5
         near = np.where(second, labels[:, 1], labels[:, 0])
         return np.where(near >= 0, near, np.where(second, labels[:, 0], labels[:, 1]))
 

@@ -106,7 +106,7 @@ class PointIntegrator:
         used = np.isfinite(points).all(axis=1)
         local = points[used].astype(np.float64)
         ranges = np.linalg.norm(local, axis=1)
-        places = (local @ T[:3, :3].T + T[:3, 3]) / voxel_m
+        scaled = (local @ T[:3, :3].T + T[:3, 3]) / voxel_m
         solid: npt.NDArray[Any] = np.ones(len(local), bool)
         if labels is not None:
             labels = np.asarray(labels[used], np.int32)
@@ -114,44 +114,44 @@ class PointIntegrator:
             labels = labels[solid]
         if colors is not None:
             colors = np.ascontiguousarray(colors[used][solid])
-        surfaces = np.ascontiguousarray(places[solid])
+        surfaces = np.ascontiguousarray(scaled[solid])
         index = self._touched(local, ranges, surfaces, T)
-        before = blocks.num_blocks
+        num_before = blocks.num_blocks
         rows = blocks.place(index)
         try:
             slots = np.full(len(blocks.head), -1, np.int64)
             slots[rows] = np.arange(len(rows))
             rates = blocks.forgetting_rates(rows, stamp_ns)
-            found = self._fuse(places, surfaces, T[:3, 3] / voxel_m, rows, slots, rates)
+            figures = self._fuse(scaled, surfaces, T[:3, 3] / voxel_m, rows, slots, rates)
             images = (
                 NO_COLORS if colors is None else colors,
                 NO_LABELS if labels is None else labels,
             )
             self._fuse_channels(surfaces, ranges[solid], rates, slots, images)
-            changed = found[:, OBSERVED] > 0
+            changed = figures[:, OBSERVED] > 0
             if changed.any():
-                figures = (found[changed, column] for column in (MOVED, SOLID, INSIDE))
-                blocks.touch_fused(rows[changed], stamp_ns, *figures)
+                columns = (figures[changed, column] for column in (MOVED, SOLID, INSIDE))
+                blocks.touch_fused(rows[changed], stamp_ns, *columns)
         finally:
             blocks.drop_new(rows)
         return Integrated(
             num_blocks=len(index),
             num_updated=int(changed.sum()),
             num_skipped=0,
-            num_added=blocks.num_blocks - before,
-            num_voxels=int(found[:, OBSERVED].sum()),
+            num_added=blocks.num_blocks - num_before,
+            num_voxels=int(figures[:, OBSERVED].sum()),
         )
 
     def _fuse(
         self,
-        places: Float64,
+        scaled: Float64,
         surfaces: Float64,
         origin: Float64,
         rows: Int64,
         slots: Int64,
         rates: Float32,
     ) -> Int64:
-        """Fuse distances, places and origin in voxels; return figures of each block."""
+        """Fuse distances, points and origin in voxels; return figures of each block."""
         config, blocks = self.blocks.config, self.blocks
         sums = np.zeros((len(rows), blocks.voxels_per_block, 3), np.float32)
         content = (
@@ -162,10 +162,10 @@ class PointIntegrator:
         )
         kernels.sum_surfaces(surfaces, origin, False, *content, blocks.lookup, slots, sums)
         if config.carve:
-            kernels.sum_free(places, origin, *content, blocks.lookup, slots, sums)
-        found = np.empty((len(rows), NUM_FOUND), np.int64)
-        kernels.fuse_sums(rows, sums, rates, settings(config), blocks.field, found)
-        return found
+            kernels.sum_free(scaled, origin, *content, blocks.lookup, slots, sums)
+        figures = np.empty((len(rows), NUM_FOUND), np.int64)
+        kernels.fuse_sums(rows, sums, rates, settings(config), blocks.field, figures)
+        return figures
 
     def _touched(
         self, local: Float64, ranges: Float64, surfaces: Float64, T_map_sensor: Float64

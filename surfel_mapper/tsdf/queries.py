@@ -65,12 +65,12 @@ def sample(blocks: BlockMap, points: npt.ArrayLike, *, min_weight: float = 0.0) 
         If points are of another shape.
 
     """
-    places, bits = in_voxels(blocks, points)
+    scaled, bits = in_voxels(blocks, points)
     head, table, state = blocks.lookup
-    distance = np.empty(len(places), np.float32)
-    gradient = np.empty((len(places), 3), np.float32)
+    distance = np.empty(len(scaled), np.float32)
+    gradient = np.empty((len(scaled), 3), np.float32)
     kernels.sample(
-        places,
+        scaled,
         1.0 / blocks.config.voxel_size_m,
         bits,
         np.float32(min_weight),
@@ -112,13 +112,13 @@ def states(
         If points are of another shape.
 
     """
-    places, bits = in_voxels(blocks, points)
+    scaled, bits = in_voxels(blocks, points)
     if occupied_up_to_m is None:
         occupied_up_to_m = 0.5 * blocks.config.voxel_size_m
     head, table, state = blocks.lookup
-    found = np.empty(len(places), np.uint8)
+    states = np.empty(len(scaled), np.uint8)
     kernels.classify(
-        places,
+        scaled,
         bits,
         np.float32(min_weight),
         np.float32(occupied_up_to_m),
@@ -126,18 +126,18 @@ def states(
         head,
         table,
         state,
-        found,
+        states,
     )
-    return found
+    return states
 
 
 def in_voxels(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], int]:
     """Return points in units of voxels, and the bits of a voxel index within a block."""
-    places = as_numbers('points', points)
-    if places.ndim != 2 or places.shape[1] != 3:
-        raise ValueError(f'points: {places.shape}, expected (P, 3)')
+    xyz = as_numbers('points', points)
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise ValueError(f'points: {xyz.shape}, expected (P, 3)')
     bits = blocks.config.voxels_per_side.bit_length() - 1
-    return places / blocks.config.voxel_size_m, bits
+    return xyz / blocks.config.voxel_size_m, bits
 
 
 Float32 = npt.NDArray[np.float32]
@@ -188,9 +188,9 @@ def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.i
     """
     if blocks.config.semantics == 'none':
         raise ValueError("semantics: 'none', expected a map that keeps labels")
-    places, bits = in_voxels(blocks, points)
-    near = np.abs(places).max(axis=1) < 1e12  # false for nan and for indices beyond int64
-    voxel = np.floor(np.where(near[:, None], places, 0.0)).astype(np.int64)
+    scaled, bits = in_voxels(blocks, points)
+    near = np.abs(scaled).max(axis=1) < 1e12  # false for nan and for indices beyond int64
+    voxel = np.floor(np.where(near[:, None], scaled, 0.0)).astype(np.int64)
     rows = np.where(near, blocks.find(voxel >> bits), -1)
     x, y, z = (voxel & ((1 << bits) - 1)).T
     votes = blocks.votes[rows, :, x + ((y + (z << bits)) << bits)]

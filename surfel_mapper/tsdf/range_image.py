@@ -102,13 +102,13 @@ class RangeImage:
             if more['color'].dtype != np.uint8:
                 raise CloudFormatError(f'color: {more["color"].dtype}, expected uint8')
         if label is not None:
-            found = self._fitted('label', np.asarray(label), ())
-            if found.dtype.kind not in 'iu' or not -1 <= found.min() <= found.max() <= MAX_LABEL:
+            image = self._fitted('label', np.asarray(label), ())
+            if image.dtype.kind not in 'iu' or not -1 <= image.min() <= image.max() <= MAX_LABEL:
                 raise CloudFormatError(
-                    f'label: {found.dtype} from {found.min()} to {found.max()}, expected whole '
+                    f'label: {image.dtype} from {image.min()} to {image.max()}, expected whole '
                     f'numbers from -1 to {MAX_LABEL}'
                 )
-            more['label'] = found.astype(np.int32, copy=False)
+            more['label'] = image.astype(np.int32, copy=False)
         if mask is not None:
             more['mask'] = (self._fitted('mask', np.asarray(mask), ()) != 0).astype(np.uint8)
         return replace(self, **more)
@@ -136,14 +136,14 @@ class RangeImage:
         are wrong at edges.
         """
         sensor = self.sensor
-        found = np.zeros((sensor.rows, sensor.columns), bool)
+        thin = np.zeros((sensor.rows, sensor.columns), bool)
         if isinstance(sensor, LidarModel):
             level = np.cos(sensor.elevations_rad) * sensor.pitch_rad[1]
             farthest = np.float32(sensor.max_range_m)
-            kernels.find_thin(self.range_m, level, step_m, widest_m, farthest, found)
+            kernels.find_thin(self.range_m, level, step_m, widest_m, farthest, thin)
         if self.mask is not None:
-            found &= self.mask[:, : sensor.columns] == 0
-        return found
+            thin &= self.mask[:, : sensor.columns] == 0
+        return thin
 
     def _fitted(
         self, name: str, image: npt.NDArray[Any], channels: tuple[int, ...]
@@ -224,14 +224,14 @@ def from_points(
     largest, used = kernels.from_points(
         np.ascontiguousarray(points), sensor.projection, limits(sensor), image, source
     )
-    found = RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
+    range_image = RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
     more: dict[str, npt.NDArray[Any]] = {}
     if colors is not None:
         channels = 4 if colors.shape[-1:] == (4,) else 3
-        more['color'] = taken('colors', colors, (len(points), channels), source, 0)
+        more['color'] = image_of('colors', colors, (len(points), channels), source, 0)
     if labels is not None:
-        more['label'] = taken('labels', labels, (len(points),), source, -1)
-    return found.with_images(**more) if more else found
+        more['label'] = image_of('labels', labels, (len(points),), source, -1)
+    return range_image.with_images(**more) if more else range_image
 
 
 def from_ranges(sensor: Sensor, range_m: npt.NDArray[Any]) -> RangeImage:
@@ -272,7 +272,7 @@ def limits(sensor: Sensor) -> Float32:
     return np.array([sensor.min_range_m, farthest, farthest + CLEARING_M], np.float32)
 
 
-def taken(
+def image_of(
     name: str,
     values: npt.NDArray[Any],
     shape: tuple[int, ...],

@@ -55,8 +55,8 @@ def find_blocks(keys, head, table, state, rows):
     rows  (K,) int64, out: row, -1 for blocks not in the map
     """
     depth = state[DEPTH]
-    for place in range(len(keys)):
-        rows[place] = find_row(keys[place], head, table, depth) if keys[place] >= 0 else -1
+    for i in range(len(keys)):
+        rows[i] = find_row(keys[i], head, table, depth) if keys[i] >= 0 else -1
 
 
 @njit(cache=True, nogil=True)
@@ -72,13 +72,13 @@ def place_blocks(keys, head, table, state, start, rows):
     """
     depth = state[DEPTH]
     entries = np.empty(SEGMENT, np.int64)
-    for place in range(start, len(keys)):
-        key = keys[place]
+    for i in range(start, len(keys)):
+        key = keys[i]
         row = find_row(key, head, table, depth)
         if row < 0:
             hashed = hash_key(key)
             if not makes_room(hashed, table, state, entries):
-                return place
+                return i
             row = state[FREE_ROW]
             if row >= 0:
                 state[FREE_ROW] = head[row, KEY]
@@ -86,21 +86,21 @@ def place_blocks(keys, head, table, state, start, rows):
                 row = state[NEXT_ROW]
                 state[NEXT_ROW] = row + 1
             else:
-                return place
+                return i
             head[row, KEY] = key
             head[row, VERSION] = NEW
             head[row, STAMP:] = 0
             insert_row(hashed, row, table, depth)
             state[VOXELS] += 1
-        rows[place] = row
+        rows[i] = row
     return len(keys)
 
 
 @njit(cache=True, nogil=True)
 def remove_blocks(rows, head, table, state):
     """Remove the blocks of rows, (K,) int64, from the table and free the rows."""
-    for place in range(len(rows)):
-        row = np.int64(rows[place])
+    for i in range(len(rows)):
+        row = np.int64(rows[i])
         remove_row(head[row, KEY], row, table, state[DEPTH])
         head[row, KEY] = state[FREE_ROW]
         head[row, VERSION] = FREE

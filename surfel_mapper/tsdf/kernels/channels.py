@@ -92,9 +92,9 @@ def fuse_color(image, bounds, u, v, mixed, signed, weight, color):
             if mixed[n] != 0:
                 right = np.float32(image[j, i + 1, channel])
                 upper = value + du * (right - value)
-                left = np.float32(image[j + 1, i, channel])
+                below = np.float32(image[j + 1, i, channel])
                 right = np.float32(image[j + 1, i + 1, channel])
-                value = upper + dv * (left + du * (right - left) - upper)
+                value = upper + dv * (below + du * (right - below) - upper)
             color[channel, n] += (value - color[channel, n]) * gain
         color[3, n] = min(together, max_weight)
 
@@ -121,12 +121,12 @@ def vote_labels(image, tau, u, v, mixed, signed, label):
         shares[0], shares[1] = (_ONE - du) * (_ONE - dv), du * (_ONE - dv)
         shares[2], shares[3] = (_ONE - du) * dv, du * dv
         best, most = np.int32(-1), _ZERO
-        for one in range(4):
+        for first in range(4):
             share = _ZERO
-            for other in range(4):
-                share += shares[other] if names[other] == names[one] else _ZERO
-            if share > most or (share == most and names[one] < best):
-                best, most = names[one], share
+            for second in range(4):
+                share += shares[second] if names[second] == names[first] else _ZERO
+            if share > most or (share == most and names[first] < best):
+                best, most = names[first], share
         label[n] = best
 
 

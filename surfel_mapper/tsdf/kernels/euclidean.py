@@ -21,7 +21,7 @@ MAX_REACH = 127
 @njit(cache=True, nogil=True)
 def spread(source, reach, target):
     """
-    Lower the squared distances of lines by those of the lines around.
+    Lower the squared distances of lines by the distances of the lines around.
 
     source, target  (K, L, N) uint16; along the second axis, target is equal to source at first
     reach           largest distance, voxels
@@ -29,9 +29,9 @@ def spread(source, reach, target):
     for k in range(source.shape[0]):
         for line in range(source.shape[1]):
             first, end = max(line - reach, 0), min(line + reach + 1, source.shape[1])
-            for other in range(first, end):
-                step = np.uint16((other - line) * (other - line))
+            for near in range(first, end):
+                step = np.uint16((near - line) * (near - line))
                 for n in range(source.shape[2]):
-                    through = np.uint16(source[k, other, n] + step)
+                    through = np.uint16(source[k, near, n] + step)
                     if through < target[k, line, n]:
                         target[k, line, n] = through

@@ -74,14 +74,14 @@ JUMP = np.int32(2**31 - 1)
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def integrate_blocks(
-    blocks, offsets, field, sensor, images, sums, settings, power, channels, found
+    blocks, offsets, field, sensor, images, sums, settings, power, channels, figures
 ):
     """
     Fuse a range image into blocks.
 
     blocks    (rows, corners, rates, slots) of K blocks: (K,) int64, their rows; (K, 3) float32 m,
               centres of their first voxels in the sensor's frame; (K,) float32, least shares of
-              contradicting measurements, in [0, 1); (K,) int64, places in sums, -1 for none
+              contradicting measurements, in [0, 1); (K,) int64, slots in sums, -1 for none
     offsets   (3, N) float32 m, from the first voxel to every voxel, x fastest
     field     (R, 2, N) float32, distance and weight of all blocks
     sensor    (kind, parameters, elevations, gaps), see kernels/projection.py and row_gaps
@@ -92,7 +92,7 @@ def integrate_blocks(
     settings  (NUM_SETTINGS,) float32
     power     weights fall by depth^-(2 power): 0 or 1
     channels  (color, votes): rows of all blocks, no rows for channels not kept
-    found     (K, NUM_FOUND) int64, out: see OBSERVED, MOVED, SOLID, INSIDE
+    figures   (K, NUM_FOUND) int64, out: see OBSERVED, MOVED, SOLID, INSIDE
     """
     num_voxels = offsets.shape[1]
     scratch = np.empty((11, num_voxels), np.float32)
@@ -100,7 +100,7 @@ def integrate_blocks(
     u, v, signed, weight = scratch[4], scratch[5], scratch[6], scratch[7]
     value, fused, summed = scratch[8], scratch[9], scratch[10]
     upper, lower = np.empty(num_voxels, np.int64), np.empty(num_voxels, np.int64)
-    place = np.empty(num_voxels, np.int32)
+    pixel = np.empty(num_voxels, np.int32)
     mixed, label = np.empty(num_voxels, np.uint8), np.empty(num_voxels, np.int32)
     kind, parameters, elevations, gaps = sensor
     pairs, cosine, color_image, label_image, mask = images
@@ -116,13 +116,13 @@ def integrate_blocks(
         shift(offsets[1], corners[b, 1], y)
         shift(offsets[2], corners[b, 2], z)
         project(x, y, z, kind, parameters, elevations, distance, u, v)
-        locate(distance, u, v, stride, settings, place)
-        gather(pairs.ravel(), stride, place, upper, lower)
+        locate(distance, u, v, stride, settings, pixel)
+        gather(pairs.ravel(), stride, pixel, upper, lower)
         mix(upper.view(np.float32), lower.view(np.float32), u, v, settings, value)
         if settings[MAX_OFFSET] > _ZERO and has_single(value):
             row_gaps(kind, gaps, v, weight)
             drop_far(x, y, u, v, distance, weight, settings, value)
-        slant(cosine, stride, place, u, v, weight)
+        slant(cosine, stride, pixel, u, v, weight)
         subtract(value, distance, weight, settings, signed)
         count = count_observed(signed)
         if count > 0 and mask.shape[0] > 0:
@@ -137,9 +137,9 @@ def integrate_blocks(
             merged[:] = signed
             replace_summed(sums[slots[b]], tau, signed, merged)
             count = count_observed(merged)
-        found[b, OBSERVED] = count
+        figures[b, OBSERVED] = count
         if count == 0:
-            found[b, MOVED] = 0
+            figures[b, MOVED] = 0
             continue
         weigh(distance if kind > 0 else z, merged, settings, power, weight)
         if label_image.shape[0] > 0 and votes.shape[0] > 0:
@@ -150,9 +150,9 @@ def integrate_blocks(
             fuse_color(color_image, bounds, u, v, mixed, signed, weight, color[row])
         mean, total = field[row, 0], field[row, 1]
         fuse(merged, weight, settings[CONTRADICTS], rate, mean, total, fused)
-        found[b, MOVED] = largest_step(mean, fused, total, weight, settings[LEAST])
+        figures[b, MOVED] = largest_step(mean, fused, total, weight, settings[LEAST])
         replace(fused, weight, most, mean, total)
-        found[b, SOLID], found[b, INSIDE] = count_solid(mean, total, tau)
+        figures[b, SOLID], figures[b, INSIDE] = count_solid(mean, total, tau)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -177,8 +177,8 @@ def subtract(value, distance, factor, settings, signed):
         range_m, d = abs(value[n]), distance[n]
         s = (range_m - d) * factor[n]
         # A clearing pixel says nothing beyond the range of the sensor.
-        seen = (range_m > _ZERO) & (s >= -tau) & ((range_m <= reach) | (d <= reach))
-        signed[n] = min(max(s, -tau), tau) if seen else SKIP
+        observed = (range_m > _ZERO) & (s >= -tau) & ((range_m <= reach) | (d <= reach))
+        signed[n] = min(max(s, -tau), tau) if observed else SKIP
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

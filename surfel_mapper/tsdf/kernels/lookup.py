@@ -44,32 +44,32 @@ _TWO = np.float32(2.0)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def locate(distance, u, v, stride, settings, place):
+def locate(distance, u, v, stride, settings, pixel):
     """
     Find the pixel above and left of every voxel in the image with its border.
 
     u, v    (N,) float32, from -1 on, or u is OUTSIDE
     stride  columns of the image, border included
-    place   (N,) int32, out: number of the pixel; 0, in the border, for voxels out of view
+    pixel   (N,) int32, out: number of the pixel; 0, in the border, for voxels out of view
     """
     near, limit = settings[MIN_RANGE], settings[LIMIT]
     stride = np.int32(stride)
-    for n in range(len(place)):
-        found = np.int32(v[n] + _TWO) * stride + np.int32(u[n] + _ONE)
-        seen = (u[n] >= -_ONE) & (distance[n] >= near) & (distance[n] <= limit)
-        place[n] = found if seen else np.int32(0)
+    for n in range(len(pixel)):
+        number = np.int32(v[n] + _TWO) * stride + np.int32(u[n] + _ONE)
+        in_view = (u[n] >= -_ONE) & (distance[n] >= near) & (distance[n] <= limit)
+        pixel[n] = number if in_view else np.int32(0)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def gather(pairs, stride, place, upper, lower):
+def gather(pairs, stride, pixel, upper, lower):
     """
     Fetch the four pixels about every voxel, two at a time.
 
     pairs         (P,) int64: each pixel and its right neighbour, two float32
     upper, lower  (N,) int64, out: pairs
     """
-    for n in range(len(place)):
-        first = np.int64(place[n])
+    for n in range(len(pixel)):
+        first = np.int64(pixel[n])
         upper[n], lower[n] = pairs[first], pairs[first + stride]
 
 
@@ -135,10 +135,10 @@ def row_gaps(kind, gaps, v, gap):
 @njit(cache=True, nogil=True, error_model='numpy')
 def has_single(value):
     """Return whether any range is that of a single pixel."""
-    found = np.int32(0)
+    single = np.int32(0)
     for n in range(len(value)):
-        found |= np.int32(value[n] < _ZERO)
-    return found != 0
+        single |= np.int32(value[n] < _ZERO)
+    return single != 0
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -156,11 +156,11 @@ def drop_far(x, y, u, v, distance, gap, settings, value):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def slant(cosine, stride, place, u, v, factor):
+def slant(cosine, stride, pixel, u, v, factor):
     """
     Find the factor of distances along the ray: 1, or the cosine at the nearest pixel.
 
-    place   (N,) int32, in: number of the upper left pixel; out: of the nearest one
+    pixel   (N,) int32, in: number of the upper left pixel; out: of the nearest one
     cosine  (rows, columns) float32 with its border, or no rows
     factor  (N,) float32, out
     """
@@ -173,7 +173,7 @@ def slant(cosine, stride, place, u, v, factor):
         right, below = u[n] + _ONE, v[n] + _ONE
         aside = np.int32(right - np.float32(np.int32(right)) >= _HALF)
         down = step if below - np.float32(np.int32(below)) >= _HALF else np.int32(0)
-        place[n] = place[n] + aside + down
+        pixel[n] = pixel[n] + aside + down
     flat = cosine.ravel()
     for n in range(len(factor)):
-        factor[n] = flat[np.int64(place[n])]
+        factor[n] = flat[np.int64(pixel[n])]

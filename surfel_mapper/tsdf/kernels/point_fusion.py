@@ -80,12 +80,12 @@ def mark_corners(points, origin, low, side, bits, limits, marks):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def begin_walk(origin, along, start, end, places, steps, reached, spacing):
+def begin_walk(origin, along, start, end, index, steps, reached, spacing):
     """
     Prepare the traversal of voxels from origin + start along to origin + end along.
 
     origin, along  (3,) float64
-    places         (3,) int64, out: the first voxel
+    index          (3,) int64, out: the first voxel
     steps          (2, 3) int64, out: direction and number of steps along each axis
     reached        (3,) float64, out: range at which the next voxel along each axis begins
     spacing        (3,) float64, out: range from voxel to voxel
@@ -94,19 +94,19 @@ def begin_walk(origin, along, start, end, places, steps, reached, spacing):
     """
     number = 1
     for axis in range(3):
-        found = walk(origin[axis], along[axis], start, end, 1)
-        places[axis], reached[axis], spacing[axis], steps[0, axis], steps[1, axis] = found
+        stepping = walk(origin[axis], along[axis], start, end, 1)
+        index[axis], reached[axis], spacing[axis], steps[0, axis], steps[1, axis] = stepping
         number += steps[1, axis]
     return number
 
 
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def next_voxel(places, steps, reached, spacing):
+def next_voxel(index, steps, reached, spacing):
     """Go to the next voxel of a traversal, see begin_walk."""
     axis = 0 if reached[0] <= reached[1] and reached[0] <= reached[2] else 2
     if axis == 2 and reached[1] <= reached[2]:
         axis = 1
-    places[axis] += steps[0, axis]
+    index[axis] += steps[0, axis]
     steps[1, axis] -= 1
     reached[axis] = reached[axis] + spacing[axis] if steps[1, axis] > 0 else np.inf
 
@@ -147,7 +147,7 @@ def sum_surfaces(points, origin, core_only, voxel_m, bits, settings, power, look
     start_m, least = settings[DROPOFF], settings[MIN_WEIGHT]
     per_metre = 1.0 / (settings[TAU] - start_m)
     mask = (1 << bits) - 1
-    places, steps = np.empty(3, np.int64), np.empty((2, 3), np.int64)
+    index, steps = np.empty(3, np.int64), np.empty((2, 3), np.int64)
     along, reached, spacing = np.empty(3), np.empty(3), np.empty(3)
     used = 0
     for p in range(len(points)):
@@ -161,8 +161,8 @@ def sum_surfaces(points, origin, core_only, voxel_m, bits, settings, power, look
         if core_only:
             start = end = measured
         along[0], along[1], along[2] = x, y, z
-        for _ in range(begin_walk(origin, along, start, end, places, steps, reached, spacing)):
-            i, j, k = places[0], places[1], places[2]
+        for _ in range(begin_walk(origin, along, start, end, index, steps, reached, spacing)):
+            i, j, k = index[0], index[1], index[2]
             u, v, w = i + 0.5 - origin[0], j + 0.5 - origin[1], k + 0.5 - origin[2]
             signed = measured - (x * u + y * v + z * w)
             if abs(signed) > CORE:  # nearer voxels follow below
@@ -173,8 +173,8 @@ def sum_surfaces(points, origin, core_only, voxel_m, bits, settings, power, look
                     sums[slot, voxel, 0] += weight * signed_m
                     sums[slot, voxel, 1] += weight
                     sums[slot, voxel, 2] += 1.0
-            next_voxel(places, steps, reached, spacing)
-        last_i, last_j, last_k = places[0] - 9, 0, 0
+            next_voxel(index, steps, reached, spacing)
+        last_i, last_j, last_k = index[0] - 9, 0, 0
         full = weight_at(measured * voxel_m, 0.0, settings, power)
         for sample in range(-2, 3):
             t = measured + sample * STEP
@@ -226,7 +226,7 @@ def sum_free(points, origin, voxel_m, bits, settings, power, lookup, slots, sums
     recent, depth = np.array([1 << 40, 0, 0, -1]), state[DEPTH]
     tau = settings[TAU] / voxel_m
     near, far = settings[MIN_RANGE] / voxel_m, settings[MAX_RANGE] / voxel_m
-    places, steps = np.empty(3, np.int64), np.empty((2, 3), np.int64)
+    index, steps = np.empty(3, np.int64), np.empty((2, 3), np.int64)
     along, ends = np.empty(3), np.empty(3)
     reached, spacing = np.empty(3), np.empty(3)
     for p in range(len(points)):
@@ -241,13 +241,13 @@ def sum_free(points, origin, voxel_m, bits, settings, power, lookup, slots, sums
         along[0], along[1], along[2] = -x, -y, -z
         for axis in range(3):
             ends[axis] = origin[axis] - end * along[axis]
-        seen = 0
-        for _ in range(begin_walk(ends, along, 0.0, end - near, places, steps, reached, spacing)):
-            i, j, k = places[0], places[1], places[2]
+        num_freed = 0
+        for _ in range(begin_walk(ends, along, 0.0, end - near, index, steps, reached, spacing)):
+            i, j, k = index[0], index[1], index[2]
             row, voxel = find_voxel(i, j, k, bits, recent, head, table, depth)
             if row >= 0 and slots[row] >= 0 and sums[slots[row], voxel, 2] <= 0.0:
-                seen = seen + 1 if sums[slots[row], voxel, 2] < 0.0 else 0
-                if seen > MOST_SEEN:
+                num_freed = num_freed + 1 if sums[slots[row], voxel, 2] < 0.0 else 0
+                if num_freed > MOST_SEEN:
                     break
                 u, v, w = i + 0.5 - origin[0], j + 0.5 - origin[1], k + 0.5 - origin[2]
                 ahead_m = max((x * u + y * v + z * w) * voxel_m, settings[MIN_RANGE])
@@ -255,11 +255,11 @@ def sum_free(points, origin, voxel_m, bits, settings, power, lookup, slots, sums
                 sums[slots[row], voxel, 0] += weight * settings[TAU]
                 sums[slots[row], voxel, 1] += weight
                 sums[slots[row], voxel, 2] -= 1.0
-            next_voxel(places, steps, reached, spacing)
+            next_voxel(index, steps, reached, spacing)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def fuse_sums(rows, sums, rates, settings, field, found):
+def fuse_sums(rows, sums, rates, settings, field, figures):
     """
     Fuse the summed measurements of a scan into blocks: each voxel once, with its mean weight.
 
@@ -268,12 +268,12 @@ def fuse_sums(rows, sums, rates, settings, field, found):
     rates     (K,) float32, least share of contradicting measurements
     settings  (NUM_SETTINGS,) float32, see kernels/lookup.py
     field     (R, 2, N) float32
-    found     (K, NUM_FOUND) int64, out: as of integrate_blocks
+    figures   (K, NUM_FOUND) int64, out: as of integrate_blocks
     """
     tau, least = settings[TAU], settings[LEAST]
     for slot in range(len(rows)):
         row = rows[slot]
-        found[slot] = 0
+        figures[slot] = 0
         for voxel in range(sums.shape[1]):
             mean, total = field[row, 0, voxel], field[row, 1, voxel]
             if sums[slot, voxel, 2] != 0.0:
@@ -285,13 +285,13 @@ def fuse_sums(rows, sums, rates, settings, field, found):
                 fused = mean + (value - mean) * gain
                 flips = (fused < 0.0) != (mean < 0.0) or total < least <= total + weight
                 moved = JUMP if flips else np.int64(abs(fused - mean) * 1e6)
-                found[slot, MOVED] = max(found[slot, MOVED], moved)
-                found[slot, OBSERVED] += 1
+                figures[slot, MOVED] = max(figures[slot, MOVED], moved)
+                figures[slot, OBSERVED] += 1
                 mean, total = fused, min(total + weight, settings[MAX_WEIGHT])
                 field[row, 0, voxel], field[row, 1, voxel] = mean, total
             if total > 0.0:
-                found[slot, SOLID] += mean < tau
-                found[slot, INSIDE] += mean < 0.0
+                figures[slot, SOLID] += mean < tau
+                figures[slot, INSIDE] += mean < 0.0
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
