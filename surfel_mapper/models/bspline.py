@@ -101,8 +101,8 @@ def basis(u: Array, knot: Array, degree: int) -> tuple[npt.NDArray[np.int64], Ar
         lower = values
         values = [np.zeros(len(u)) for _ in range(order + 1)]
         for k, value in enumerate(lower):
-            left, right = knot[span + 1 - order + k], knot[span + 1 + k]
-            share = (u - left) / (right - left) * value
+            low, high = knot[span + 1 - order + k], knot[span + 1 + k]
+            share = (u - low) / (high - low) * value
             values[k] += value - share
             values[k + 1] = share
     slopes = np.zeros((len(u), degree + 1))
@@ -202,14 +202,14 @@ def design(
         Factor of the derivatives.
 
     """
-    firsts, parts, unit = [], [], 1.0
+    firsts, factors, unit = [], [], 1.0
     for axis in range(2):
         first, values, slopes = field._basis(xy, axis)
         firsts.append(first[:, None] + np.arange(values.shape[1]))
-        parts.append(slopes if axis == along else values)
+        factors.append(slopes if axis == along else values)
         unit = 1.0 / field.width_m(axis) if axis == along else unit
     rows = firsts[0][:, :, None] * field.control.shape[1] + firsts[1][:, None, :]
-    weights = parts[0][:, :, None] * parts[1][:, None, :]
+    weights = factors[0][:, :, None] * factors[1][:, None, :]
     shape = len(xy), (field.degrees[0] + 1) * (field.degrees[1] + 1)
     return rows.reshape(shape), weights.reshape(shape), unit
 
@@ -286,19 +286,19 @@ def fit_pspline(
         return HeightField(start.pitch_m, start.origin, start.degrees, control)
     active = np.zeros(start.control.shape, np.bool_)
     active.ravel()[rows] = True
-    before = continued(start.control, start.control != 0.0)
-    control = relax(samples, start.greville(), active, (smoothing, RIDGE), before)
+    initial = continued(start.control, start.control != 0.0)
+    control = relax(samples, start.greville(), active, (smoothing, RIDGE), initial)
     control = continued(control, active)
     return HeightField(start.pitch_m, start.origin, start.degrees, control)
 
 
-def continued(control: Array, known: npt.NDArray[np.bool_]) -> Array:
+def continued(control: Array, fitted: npt.NDArray[np.bool_]) -> Array:
     """Return control points (Nx, Ny) where unknown ones have the height of the nearest other."""
     from scipy.ndimage import distance_transform_edt  # seconds to import
 
-    if not known.any():
+    if not fitted.any():
         return control
-    x, y = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    x, y = distance_transform_edt(~fitted, return_distances=False, return_indices=True)
     nearest: Array = control[x, y]
     return nearest
 

@@ -59,19 +59,19 @@ def is_direct(shape: tuple[int, ...], reach: int) -> bool:
     return number * width**2 <= MOST_DIRECT or min(shape) < LEAST_SIDE
 
 
-def second_differences(places: Array) -> Array:
-    """Return the matrix (N - 2, N) of second differences at (N,) places; 2 for equal steps."""
-    steps = np.diff(places)
-    before, after = steps[:-1], steps[1:]
-    matrix, row = np.zeros((len(places) - 2, len(places))), np.arange(len(places) - 2)
-    matrix[row, row] = 2.0 * after / (before + after)
+def second_differences(positions: Array) -> Array:
+    """Return the matrix (N - 2, N) of second differences at (N,) positions; 2 for equal steps."""
+    steps = np.diff(positions)
+    first, second = steps[:-1], steps[1:]
+    matrix, row = np.zeros((len(positions) - 2, len(positions))), np.arange(len(positions) - 2)
+    matrix[row, row] = 2.0 * second / (first + second)
     matrix[row, row + 1] = -2.0
-    matrix[row, row + 2] = 2.0 * before / (before + after)
+    matrix[row, row + 2] = 2.0 * first / (first + second)
     return matrix
 
 
 def solve_band(
-    samples: FieldSamples, places: tuple[Array, Array], rules: tuple[float, float]
+    samples: FieldSamples, positions: tuple[Array, Array], rules: tuple[float, float]
 ) -> Array:
     """
     Return the control points (Nx, Ny) that minimise squared residuals and the penalty, m.
@@ -80,26 +80,26 @@ def solve_band(
     ----------
     samples : FieldSamples
         Samples of the field.
-    places : (Nx,), (Ny,) float64, m
-        Places of the control points along x and y; Ny decides the width of the band.
+    positions : (Nx,), (Ny,) float64, m
+        Positions of the control points along x and y; Ny decides the width of the band.
     rules : (float, float)
         Weight of the penalty, and weight that pulls control points to 0.
 
     """
     from scipy.linalg import solveh_banded  # seconds to import
 
-    (smoothing, ridge), shape = rules, (len(places[0]), len(places[1]))
+    (smoothing, ridge), shape = rules, (len(positions[0]), len(positions[1]))
     reach = samples.rows[:, -1:] - samples.rows[:, :1] if len(samples.rows) else np.zeros((1, 1))
     width = max(int(reach.max()), 2 * shape[1], 2) + 1
     number = shape[0] * shape[1]
     weighted = samples.weights * samples.share[:, None]
     i, j = np.triu_indices(samples.rows.shape[1])
-    place = (samples.rows[:, j] - samples.rows[:, i]) * number + samples.rows[:, i]
+    index = (samples.rows[:, j] - samples.rows[:, i]) * number + samples.rows[:, i]
     entries = weighted[:, i] * samples.weights[:, j]
-    band = np.bincount(place.ravel(), entries.ravel(), width * number)
+    band = np.bincount(index.ravel(), entries.ravel(), width * number)
     grid = band.reshape(width, *shape)
     for axis in range(2):
-        second = second_differences(places[axis])
+        second = second_differences(positions[axis])
         product, step = second.T @ second, shape[1] if axis == 0 else 1
         for k in range(min(3, shape[axis])):
             along = np.zeros(shape[axis])
@@ -107,15 +107,15 @@ def solve_band(
             grid[k * step] += smoothing * (along[:, None] if axis == 0 else along)
     grid[0] += ridge
     right = np.bincount(samples.rows.ravel(), (weighted * samples.z[:, None]).ravel(), number)
-    found = solveh_banded(
+    solution = solveh_banded(
         band.reshape(width, number), right, lower=True, check_finite=False, overwrite_ab=True
     )
-    return np.array(found.reshape(shape), np.float64)  # a view would keep the band
+    return np.array(solution.reshape(shape), np.float64)  # a view would keep the band
 
 
 def relax(
     samples: FieldSamples,
-    places: tuple[Array, Array],
+    positions: tuple[Array, Array],
     active: npt.NDArray[np.bool_],
     rules: tuple[float, float],
     control: Array,
@@ -127,8 +127,8 @@ def relax(
     ----------
     samples : FieldSamples
         Samples of the field.
-    places : (Nx,), (Ny,) float64, m
-        Places of the control points along x and y.
+    positions : (Nx,), (Ny,) float64, m
+        Positions of the control points along x and y.
     active : (Nx, Ny) bool
         Control points on which samples depend; the penalty acts on these.
     rules : (float, float)
@@ -142,16 +142,16 @@ def relax(
 
     (smoothing, ridge), weight = rules, np.sqrt(samples.share)
     data = sparse(samples.rows, samples.weights * weight[:, None], control.size)
-    parts = [data, *differences(places, active, np.sqrt(smoothing))]
+    matrices = [data, *differences(positions, active, np.sqrt(smoothing))]
     free = np.flatnonzero(active)
-    design = vstack(parts, format='csr')[:, free]
+    design = vstack(matrices, format='csr')[:, free]
     matrix = design.T @ design + ridge * diags_array(np.ones(len(free)))
     right = data[:, free].T @ (samples.z * weight)
     jacobi = diags_array(1.0 / matrix.diagonal())
     start = control.ravel()[free]
-    found, _ = cg(matrix, right, start, rtol=ACCURACY, maxiter=MOST_STEPS, M=jacobi)
+    solution, _ = cg(matrix, right, start, rtol=ACCURACY, maxiter=MOST_STEPS, M=jacobi)
     result = control.copy()
-    result.ravel()[free] = found
+    result.ravel()[free] = solution
     return result
 
 
@@ -164,18 +164,18 @@ def sparse(rows: Indices, values: Array, number: int) -> Any:
 
 
 def differences(
-    places: tuple[Array, Array], active: npt.NDArray[np.bool_], factor: float
+    positions: tuple[Array, Array], active: npt.NDArray[np.bool_], factor: float
 ) -> list[Any]:
     """Return factor times the second differences of active points, by axis."""
-    shape, found = (len(places[0]), len(places[1])), []
+    shape, matrices = (len(positions[0]), len(positions[1])), []
     index = np.arange(shape[0] * shape[1]).reshape(shape)
     for axis in range(2):
         along, step = np.moveaxis(index, axis, 0), shape[1] if axis == 0 else 1
         first, number = along[:-2].ravel(), along.shape[1]
         rows = first[:, None] + step * np.arange(3)
-        second = second_differences(places[axis])
+        second = second_differences(positions[axis])
         line = np.arange(len(second))[:, None]
         values = np.repeat(second[line, line + np.arange(3)], number, axis=0)
         used = active.ravel()[rows].all(axis=1)
-        found.append(sparse(rows[used], factor * values[used], index.size))
-    return found
+        matrices.append(sparse(rows[used], factor * values[used], index.size))
+    return matrices

@@ -165,7 +165,7 @@ def fit_points(
     for k, (_, members) in enumerate(patches):
         of_cluster[members] = k
     label[at] = np.repeat(of_cluster, clusters.num_points)
-    found = grow(
+    growth = grow(
         voxels,
         thinned.means,
         label,
@@ -174,77 +174,77 @@ def fit_points(
         config,
         view,
     )
-    joined = grow_sparse(thinned, voxels, found, config, view)
+    joined = grow_sparse(thinned, voxels, growth, config, view)
     laps.append(clock())
     fitted = owner_patches(joined, config, view)
     lost = np.array([patch is None for patch in fitted], np.bool_)
-    if lost.any() and joined is not found:
-        joined = separated(voxels, joined, found, lost)
+    if lost.any() and joined is not growth:
+        joined = separated(voxels, joined, growth, lost)
         fitted = owner_patches(joined, config, view)
     return owner_models(thinned, voxels, joined, fitted, config)
 
 
 def grow_sparse(
-    thinned: Thinned, voxels: VoxelPoints, found: Grown, config: ModelsConfig, view: Array
+    thinned: Thinned, voxels: VoxelPoints, growth: Grown, config: ModelsConfig, view: Array
 ) -> Grown:
     """Find facets in finer, then in coarser voxels while many points are on no patch, and join."""
     noise = config.noise_m, config.noise_per_range_sq
-    rules = CoarseRules(config.voxel_size_m, found.tolerance_m, noise, view)
-    shape = found.normals, found.curved
+    rules = CoarseRules(config.voxel_size_m, growth.tolerance_m, noise, view)
+    shape = growth.normals, growth.curved
     owner: npt.NDArray[np.int32] = np.full(thinned.num_points, -1, np.int32)
-    owner[voxels.rows] = found.owner
+    owner[voxels.rows] = growth.owner
     joined = False
     halves = thinned.bits.max() < AXIS_BITS and thinned.bits.sum() + 3 <= KEY_BITS
     for factor in SIZES if halves else SIZES[1:]:
-        if (owner[voxels.rows] < 0).sum() < max(SPARSE_SHARE * len(found.owner), 1.0):
+        if (owner[voxels.rows] < 0).sum() < max(SPARSE_SHARE * len(growth.owner), 1.0):
             break
         grown_over = grow_coarse if factor <= MOST_JOINED else extend_coarse
         size_m, joined = factor * config.voxel_size_m, True
         shape = grown_over(thinned.points, owner, shape, size_m, rules, config)
     if not joined:
-        return found
+        return growth
     owner = owner[voxels.rows]
-    return grown(owner, owner_table(voxels, owner), *shape, found.tolerance_m)
+    return grown(owner, owner_table(voxels, owner), *shape, growth.tolerance_m)
 
 
 def blocks_of(means: Array, size_m: float) -> npt.NDArray[np.int32]:
     """Return the index of a block of BLOCK_VOXELS voxels a side for each point (N, 3)."""
     index = np.floor(means / (BLOCK_VOXELS * size_m)).astype(np.int64)
-    found = np.unique(index, axis=0, return_inverse=True)[1].reshape(-1)
-    blocks: npt.NDArray[np.int32] = found.astype(np.int32)
+    inverse = np.unique(index, axis=0, return_inverse=True)[1].reshape(-1)
+    blocks: npt.NDArray[np.int32] = inverse.astype(np.int32)
     return blocks
 
 
 def separated(
-    voxels: VoxelPoints, joined: Grown, before: Grown, lost: npt.NDArray[np.bool_]
+    voxels: VoxelPoints, joined: Grown, previous: Grown, lost: npt.NDArray[np.bool_]
 ) -> Grown:
-    """Return joined patches, the lost ones (K,) as they were before; these are multi-valued."""
+    """Return joined patches, the lost ones (K,) as the previous ones; these are multi-valued."""
     number = len(joined.normals)
     again = np.append(lost, np.False_)[np.maximum(joined.owner, -1)]
-    earlier = np.where(before.owner >= 0, before.owner + number, before.owner)
+    earlier = np.where(previous.owner >= 0, previous.owner + number, previous.owner)
     owner = np.where(again, earlier, joined.owner)
     used, index = np.unique(np.maximum(owner, -1), return_inverse=True)
     shift = int(used[0] < 0)
     owner = np.where(owner < 0, owner, index - shift).astype(np.int32)
-    normals = np.concatenate([joined.normals, before.normals])[used[shift:]]
-    curved = np.concatenate([joined.curved, before.curved])[used[shift:]]
+    normals = np.concatenate([joined.normals, previous.normals])[used[shift:]]
+    curved = np.concatenate([joined.curved, previous.curved])[used[shift:]]
     return grown(owner, owner_table(voxels, owner), normals, curved, joined.tolerance_m)
 
 
-def owner_patches(found: Grown, config: ModelsConfig, view: Array) -> list[Plane | None]:
+def owner_patches(growth: Grown, config: ModelsConfig, view: Array) -> list[Plane | None]:
     """Fit patches to the points that they own; None for multi-valued ones."""
-    number = len(found.normals)
-    starts = np.searchsorted(found.owners, np.arange(number + 1))
+    number = len(growth.normals)
+    starts = np.searchsorted(growth.owners, np.arange(number + 1))
     first = int(starts[0])
-    middle = np.array([found.means[a:b].mean(axis=0) for a, b in pairwise(starts.tolist())])
+    middle = np.array([growth.means[a:b].mean(axis=0) for a, b in pairwise(starts.tolist())])
     middle = middle.reshape(-1, 3)
-    towards = np.einsum('ij,ij->i', found.normals, view - middle)
+    towards = np.einsum('ij,ij->i', growth.normals, view - middle)
     points = PatchPoints(
-        points=np.ascontiguousarray(found.means[first:]),
+        points=np.ascontiguousarray(growth.means[first:]),
         starts=starts - first,
-        normals=found.normals * np.where(towards < 0.0, -1.0, 1.0)[:, None],
+        normals=growth.normals * np.where(towards < 0.0, -1.0, 1.0)[:, None],
         thickness=thickness(middle, config, view),
-        curved=found.curved,
+        curved=growth.curved,
     )
     return fit_patches(points, config, view) if number else []
 
@@ -252,7 +252,7 @@ def owner_patches(found: Grown, config: ModelsConfig, view: Array) -> list[Plane
 def owner_models(
     thinned: Thinned,
     voxels: VoxelPoints,
-    found: Grown,
+    growth: Grown,
     patches: list[Plane | None],
     config: ModelsConfig,
 ) -> MultiModel:
@@ -262,33 +262,33 @@ def owner_models(
     num_planes = len(order)
     order += [k for k, patch in enumerate(patches) if isinstance(patch, Surface)]
     kept = [replace(patch, id=i) for i, k in enumerate(order) if (patch := patches[k]) is not None]
-    starts = np.searchsorted(found.owners, np.arange(number + 1))
+    starts = np.searchsorted(growth.owners, np.arange(number + 1))
     surfaces = with_smooth_seams(
         [patch for patch in kept if isinstance(patch, Surface)],
-        [found.means[starts[k] : starts[k + 1]] for k in order[num_planes:]],
+        [growth.means[starts[k] : starts[k + 1]] for k in order[num_planes:]],
         config,
     )
     ids = np.full(number, -1, np.int64)
     ids[order] = np.arange(len(order))
     # multi-valued surfaces and free groups are Gaussians; groups are negative owners
-    is_free = np.append(ids, -1)[np.maximum(found.owners, -1)] < 0
-    names, which, counts = np.unique(
-        found.owners[is_free], return_inverse=True, return_counts=True
+    is_free = np.append(ids, -1)[np.maximum(growth.owners, -1)] < 0
+    names, inverse, counts = np.unique(
+        growth.owners[is_free], return_inverse=True, return_counts=True
     )
-    low = min(int(found.owners.min(initial=0)), 0)
+    low = min(int(growth.owners.min(initial=0)), 0)
     table = np.empty(number - low, np.int32)
     table[-low:] = ids
     table[names - low] = len(kept) + np.arange(len(names))
     labels = np.full(thinned.num_points, -1, np.int32)
-    labels[voxels.rows] = table[found.owner - low]
-    mean, covariance = group_moments(found.means[is_free], which, counts)
+    labels[voxels.rows] = table[growth.owner - low]
+    mean, covariance = group_moments(growth.means[is_free], inverse, counts)
     return MultiModel(
         planes=kept[:num_planes],
         surfaces=surfaces,
         gaussians=Gaussians(len(kept) + np.arange(len(names)), counts, mean, covariance),
         labels=labels,
         voxel_size_m=config.voxel_size_m,
-        num_thinned=len(found.means),
+        num_thinned=len(growth.means),
         noise=(config.noise_m, config.noise_per_range_sq),
     )
 
@@ -338,18 +338,18 @@ def assembled(
     for number, (patch, members) in enumerate([*planes, *surfaces]):
         of_cluster[members] = number
         numbered.append(replace(patch, id=number))
-    rest = np.flatnonzero(of_cluster < 0)
-    of_cluster[rest] = len(numbered) + np.arange(len(rest))
+    free = np.flatnonzero(of_cluster < 0)
+    of_cluster[free] = len(numbered) + np.arange(len(free))
     labels = np.empty(len(clusters.points), np.int32)
     number_ranges(clusters.rows, of_cluster, clusters.order, labels)
     model = MultiModel(
         planes=numbered[: len(planes)],
         surfaces=[patch for patch in numbered if isinstance(patch, Surface)],
         gaussians=Gaussians(
-            id=of_cluster[rest],
-            num_points=clusters.num_points[rest],
-            mean=clusters.mean[rest],
-            covariance=clusters.covariances()[rest],
+            id=of_cluster[free],
+            num_points=clusters.num_points[free],
+            mean=clusters.mean[free],
+            covariance=clusters.covariances()[free],
         ),
         labels=labels,
         voxel_size_m=config.voxel_size_m,
@@ -391,8 +391,8 @@ def surfel_points(surfels: Surfels, voxel_size_m: float) -> Array:
     half = np.minimum(wide, voxel_size_m * np.sqrt(0.5))[:, None]
     low, high = ((surfels.voxel_index + to) * voxel_size_m for to in (INSET, 1.0 - INSET))
     steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    parts = [surfels.position + half * (i * x + j * y) for i, j in steps]
-    inside = [np.clip(part, low, high) for part in parts]
+    samples = [surfels.position + half * (i * x + j * y) for i, j in steps]
+    inside = [np.clip(sample, low, high) for sample in samples]
     points: Array = np.stack(inside, axis=1).reshape(-1, 3)
     return points
 

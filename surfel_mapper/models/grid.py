@@ -65,12 +65,12 @@ class Grid:
         from_x = np.abs(offset[:, 0] - (x + (corner & 1)) * self.pitch_m)
         from_y = np.abs(offset[:, 1] - (y + (corner >> 1)) * self.pitch_m)
         strip, triangle = self.pitch_m / 255.0, 2.0 * self.pitch_m / 255.0
-        found: npt.NDArray[np.bool_] = (
+        cut_off: npt.NDArray[np.bool_] = (
             (from_x < cuts[:, 0] * strip)
             | (from_y < cuts[:, 1] * strip)
             | (from_x + from_y < cuts[:, 2] * triangle)
         )
-        return found
+        return cut_off
 
     def samples(self, step_m: float) -> Array:
         """Return covered locations (M, 2) at about this spacing, m."""
@@ -204,18 +204,18 @@ class Cells:
             """Return which cells hold points some cells beside chosen ones (n,)."""
             size, beside = self.sizes[of[chosen]], at[chosen] + np.stack([dx, dy], axis=1)
             inside = ((beside >= 0) & (beside < size)).all(axis=1)
-            place = np.where(inside, chosen + dx * size[:, 1] + dy, 0)
-            found: npt.NDArray[np.bool_] = inside & filled[place]
-            return found
+            neighbour = np.where(inside, chosen + dx * size[:, 1] + dy, 0)
+            is_filled: npt.NDArray[np.bool_] = inside & filled[neighbour]
+            return is_filled
 
         some = np.flatnonzero(filled)
-        zero, one = np.zeros(len(some), np.int64), np.ones(len(some), np.int64)
+        zero, unit = np.zeros(len(some), np.int64), np.ones(len(some), np.int64)
         whole = np.logical_and.reduce(
             [
-                occupied(some, -one, zero),
-                occupied(some, one, zero),
-                occupied(some, zero, -one),
-                occupied(some, zero, one),
+                occupied(some, -unit, zero),
+                occupied(some, unit, zero),
+                occupied(some, zero, -unit),
+                occupied(some, zero, unit),
             ]
         )
         rim = some[~whole]
@@ -224,13 +224,13 @@ class Cells:
         mean = self.sums[rim, :2] / self.sums[rim, 3:] - self.origins[of[rim]]
         is_high = mean < (at[rim] + 0.5) * pitch[:, None]
         self.corner[rim] = is_high @ [1, 2]
-        held = np.flatnonzero(self.rim[row])
+        on_rim = np.flatnonzero(self.rim[row])
         number = np.cumsum(self.rim) - 1
-        which = number[row[held]]
-        away = np.abs(offset[held] - ((at[rim] + is_high) * pitch[:, None])[which])
+        rim_cell = number[row[on_rim]]
+        away = np.abs(offset[on_rim] - ((at[rim] + is_high) * pitch[:, None])[rim_cell])
         least = np.full((len(rim), 3), np.inf)
         for j, values in enumerate((away[:, 0], away[:, 1], away.sum(axis=1))):
-            np.minimum.at(least[:, j], which, values)
+            np.minimum.at(least[:, j], rim_cell, values)
         least -= margin_m * np.array([1.0, 1.0, np.sqrt(2.0)])
         cuts = np.floor(least / (pitch[:, None] / 255.0 * np.array([1.0, 1.0, 2.0])))
         dx, dy = (2 * is_high.astype(np.int64) - 1).T

@@ -130,7 +130,7 @@ class PatchFitter:
     def describe(self, rows: list[Rows]) -> Described:
         """Return moments, frames and kind of groups of voxels."""
         graph, every = self._graph, np.concatenate([np.empty(0, np.int32), *rows])
-        starts = np.cumsum([0, *(len(part) for part in rows)])
+        starts = np.cumsum([0, *(len(group) for group in rows)])
         total, means, covariances = self._merged(every, starts)
         normals = np.empty_like(means)
         mean_normals(every, starts, graph.kind == FLAT, graph.normal, normals)
@@ -148,7 +148,7 @@ class PatchFitter:
         self,
         ids: list[int],
         groups: Described,
-        before: list[Tracked | None],
+        previous: list[Tracked | None],
         beyond: list[Rows],
     ) -> list[Tracked]:
         """
@@ -160,24 +160,24 @@ class PatchFitter:
             Ids of the patches.
         groups : Described
             Their voxels; frames are changed in place.
-        before : list of Tracked or None
+        previous : list of Tracked or None
             The previous patches.
         beyond : list of (m,) int32
             Rows of voxels that continue them.
 
         """
         samples, frames, curved, means = groups.samples, groups.frames, groups.curved, groups.means
-        origins = self._steadied(before, groups)
+        origins = self._steadied(previous, groups)
         pitches = np.where(curved, self._surface_pitch_m, PLANE_PITCH_VOXELS * self._size_m)
         placed = origins, frames, pitches
         cells, _ = cells_of(samples, placed, 0.5 * self._size_m, snapped=True)
-        ends = np.array([len(part) for part in beyond])
+        ends = np.array([len(extra) for extra in beyond])
         fields = fields_of(cells, np.flatnonzero(curved & (ends == 0)))
         seams = np.flatnonzero(curved & (ends > 0))
         if len(seams):
             wider = self._wider_cells(seams, samples, beyond, (origins, frames, pitches))
-            found = fields_of(wider, np.arange(len(seams)))
-            fields.update((int(seams[k]), field) for k, field in found.items())
+            refitted = fields_of(wider, np.arange(len(seams)))
+            fields.update((int(seams[k]), field) for k, field in refitted.items())
         shifts = np.einsum('kij,kj->ki', frames, means - origins)
         cells.origins[:] -= shifts[:, :2]  # published grids are relative to the mean
         rms_m = rms_across(groups.covariances, frames[:, 2], groups.total)
@@ -189,8 +189,8 @@ class PatchFitter:
             if field is not None:
                 error_m = self._rms_m(field, frames[k], origins[k], rows)
                 patch = Surface(*common, error_m, grid, moved(field, shifts[k]))
-            place = samples.normals[k], groups.boxes[k], origins[k]
-            patches.append(Tracked(patch, rows, beyond[k], *place))
+            anchor = samples.normals[k], groups.boxes[k], origins[k]
+            patches.append(Tracked(patch, rows, beyond[k], *anchor))
         return patches
 
     def _wider_cells(
@@ -201,18 +201,18 @@ class PatchFitter:
         frames: tuple[Array, Array, Array],
     ) -> Cells:
         """Return the cells of patches with the voxels beyond; frames: anchors, axes, pitches."""
-        parts = [
-            part
+        chunks = [
+            chunk
             for k in chosen
-            for part in (
+            for chunk in (
                 samples.points[samples.starts[k] : samples.starts[k + 1]],
                 self._points(beyond[k]),
             )
         ]
-        points, ends = np.concatenate(parts), np.cumsum([len(part) for part in parts])[1::2]
+        points, ends = np.concatenate(chunks), np.cumsum([len(chunk) for chunk in chunks])[1::2]
         starts = np.concatenate([[0], ends])
         groups = PatchPoints(points, starts, samples.normals[chosen], samples.thickness[chosen])
-        origins, axes, pitches = (part[chosen] for part in frames)
+        origins, axes, pitches = (array[chosen] for array in frames)
         return cells_of(groups, (origins, axes, pitches), 0.5 * self._size_m, snapped=True)[0]
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
@@ -239,20 +239,20 @@ class PatchFitter:
         _, _, frames, curved = described(groups, np.zeros(3), rules)
         return frames, curved
 
-    def _steadied(self, before: list[Tracked | None], groups: Described) -> Array:
+    def _steadied(self, previous: list[Tracked | None], groups: Described) -> Array:
         """Return anchors; frames that turned little stay, and are changed in place."""
         frames, means, curved = groups.frames, groups.means, groups.curved
         origins = means.copy()
-        known = {
+        kept = {
             k: tracked
-            for k, tracked in enumerate(before)
+            for k, tracked in enumerate(previous)
             if tracked is not None and tracked.is_surface == curved[k]
         }
-        if not known:
+        if not kept:
             return origins
-        rows = np.array(list(known))
-        was = np.array([tracked.patch.R_patch_map for tracked in known.values()])
-        anchors = np.array([tracked.origin for tracked in known.values()])
+        rows = np.array(list(kept))
+        was = np.array([tracked.patch.R_patch_map for tracked in kept.values()])
+        anchors = np.array([tracked.origin for tracked in kept.values()])
         normals = frames[rows, 2]
         turn = np.linalg.norm(was[:, 2] - normals, axis=1)
         radius = 3.0 * np.sqrt(np.trace(groups.covariances[rows], axis1=1, axis2=2))

@@ -82,7 +82,7 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     splines = splines_of(cells, np.flatnonzero(curved), config)
     numbers, grids = np.diff(groups.starts), cells.grids()
     rms_m = rms_across(covariances, frames[:, 2], numbers)
-    found: list[Plane | None] = []
+    patches: list[Plane | None] = []
     for k in range(number):
         plane = Plane(
             id=k,
@@ -95,8 +95,8 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
         )
         far_m = max(FAR_VOXELS * a, FAR_THICKNESS * float(groups.thickness[k]))
         points = local[groups.starts[k] : groups.starts[k + 1]]
-        found.append(surface_of(plane, splines[k], points, far_m) if curved[k] else plane)
-    return found
+        patches.append(surface_of(plane, splines[k], points, far_m) if curved[k] else plane)
+    return patches
 
 
 def described(
@@ -151,11 +151,11 @@ def aligned(frames: Array, normals: Array) -> Array:
     """Return frames (K, 3, 3) with other normals (K, 3), turned so that x changes least."""
     x = frames[:, 0] - np.einsum('ij,ij->i', frames[:, 0], normals)[:, None] * normals
     length = np.linalg.norm(x, axis=1)
-    found = frames.copy()
+    turned = frames.copy()
     kept = np.flatnonzero(length >= 1e-6)
     x = x[kept] / length[kept, None]
-    found[kept] = np.stack([x, np.cross(normals[kept], x), normals[kept]], axis=1)
-    return found
+    turned[kept] = np.stack([x, np.cross(normals[kept], x), normals[kept]], axis=1)
+    return turned
 
 
 def bend_height(local: Array, pitch_m: float) -> float:
@@ -239,5 +239,5 @@ def surface_of(plane: Plane, spline: HeightField, points: Array, far_m: float) -
 def rms_across(covariances: Array, normals: Array, numbers: Indices) -> Array:
     """Return the root mean square distances (K,) of points from their means along directions."""
     variance = np.einsum('ki,kij,kj->k', normals, covariances, normals)
-    found: Array = np.sqrt(np.maximum(variance, 0.0) * (numbers - 1) / numbers)
-    return found
+    rms_m: Array = np.sqrt(np.maximum(variance, 0.0) * (numbers - 1) / numbers)
+    return rms_m

@@ -66,15 +66,15 @@ def with_smooth_seams(
         for surface, own in zip(surfaces, points, strict=True)
     ]
     axes = np.array([surface.normal for surface in surfaces])
-    owner = np.repeat(np.arange(len(surfaces)), [len(part) for part in points])
+    owner = np.repeat(np.arange(len(surfaces)), [len(own) for own in points])
     beyond = continuations(every, np.concatenate(normals), owner, axes, config.voxel_size_m)
-    chosen = [number for number, found in enumerate(beyond) if len(found)]
+    chosen = [number for number, rows in enumerate(beyond) if len(rows)]
     if not chosen:
         return surfaces
-    parts = [np.concatenate([points[number], every[beyond[number]]]) for number in chosen]
+    extended = [np.concatenate([points[number], every[beyond[number]]]) for number in chosen]
     groups = PatchPoints(
-        points=np.concatenate(parts),
-        starts=np.concatenate([[0], np.cumsum([len(part) for part in parts])]),
+        points=np.concatenate(extended),
+        starts=np.concatenate([[0], np.cumsum([len(group) for group in extended])]),
         normals=np.array([surfaces[number].normal for number in chosen]),
         thickness=np.zeros(len(chosen)),
     )
@@ -84,13 +84,13 @@ def with_smooth_seams(
     placed = means, frames, pitches
     cells, _ = cells_of(groups, placed, config.voxel_size_m, snapped=True)
     splines = splines_of(cells, np.arange(len(chosen)), config)
-    found = list(surfaces)
+    smooth = list(surfaces)
     for k, number in enumerate(chosen):
         local = surfaces[number].to_local(points[number])
         error = local[:, 2] - splines[k].heights(local[:, :2])
         rms_m = float(np.sqrt(np.mean(error**2)))
-        found[number] = replace(surfaces[number], spline=splines[k], rms_m=rms_m)
-    return found
+        smooth[number] = replace(surfaces[number], spline=splines[k], rms_m=rms_m)
+    return smooth
 
 
 def continuations(
@@ -117,17 +117,17 @@ def continuations(
 
     reach_m = REACH_VOXELS * voxel_size_m
     members = [np.flatnonzero(owner == surface) for surface in range(len(axes))]
-    found = []
+    beyond = []
     for surface, own in enumerate(members):
         low, high = points[own].min(axis=0) - reach_m, points[own].max(axis=0) + reach_m
         near = (owner != surface) & ((low <= points) & (points <= high)).all(axis=1)
         rows = np.flatnonzero(near)
         tree = cKDTree(points[own])
         away, nearest = tree.query(points[rows], distance_upper_bound=reach_m)
-        rows, away, nearest = (part[nearest < len(own)] for part in (rows, away, nearest))
-        place = own[nearest]
-        height = np.abs(((points[rows] - points[place]) * normals[place]).sum(axis=1))
+        rows, away, nearest = (array[nearest < len(own)] for array in (rows, away, nearest))
+        host = own[nearest]
+        height = np.abs(((points[rows] - points[host]) * normals[host]).sum(axis=1))
         smooth = height < STEEPEST * np.maximum(away, voxel_size_m)
-        smooth &= np.abs((normals[rows] * normals[place]).sum(axis=1)) > CREASE
-        found.append(rows[smooth & (np.abs(normals[rows] @ axes[surface]) > UPRIGHT)])
-    return found
+        smooth &= np.abs((normals[rows] * normals[host]).sum(axis=1)) > CREASE
+        beyond.append(rows[smooth & (np.abs(normals[rows] @ axes[surface]) > UPRIGHT)])
+    return beyond

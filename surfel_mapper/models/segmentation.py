@@ -133,16 +133,16 @@ def merge_clusters(clusters: Clusters, config: ModelsConfig, viewpoint: Array) -
 
 
 def height_fields(
-    parts: list[Rows],
+    groups: list[Rows],
     side: Callable[[Rows], npt.NDArray[np.bool_] | None],
     components: Callable[[Rows], list[Rows]],
 ) -> list[Rows]:
     """
-    Bisect parts of a surface until each is a height field; clusters and surfels of a map alike.
+    Bisect groups of rows until each is a height field; clusters and surfels of a map alike.
 
     Parameters
     ----------
-    parts : list of (n,) int
+    groups : list of (n,) int
         Rows of clusters or surfels.
     side : callable
         Returns how to bisect rows, (n,) bool, or None if they are a height field.
@@ -150,16 +150,16 @@ def height_fields(
         Returns the connected components of rows.
 
     """
-    found, waiting = [], parts[::-1]
+    fields, waiting = [], groups[::-1]
     while waiting:
-        part = waiting.pop()
-        beyond = side(part)
+        group = waiting.pop()
+        beyond = side(group)
         if beyond is None:
-            found.append(part)
+            fields.append(group)
         else:
-            for half in (part[beyond], part[~beyond]):
+            for half in (group[beyond], group[~beyond]):
                 waiting += components(half)[::-1]
-    return found
+    return fields
 
 
 def merged(
@@ -187,7 +187,7 @@ def merged(
     merge_pairs(clusters.points, rows, boxes, pairs[nearest], rules[5], parent)
     order = np.argsort(parent, kind='stable')
     ends = np.flatnonzero(np.diff(parent[order])) + 1
-    return [part for part in np.split(members[order], ends) if len(part)]
+    return [component for component in np.split(members[order], ends) if len(component)]
 
 
 def boxes_of(points: Array, rows: Indices) -> Array:

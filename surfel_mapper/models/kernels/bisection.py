@@ -75,14 +75,14 @@ def num_outliers(x, y, z, mean, value, frame):
     vx, vy, vz = frame[1, 0], frame[1, 1], frame[1, 2]
     wx, wy, wz = frame[2, 0], frame[2, 1], frame[2, 2]
     a, b, c = 1.0 / value[2], 1.0 / value[1], 1.0 / max(value[0], 1e-12 * value[2])
-    found = 0.0
+    num = 0.0
     for i in range(len(x)):
         dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
         u = (ux * dx + uy * dy) + uz * dz
         v = (vx * dx + vy * dy) + vz * dz
         w = (wx * dx + wy * dy) + wz * dz
-        found += 1.0 if (u * u * a + v * v * b) + w * w * c >= THREE_SIGMA_SQ else 0.0
-    return found
+        num += 1.0 if (u * u * a + v * v * b) + w * w * c >= THREE_SIGMA_SQ else 0.0
+    return num
 
 
 @inlined(error_model='numpy')
@@ -194,9 +194,9 @@ def partition(points, order, low, middle, high, share, to_points, to_order):
     first, second = np.uint64(low), np.uint64(middle)
     for i in range(np.uint64(low), np.uint64(high)):
         beyond = share[i] > 0.5
-        place = second if beyond else first
-        to_x[place], to_y[place], to_z[place] = x[i], y[i], z[i]
-        to_order[place] = order[i]
+        target = second if beyond else first
+        to_x[target], to_y[target], to_z[target] = x[i], y[i], z[i]
+        to_order[target] = order[i]
         first += np.uint64(not beyond)
         second += np.uint64(beyond)
 
@@ -270,11 +270,11 @@ def bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, valu
         is_flat = is_flat_cluster(x, y, z, mean, value, frame, viewpoint, rules)
         middle = high
         if not is_flat and high - low >= max(rules[3], 4.0):
-            parts = share[low:high]
-            middle = high - split_two_means(x, y, z, mean, value, frame, parts, scratch)
+            own_share = share[low:high]
+            middle = high - split_two_means(x, y, z, mean, value, frame, own_share, scratch)
             if high - low <= rules[2]:
-                split_mixture(x, y, z, mean, parts)
-                middle = high - count_beyond(parts)
+                split_mixture(x, y, z, mean, own_share)
+                middle = high - count_beyond(own_share)
         if middle - low < 2 or high - middle < 2:
             for i in range(low, high):
                 for j in range(3):
@@ -288,16 +288,16 @@ def bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, valu
                     frames[num, i, j] = frame[i, j]
             num += 1
             continue
-        other = 1 - own
+        spare = 1 - own
         partition(
-            buffers[own], orders[own], low, middle, high, share, buffers[other], orders[other]
+            buffers[own], orders[own], low, middle, high, share, buffers[spare], orders[spare]
         )
         smaller_last = middle - low > high - middle
         for child in range(2):
-            left = (child == 0) == smaller_last
-            stack[depth, 0] = low if left else middle
-            stack[depth, 1] = middle if left else high
-            stack[depth, 2] = other
+            is_low = (child == 0) == smaller_last
+            stack[depth, 0] = low if is_low else middle
+            stack[depth, 1] = middle if is_low else high
+            stack[depth, 2] = spare
             depth += 1
     return num
 
