@@ -198,9 +198,9 @@ class DistanceField:
             If the blocks span too many voxels.
 
         """
-        found = EuclideanField(self.blocks, max_m=max_m)
-        found.update()
-        return found
+        distances = EuclideanField(self.blocks, max_m=max_m)
+        distances.update()
+        return distances
 
     def mesh(self) -> Mesh:
         """Return the surface as triangles; only changed blocks are meshed again."""

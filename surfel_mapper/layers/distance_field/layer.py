@@ -198,11 +198,11 @@ class TsdfLayer(Layer):
         keys = pack_keys(voxel_index)
 
         def contains(points: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-            found = np.zeros(len(points), np.bool_)
+            inside = np.zeros(len(points), np.bool_)
             for margins_m in itertools.product((-margin_m, margin_m), repeat=3):
                 index = np.floor((points + margins_m) / size_m).astype(np.int32)
-                found |= np.isin(pack_keys(index), keys)
-            return found
+                inside |= np.isin(pack_keys(index), keys)
+            return inside
 
         self.blocks.clear_region(contains, rows[rows >= 0])
 
@@ -243,7 +243,7 @@ class TsdfLayer(Layer):
                 topic='~/mesh',
                 type_name='visualization_msgs/msg/Marker',
                 prepare=lambda: self._whole_mesh.prepare(),
-                messages=lambda now: self._whole_mesh.messages(now),
+                messages=lambda moment: self._whole_mesh.messages(moment),
                 in_background=True,
                 version=lambda _: (id(self.blocks), self.blocks.version),
                 rate_hz=lambda config: config.tsdf.mesh_rate_hz,
@@ -252,7 +252,7 @@ class TsdfLayer(Layer):
                 topic='~/mesh_tiles',
                 type_name='visualization_msgs/msg/MarkerArray',
                 prepare=lambda: not self.config.tsdf.mesh_rate_hz or self._live_mesh.prepare(),
-                messages=lambda now: self._live_mesh.changed(now),
+                messages=lambda moment: self._live_mesh.changed(moment),
                 all_messages=self._all_tiles,
                 in_background=True,
                 version=lambda _: (id(self.blocks), self.blocks.version),
@@ -301,31 +301,31 @@ class TsdfLayer(Layer):
         """Return the mesh."""
         return [MeshDrawing(name='mesh', mesh=self.mesh())]
 
-    def _all_tiles(self, now: Moment) -> Iterable[bytes]:
-        return self._live_mesh.complete(now) if self.config.tsdf.mesh_rate_hz else ()
+    def _all_tiles(self, moment: Moment) -> Iterable[bytes]:
+        return self._live_mesh.complete(moment) if self.config.tsdf.mesh_rate_hz else ()
 
-    def _slice_messages(self, now: Moment) -> list[bytes]:
-        found = slice_at(self.blocks, self.config.tsdf.slice_height_m)
-        content = (found.resolution_m, found.origin, found.cost)
-        return [occupancy_grid(*content, stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
+    def _slice_messages(self, moment: Moment) -> list[bytes]:
+        grid = slice_at(self.blocks, self.config.tsdf.slice_height_m)
+        content = (grid.resolution_m, grid.origin, grid.cost)
+        return [occupancy_grid(*content, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)]
 
-    def _esdf_messages(self, now: Moment) -> Iterable[bytes]:
+    def _esdf_messages(self, moment: Moment) -> Iterable[bytes]:
         """Return the cloud of the distances below esdf.max_m; serialised while iterated."""
-        known = self.esdf.known()
-        near = known.distance < self.config.esdf.max_m
-        points = known.points[near].astype(np.float32)
-        columns = dict(zip('xyz', points.T, strict=True)) | {'distance': known.distance[near]}
+        distances = self.esdf.known()
+        near = distances.distance < self.config.esdf.max_m
+        points = distances.points[near].astype(np.float32)
+        columns = dict(zip('xyz', points.T, strict=True)) | {'distance': distances.distance[near]}
         return (
-            cloud_bytes(from_columns(each), stamp_ns=now.stamp_ns, frame_id=now.frame_id)
-            for each in [columns]
+            cloud_bytes(from_columns(table), stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)
+            for table in [columns]
         )
 
-    def _clearance_messages(self, now: Moment) -> list[bytes]:
+    def _clearance_messages(self, moment: Moment) -> list[bytes]:
         config = self.config.esdf
         heights_m, area = (config.slice_min_m, config.slice_max_m), self._position[:2]
-        found = clearance_slice(self.blocks, heights_m, config.max_m, area, config.radius_m)
-        content = (found.resolution_m, found.origin, found.cost)
-        return [occupancy_grid(*content, stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
+        grid = clearance_slice(self.blocks, heights_m, config.max_m, area, config.radius_m)
+        content = (grid.resolution_m, grid.origin, grid.cost)
+        return [occupancy_grid(*content, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)]
 
     def _sensor(self, scan: Scan) -> CameraModel | LidarModel | None:
         """Return the model of the sensor of a scan; None if it is fused point by point."""

@@ -34,8 +34,8 @@ def slice_at(blocks: BlockMap, height_m: float) -> CostGrid:
     rows = rows[blocks.index(rows)[:, 2] == layer // blocks.config.voxels_per_side]
     if not len(rows):
         return no_cells(blocks)
-    occupied, seen = columns_between(blocks, rows, (layer, layer))
-    cost = np.where(occupied, OBSTACLE, np.where(seen, 0, UNSEEN)).astype(np.int8)
+    occupied, observed = columns_between(blocks, rows, (layer, layer))
+    cost = np.where(occupied, OBSTACLE, np.where(observed, 0, UNSEEN)).astype(np.int8)
     return CostGrid(
         resolution_m=blocks.config.voxel_size_m, origin=lowest_corner(blocks, rows), cost=cost
     )
@@ -102,12 +102,12 @@ def clearance_slice(
     rows = rows[chosen]
     if not len(rows):
         return no_cells(blocks)
-    occupied, seen = columns_between(blocks, rows, (int(layers[0]), int(layers[1])))
+    occupied, observed = columns_between(blocks, rows, (int(layers[0]), int(layers[1])))
     distance = np.full(occupied.shape, max_m)
     if occupied.any():
         distance = np.minimum(distance_transform_edt(~occupied, sampling=size_m), max_m)
     cost = np.minimum(np.rint(100.0 * (1.0 - distance / max_m)), OBSTACLE - 1)
-    cost = np.where(occupied, OBSTACLE, np.where(seen, cost, UNSEEN)).astype(np.int8)
+    cost = np.where(occupied, OBSTACLE, np.where(observed, cost, UNSEEN)).astype(np.int8)
     return CostGrid(resolution_m=size_m, origin=lowest_corner(blocks, rows), cost=cost)
 
 
@@ -120,13 +120,13 @@ def columns_between(
     columns, lines = checked_size((high - low)[:2]).tolist()
     layer = index[:, 2:] * side + np.arange(side)
     between = ((layer >= layers[0]) & (layer <= layers[1]))[:, :, None, None]
-    known = (blocks.weight[rows] > 0.0).reshape(-1, side, side, side) & between
-    near = blocks.distance[rows].reshape(known.shape) <= 0.5 * blocks.config.voxel_size_m
+    observed = (blocks.weight[rows] > 0.0).reshape(-1, side, side, side) & between
+    near = blocks.distance[rows].reshape(observed.shape) <= 0.5 * blocks.config.voxel_size_m
     first = index[:, :2] * side - low[:2]
-    found = []
-    for here in (known & near, known):
+    masks = []
+    for voxels in (observed & near, observed):
         cells = np.zeros((lines, columns), bool)
-        number, y, x = np.nonzero(here.any(axis=1))
+        number, y, x = np.nonzero(voxels.any(axis=1))
         cells[first[number, 1] + y, first[number, 0] + x] = True
-        found.append(cells)
-    return found[0], found[1]
+        masks.append(cells)
+    return masks[0], masks[1]
