@@ -400,8 +400,8 @@ def write_outcomes(path: Path, outcomes: Sequence[ScanOutcome]) -> None:
     from surfel_mapper.files.atomic import replace_file
     from surfel_mapper.offline.summary import in_order
 
-    seen = {stage: 0.0 for outcome in outcomes for stage in outcome.milliseconds}
-    stages = [stage for stage, _ in in_order(seen, STAGES)]
+    times_ms = {stage: 0.0 for outcome in outcomes for stage in outcome.milliseconds}
+    stages = [stage for stage, _ in in_order(times_ms, STAGES)]
     text = io.StringIO(newline='')
     table = csv.writer(text, lineterminator='\n')
     table.writerow([*COLUMNS, *(f'{stage}_ms' for stage in stages)])
