@@ -27,7 +27,7 @@ from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.messages.cdr import MAX_FRAME_NAME
 from surfel_mapper.messages.compressed_image import unpacked
-from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns, parse_cloud
+from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns, parse_cloud, to_scan
 from surfel_mapper.messages.poses import raw_poses
 
 
@@ -104,7 +104,7 @@ def test_names_of_frames_are_limited():
             assert raw_poses('odometry', pose, 'base_link', 'odom')[0].child == 'f' * size
             continue
         with pytest.raises(CloudFormatError, match=r'frame .* of 257 characters'):
-            parse_cloud(raw)
+            to_scan(parse_cloud(raw))
         with pytest.raises(PoseError, match=r'frame .* of 257 characters'):
             raw_poses('odometry', pose, 'base_link', 'odom')
 
