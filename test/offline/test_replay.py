@@ -190,9 +190,10 @@ def test_the_default_output_can_be_read_back(bag, tmp_path, capsys, caplog):
 
     assert main(['merge', str(out), '--output', str(tmp_path / 'one'), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['digest'] == digest
-    assert not caplog.records
+    twice = '3 of its 6 scans have stamps of scans in'
+    assert twice not in caplog.text
     assert main(['merge', str(half / 'map.npz'), str(out), '--output', str(tmp_path / 'two')]) == 0
-    assert '3 of its 6 scans have stamps of scans in' in caplog.text
+    assert twice in caplog.text
 
     loaded = {'map.mode': 'frozen', 'map.load': str(out), 'pose.source': 'registration'}
     assert started_mapper(Config.from_mapping(loaded)).map.digest() == digest
