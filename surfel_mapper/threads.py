@@ -65,6 +65,12 @@ REAL_TIME_PRIORITY = 1
 """The lowest real-time priority of Linux: above ordinary threads, below control loops."""
 
 
+def end_real_time() -> None:
+    """Give the calling thread ordinary priority if it was started by ``real_time_threads``."""
+    if sys.platform == 'linux':
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 @contextmanager
 def real_time_threads() -> Iterator[None]:
     """

@@ -39,6 +39,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.pipeline.drops import described
 from surfel_mapper.ros.line_logger import LineLogger
+from surfel_mapper.threads import end_real_time
 
 PARAMETER_TYPES = {kind.value for kind in Parameter.Type}
 
@@ -239,6 +240,7 @@ class Ticker:
         self._thread.join()
 
     def _run(self) -> None:
+        end_real_time()
         while not self._stopping.wait(self._period_s):
             with self._node.surviving('a timer'):
                 self._callback()
