@@ -10,7 +10,8 @@ ahead of all by more than MAX_AHEAD_S. Odd messages wait until another message d
   used, and time continues from their stamps.
 - A stamp in time refutes them: they are dropped. A sensor with another clock, or one that counts
   from 1970 for a second after a restart, leaves the map as it was.
-- A source that no other contradicts for ALONE_S, by its own stamps, is believed. After a message
+- A source that no other contradicts for ALONE_S, by its own stamps, is believed; if it is ahead
+  and there is no other, at its second message. After a message
   ahead, any later stamp agrees. If that is further than MAX_AHEAD_S again, as of a sensor that
   stops to scan, steps up to twice as long are no longer odd.
 
@@ -253,9 +254,19 @@ class StampGuard:
         """Return whether an odd message confirms those that wait: of the other kind, or long."""
         kind, first = type(message), self._odd[0]
         return (
-            any(type(waiting) is not kind for waiting in self._odd)
+            self._is_only_source(message, first.stamp_ns)
+            or any(type(waiting) is not kind for waiting in self._odd)
             or abs(message.stamp_ns - first.stamp_ns) >= ALONE_S * 1e9
             or len(self._odd) >= MAX_WAITING
+        )
+
+    def _is_only_source(self, message: Scan | StampedPose, stamp_ns: int) -> bool:
+        """Return whether only one sensor gives data, and a stamp is ahead: it has paused."""
+        return (
+            isinstance(message, Scan)
+            and self._transforms.newest_ns is None
+            and self._scan_ns.keys() <= {source_of(message)}
+            and (self.newest_ns is None or stamp_ns > self.newest_ns)
         )
 
     def _agree(self, stamp_ns: int, odd_ns: int, is_odd: bool) -> bool:
