@@ -53,23 +53,6 @@ def compact(xyz, keep, out):
 
 
 @njit(cache=True, nogil=True)
-def copy_ranges(points, ranges, out):
-    """
-    Concatenate ranges of rows.
-
-    points  (N, 3) float64
-    ranges  (K, 2) int64, first row of each range, and the row after its last
-    out     (M, 3) float64, M the number of rows of all ranges
-    """
-    row = 0
-    for k in range(len(ranges)):
-        for i in range(ranges[k, 0], ranges[k, 1]):
-            for j in range(3):
-                out[row, j] = points[i, j]
-            row += 1
-
-
-@njit(cache=True, nogil=True)
 def number_ranges(ranges, numbers, order, out):
     """
     Assign the number of a range to its items, at their positions before sorting.

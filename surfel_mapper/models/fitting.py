@@ -26,7 +26,7 @@ from surfel_mapper.compilation import clock
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import AXIS_BITS, KEY_BITS
-from surfel_mapper.kernels.selection import copy_ranges, number_ranges
+from surfel_mapper.kernels.selection import number_ranges
 from surfel_mapper.mapping.moments import are_far_apart, OTHER_UNIT
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.cloud_noise import estimate_noise
@@ -314,8 +314,8 @@ def fitted_patches(
     if not kept:
         return []
     starts = np.concatenate([[0], np.cumsum([counts[members].sum() for members in kept])])
-    points = np.empty((starts[-1], 3))
-    copy_ranges(clusters.points, clusters.rows[np.concatenate(kept)], points)
+    ranges = clusters.rows[np.concatenate(kept)]
+    points = np.concatenate([clusters.points[start:stop] for start, stop in ranges])
     means = np.array([counts[m] @ clusters.mean[m] / counts[m].sum() for m in kept])
     groups = PatchPoints(
         points=points,
