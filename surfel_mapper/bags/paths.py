@@ -22,7 +22,6 @@ from surfel_mapper.bags.compression import ZSTD_MAGIC
 from surfel_mapper.config import read_yaml
 from surfel_mapper.errors import BagError
 from surfel_mapper.files.atomic import by_number
-from surfel_mapper.files.scan_files import SUFFIXES
 
 STORAGE_SUFFIXES = ('.mcap', '.db3')
 PACKED_SUFFIXES = ('.zstd', '.zst')
@@ -32,12 +31,16 @@ METADATA = 'metadata.yaml'
 
 _log = logging.getLogger(__name__)
 
-READ = (
-    f'a bag: a directory with {METADATA} or files ending in .mcap or .db3 (perhaps .zstd), or a '
-    f'.bag of ROS 1; or scans: files ending in {", ".join(SUFFIXES)}, a folder of them, or an '
-    'Ouster .pcap'
-)
-"""Formats of recordings, for errors."""
+
+def readable() -> str:
+    """Return the formats of recordings, for errors; their modules load the compiler."""
+    from surfel_mapper.files.scan_files import SUFFIXES
+
+    return (
+        f'a bag: a directory with {METADATA} or files ending in .mcap or .db3 (perhaps .zstd), or '
+        f'a .bag of ROS 1; or scans: files ending in {", ".join(SUFFIXES)}, a folder of them, or '
+        'an Ouster .pcap'
+    )
 
 
 def files_of(path: Path) -> list[Path]:
@@ -58,7 +61,7 @@ def files_of(path: Path) -> list[Path]:
     if not path.is_file():
         raise BagError(f'{path}: no such file or directory; expected a bag or scans')
     if not is_storage(path) and not is_ros1(path):
-        raise BagError(f'{path}: {path.suffix or "no ending"} is not read; expected {READ}')
+        raise BagError(f'{path}: {path.suffix or "no ending"} is not read; expected {readable()}')
     return [path]
 
 
@@ -183,7 +186,7 @@ def loose_files(directory: Path) -> list[Path]:
     if not files:
         endings = Counter(file.suffix for file in directory.iterdir() if file.is_file())
         listed = ', '.join(f'{n} {ending or "without ending"}' for ending, n in endings.items())
-        raise BagError(f'{directory}: files in it: {listed or "none"}; expected {READ}')
+        raise BagError(f'{directory}: files in it: {listed or "none"}; expected {readable()}')
     return sorted(files, key=by_number)
 
 

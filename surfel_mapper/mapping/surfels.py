@@ -21,7 +21,6 @@ import numpy.typing as npt
 from surfel_mapper import map_formats
 from surfel_mapper.arguments import as_array, made_array
 from surfel_mapper.errors import DependencyError
-from surfel_mapper.mapping.kernels.surfels import derive_surfels
 
 logger = logging.getLogger(__name__)
 
@@ -309,7 +308,9 @@ def derive(
         np.empty(num, np.int64),
         np.empty((num, 3), np.int32),
     )
-    if num:  # else the kernel need not be compiled yet
+    if num:  # readers of files import this module, and need no compiler
+        from surfel_mapper.mapping.kernels.surfels import derive_surfels
+
         derive_surfels(rows, chosen, voxel_size_m, bits, arrays)
     return Surfels(*arrays)
 
