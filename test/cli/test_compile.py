@@ -64,7 +64,7 @@ def test_mapping_compiles_nothing_after_compiling_for_its_configuration(tmp_path
     kernels = {'NUMBA_CACHE_DIR': str(tmp_path / 'kernels')}
 
     stdout, stderr = run(tmp_path, 'compile --config my.yaml', **kernels)
-    assert re.search(r'compiling kernels, once on this machine: 1 of \d \(decoding\)', stderr)
+    assert re.search(r'compiling kernels, once on this machine: 1 of \d \(adding scans\)', stderr)
     assert stdout.startswith('kernels compiled ')
 
     done = subprocess.run(

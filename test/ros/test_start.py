@@ -45,7 +45,9 @@ def test_a_node_without_compiled_kernels_says_what_it_compiles_and_drops_no_clou
         re.fullmatch(r'compiling kernels, once on this machine: \d of \d \(.+\)', text)
         for text in compiling
     )
-    assert re.search(r'compiling kernels, once on this machine: 1 of \d \(decoding\)', node.output)
+    assert re.search(
+        r'compiling kernels, once on this machine: 1 of \d \(adding scans\)', node.output
+    )
     assert re.search(r'\d+ kernels compiled in [\d.]+ s', node.output)
     updates, _ = mapped(messages)
     assert [each.width for each in changed] == [len(update.changed) for update in updates]
