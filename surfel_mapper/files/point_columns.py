@@ -29,7 +29,7 @@ NORMALS = ('nx', 'ny', 'nz')
 
 def named_columns(table: npt.NDArray[Any]) -> Columns:
     """
-    Return the columns of a table (N, C) by what they look like, the first three as x y z.
+    Name the columns of a table (N, C) by their values; the first three are x y z.
 
     The fourth is the intensity and the fifth the ring, if they can be. The last three of six or
     seven columns are a colour or a normal, if they can be: XYZRGB, PTS.

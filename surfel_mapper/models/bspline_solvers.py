@@ -30,7 +30,7 @@ LEAST_SIDE = 16
 """Control points along the short side, below which the band is narrow enough at any length."""
 
 ACCURACY, MOST_STEPS = 1e-7, 400
-"""Conjugate gradients end at this residual relative to the right side, or after so many steps."""
+"""Relative residual at which conjugate gradients end, and their largest number of steps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

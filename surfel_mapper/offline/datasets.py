@@ -251,8 +251,8 @@ def argoverse2(path: Path) -> Dataset | None:
         raise FileFormatError(f'{poses_path}: no {missing[0]} among {", ".join(table)}')
     order = np.argsort(table['timestamp_ns'])
     xyz, q_xyzw = (np.stack([table[n][order] for n in part], 1) for part in (names[:3], names[3:]))
-    found = Trajectory(table['timestamp_ns'][order], xyz, q_xyzw)
-    return Dataset('Argoverse 2', files, stamps_ns, found, poses_path, read_argoverse2)
+    trajectory = Trajectory(table['timestamp_ns'][order], xyz, q_xyzw)
+    return Dataset('Argoverse 2', files, stamps_ns, trajectory, poses_path, read_argoverse2)
 
 
 def read_argoverse2(path: Path) -> tuple[npt.NDArray[Any], Columns]:

@@ -165,8 +165,8 @@ def tum(path: Path) -> DepthFolder:
     poses_path = path / 'groundtruth.txt'
     poses = read_trajectory(poses_path, 'tum') if poses_path.is_file() else None
     camera = re.search('freiburg([123])|fr([123])', path.name.lower())
-    known = FREIBURG[camera[1] or camera[2]] if camera else KINECT
-    intrinsics, units_per_m = camera_of(path, known, TUM_M)
+    nominal = FREIBURG[camera[1] or camera[2]] if camera else KINECT
+    intrinsics, units_per_m = camera_of(path, nominal, TUM_M)
     return DepthFolder('TUM RGB-D', files, stamps_ns, poses, poses_path, intrinsics, units_per_m)
 
 
@@ -229,7 +229,7 @@ def numbered_folder(
     path: Path,
     files: list[Path],
     pose_files: Sequence[Path],
-    known: Intrinsics | None,
+    nominal: Intrinsics | None,
     poses_path: Path,
 ) -> DepthFolder:
     """Return images in mm whose poses are files of a matrix; lost ones, not finite, have none."""
@@ -241,7 +241,7 @@ def numbered_folder(
         raise FileFormatError(f'{pose_files[0]} and others: a matrix that is no rotation')
     stamps = np.array(stamps_ns)[is_known]
     trajectory = Trajectory(stamps, poses[:, :3, 3].copy(), quaternions(poses))
-    intrinsics, units_per_m = camera_of(path, known, MM)
+    intrinsics, units_per_m = camera_of(path, nominal, MM)
     return DepthFolder(
         name,
         files,
@@ -272,20 +272,20 @@ def numbers_in(file: Path, sizes: tuple[int, ...]) -> npt.NDArray[np.float64]:
 
 
 def camera_of(
-    path: Path, known: Intrinsics | None, units_per_m: float
+    path: Path, nominal: Intrinsics | None, units_per_m: float
 ) -> tuple[Intrinsics, float]:
     """Return intrinsics and units of depth, of a file in the folder or above it, else as known."""
     places = [folder / name for folder in (path, path.parent) for name in INTRINSICS]
     file = next(filter(Path.is_file, places), None)
-    if file is None and known is None:
+    if file is None and nominal is None:
         raise FileFormatError(f'{path}: no intrinsics of its camera, expected {INTRINSICS[0]}')
     if file is None:
-        assert known is not None
+        assert nominal is not None
         logger.warning(
             '%s: no file of intrinsics, those of the data set are taken: fx, fy, cx, cy %s',
-            *(path, known),
+            *(path, nominal),
         )
-        return known, units_per_m
+        return nominal, units_per_m
     if file.suffix == '.json':
         return camera_in_json(file, units_per_m)
     numbers = numbers_in(file, (4, 9, 16))

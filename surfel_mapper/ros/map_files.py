@@ -73,7 +73,7 @@ class MapWriter:
             self._thread.post(done)
 
     def close(self) -> None:
-        """Finish what is being written, after the mapping thread has ended."""
+        """Wait for the files being written, after the mapping thread has ended."""
         self._executor.shutdown()
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Saving in a thread of its own: what is written, requests that are one, and files left behind."""
+"""Saving in a thread of its own: the file, requests that are one, and stale temporary files."""
 
 from __future__ import annotations
 
