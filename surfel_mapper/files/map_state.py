@@ -50,8 +50,6 @@ def save_map(
     path: str | Path,
     surfel_map: SurfelMap,
     window: Iterable[WindowedScan] = (),
-    *,
-    compress: bool = False,
 ) -> str:
     """
     Write a map, and the scans of its window, to a file; return the digest of the map.
@@ -64,8 +62,6 @@ def save_map(
         The map.
     window : iterable of WindowedScan
         The scans that can be evicted, oldest first: its SlidingWindow.
-    compress : bool
-        Compress: 1.7 times smaller, 4 times slower.
 
     Raises
     ------
@@ -93,7 +89,7 @@ def save_map(
         'frame_ids': [scan.frame_id for scan in scans],
         'digest': digest,
     }
-    save_state(path, arrays, attributes, compress=compress)
+    save_state(path, arrays, attributes)
     return digest
 
 
