@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bash completes verbs, options, choices and settings, by the code that docs/commands.md registers."""
+"""Bash completes verbs, options, choices and settings, as docs/commands.md registers it."""
 
 from __future__ import annotations
 
