@@ -37,8 +37,14 @@ def first_ones() -> list[Declaration]:
 
 def settings_table() -> str:
     """Return the tables in Markdown; * marks settings that can change while the node runs."""
-    further = [declared for declared in declarations() if declared.name not in FIRST]
-    return f'{table_of(first_ones())}\nAll others:\n\n{table_of(further)}'
+    by_group: dict[str, list[Declaration]] = {}
+    for declared in declarations():
+        if declared.name not in FIRST:
+            by_group.setdefault(declared.name.rpartition('.')[0], []).append(declared)
+    general = by_group.pop('')
+    texts = [f'## Those that matter most\n\n{table_of(first_ones())}']
+    texts += [f'## `{group}`\n\n{table_of(by_group[group])}' for group in by_group]
+    return '\n'.join([*texts, f'## General\n\n{table_of(general)}'])
 
 
 def table_of(declared_ones: Iterable[Declaration]) -> str:

@@ -13,6 +13,7 @@ import yaml
 import surfel_mapper
 from surfel_mapper import filters
 from surfel_mapper.cli.main import VERBS
+from surfel_mapper.pipeline.drops import REMEDIES
 from test.settings import ROOT
 
 DOCS = ROOT / 'docs'
@@ -151,6 +152,11 @@ def test_pages_have_every_topic_and_service_of_the_node():
     names = set(re.findall(r"'(~/[a-z_]+[a-z])'", sources))
     assert len(names) > 15
     assert sorted(name for name in names if f'`{name}`' not in pages) == []
+
+
+def test_the_page_of_symptoms_has_every_cause_that_has_a_remedy():
+    page = everything('docs/troubleshooting.md')
+    assert [cause for cause in REMEDIES if f'`{cause}`' not in page] == []
 
 
 def test_pictures_are_small():
