@@ -5,8 +5,9 @@ Saving and loading a map with its window, exactly: the digests before and after 
 
 The file has the integers of every voxel, and for each scan of the window its moments, stamp, pose,
 frame and, if kept, points; so a loaded map continues as if it had never stopped. Without the
-frames, in files of earlier versions, those of all scans are empty. Files are not trusted: voxels
-and counts are checked, and the digest is compared.
+frames, in files of earlier versions, those of all scans are empty; without numbers of scans a
+voxel gets those of the window, and one more if it holds further points. Files are not trusted:
+voxels and counts are checked, and the digest is compared.
 """
 
 from __future__ import annotations
@@ -45,6 +46,9 @@ NO_ORIGIN = (0.0, 0.0, 0.0)
 
 NAMES = ('key', 'count', 'total', 'product', 'view', 'channels')
 
+SCANS = 'num_scans'
+"""Name of the optional array of numbers of scans; without it there is one scan."""
+
 
 def save_map(
     path: str | Path,
@@ -71,11 +75,10 @@ def save_map(
     """
     digest = surfel_map.digest()
     moments = surfel_map.moments()
-    arrays: dict[str, npt.NDArray[Any]] = {f'map.{n}': getattr(moments, n) for n in NAMES}
+    arrays = _arrays('map', moments)
     scans = list(window)
     for number, scan in enumerate(scans):
-        for name in NAMES:
-            arrays[f'scan{number}.{name}'] = getattr(scan.moments, name)
+        arrays |= _arrays(f'scan{number}', scan.moments)
         if scan.points is not None:
             arrays[f'scan{number}.points'] = scan.points
     arrays['scans.stamp_ns'] = np.array([scan.stamp_ns for scan in scans], np.int64)
@@ -149,12 +152,31 @@ def load_map(
         for scan in scans:
             of_window.insert(scan.moments)
         check_held(surfel_map.moments(), of_window.moments())
+        if f'map.{SCANS}' not in arrays:
+            surfel_map = with_scans_of(surfel_map, of_window.moments())
     digest = surfel_map.digest()
     if digest != attributes.get('digest'):
         raise FileFormatError(
             f'{path}: damaged: digest {digest}, expected {attributes.get("digest")}'
         )
     return surfel_map, scans
+
+
+def with_scans_of(surfel_map: SurfelMap, window: ScanMoments) -> SurfelMap:
+    """
+    Return a map of a file without numbers of scans, with those of its window.
+
+    If a voxel holds further points, they count as one scan more: it stays when the window leaves.
+    """
+    whole = surfel_map.moments()
+    rows = np.searchsorted(whole.key, window.key)
+    num_scans = np.zeros(len(whole), np.int64)
+    num_scans[rows] = window.scans
+    num_points = np.zeros(len(whole), np.int64)
+    num_points[rows] = window.count
+    counted = surfel_map.emptied()
+    counted.insert(replace(whole, num_scans=num_scans + (whole.count > num_points)))
+    return counted
 
 
 def check_held(whole: ScanMoments, kept: ScanMoments) -> None:
@@ -242,7 +264,7 @@ def _num_scans(arrays: dict[str, npt.NDArray[Any]]) -> int:
     if poses.dtype != np.float64 or poses.shape != (len(stamps), 4, 4):
         raise ValueError(f'poses of scans: {poses.dtype} {poses.shape} for {len(stamps)} scans')
     prefixes = ['map', *(f'scan{number}' for number in range(len(stamps)))]
-    expected = {f'{prefix}.{name}' for prefix in prefixes for name in (*NAMES, 'points')}
+    expected = {f'{prefix}.{name}' for prefix in prefixes for name in (*NAMES, SCANS, 'points')}
     unknown = sorted({*arrays} - expected - {'scans.stamp_ns', 'scans.pose'})
     if unknown or 'map.points' in arrays:
         raise ValueError(f'unknown arrays {unknown or ["map.points"]}')
@@ -284,11 +306,19 @@ def _scan(arrays: dict[str, npt.NDArray[Any]], number: int, surfel_map: SurfelMa
     )
 
 
+def _arrays(prefix: str, moments: ScanMoments) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of moments by their names in the file."""
+    names = [*NAMES, *([] if moments.num_scans is None else [SCANS])]
+    return {f'{prefix}.{name}': getattr(moments, name) for name in names}
+
+
 def _moments(
     arrays: dict[str, npt.NDArray[Any]], prefix: str, surfel_map: SurfelMap
 ) -> ScanMoments:
     """Return the moments under a prefix."""
     columns = {name: arrays[f'{prefix}.{name}'] for name in NAMES}
+    if f'{prefix}.{SCANS}' in arrays:
+        columns[SCANS] = arrays[f'{prefix}.{SCANS}']
     return checked_moments(columns, surfel_map, prefix)
 
 
@@ -319,8 +349,9 @@ def checked_moments(
     for name, array in columns.items():
         if array.shape != (len(key), *widths.get(name, ())) or array.dtype.kind != 'i':
             raise ValueError(f'{prefix}.{name}: {array.dtype} {array.shape}')
-    if any(columns[name].dtype != np.int64 for name in ('key', 'product', 'channels')):
-        raise ValueError(f'{prefix}: keys, products or channels are not int64')
+    wide = [n for n in ('key', 'product', 'channels', SCANS) if n in columns]
+    if any(columns[name].dtype != np.int64 for name in wide):
+        raise ValueError(f'{prefix}: keys, products, channels or numbers of scans are not int64')
     in_order = key  # as save_map writes them; np.unique, by hashes, takes 80 times as long
     if not (key[1:] > key[:-1]).all():
         in_order = np.sort(key)
@@ -328,6 +359,9 @@ def checked_moments(
         raise ValueError(f'{prefix}: a voxel occurs twice, or is out of range')
     if (count < 1).any() or (count > MAX_MAP_COUNT).any():
         raise ValueError(f'{prefix}: impossible numbers of points')
+    num_scans = columns.get(SCANS)
+    if num_scans is not None and ((num_scans < 1) | (num_scans > count)).any():
+        raise ValueError(f'{prefix}: impossible numbers of scans')
     return ScanMoments(
         voxel_size_m=surfel_map.voxel_size_m,
         level=surfel_map.level,
@@ -338,4 +372,5 @@ def checked_moments(
         view=columns['view'],
         channel_names=names,
         channels=columns['channels'],
+        num_scans=num_scans,
     )

@@ -4,15 +4,16 @@
 Maps as Parquet, one row per voxel: derived quantities and exact moments.
 
 Every voxel has a row, sorted by voxel: its index i j k, the quantities that SurfelMap derives
-(x y z nx ny nz planarity curvature; x y z plus the origin of the map, in doubles), and the exact
-moments as int64 (num_points, sum_*, sum_**, view_*). The map is rebuilt from the moments with the
+(x y z nx ny nz planarity curvature thickness normal_sigma radius size cov_**; x y z plus the
+origin of the map, in doubles), and the exact moments as int64 (num_points, num_scans, sum_*,
+sum_**, view_*). The map is rebuilt from the moments with the
 same digest, which is in the file and compared, so a changed file is refused. Other tools read the
 columns by name. Reading and writing are one module because they share the names of the columns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import itertools
 import json
 import os
@@ -29,6 +30,7 @@ from surfel_mapper.files.map_state import checked_moments, NO_ORIGIN
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import check_possible, digest_of, pack_keys, ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import COVARIANCE, QUALITY
 from surfel_mapper.threads import share, usable_cores
 
 KIND, VERSION = 'surfel_mapper surfels', 1
@@ -52,7 +54,10 @@ INDEX = ('i', 'j', 'k')
 SUMS = ('sum_x', 'sum_y', 'sum_z')
 PRODUCTS = ('sum_xx', 'sum_xy', 'sum_xz', 'sum_yy', 'sum_yz', 'sum_zz')
 VIEWS = ('view_x', 'view_y', 'view_z')
+SCANS = 'num_scans'
+"""Missing in files of earlier versions: one scan for each voxel then."""
 DERIVED = ('x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity', 'curvature')
+"""With the columns of QUALITY and COVARIANCE the derived columns, which are not read."""
 
 Columns = dict[str, npt.NDArray[Any]]
 
@@ -168,12 +173,13 @@ def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, Su
             content = parquet.ParquetFile(file, **FOOTER_LIMITS)
             attributes = read_attributes(path, content.schema_arrow.metadata or {})
             surfel_map = map_of(attributes, voxel_size_m, path)
-            names = moment_names(surfel_map)
-            unknown = {*content.schema_arrow.names} - {*names, *DERIVED}
+            in_file = content.schema_arrow.names
+            names = moment_names(surfel_map, in_file)
+            unknown = {*in_file} - {*names, *DERIVED, *QUALITY, *COVARIANCE}
             if unknown:
                 raise ValueError(f'unknown columns {sorted(unknown)}')
             check_size(content, names, path, os.fstat(opened.fileno()).st_size)
-            columns = read_rows(file, content.metadata, surfel_map)
+            columns = read_rows(file, content.metadata, surfel_map, names)
             moments = checked_moments(columns, surfel_map, 'rows')
     except FileFormatError:
         raise
@@ -184,7 +190,7 @@ def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, Su
     return moments, surfel_map, attributes.get('digest')
 
 
-def read_rows(file: Any, footer: Any, surfel_map: SurfelMap) -> Columns:
+def read_rows(file: Any, footer: Any, surfel_map: SurfelMap, names: tuple[str, ...]) -> Columns:
     """
     Return the arrays of the moments in a file, whose groups of rows are read by threads.
 
@@ -194,7 +200,6 @@ def read_rows(file: Any, footer: Any, surfel_map: SurfelMap) -> Columns:
     a whole file for a damaged one.
     """
     _, parquet = import_pyarrow()
-    names = moment_names(surfel_map)
     sizes = [footer.row_group(group).num_rows for group in range(footer.num_row_groups)]
     ends = list(itertools.accumulate(sizes))
     arrays = moment_arrays(footer.num_rows, surfel_map)
@@ -272,6 +277,7 @@ def map_columns(surfel_map: SurfelMap) -> Columns:
         **named(INDEX, moments.voxel_index),
         **derived_columns(surfel_map),
         'num_points': moments.count,
+        SCANS: moments.scans,
         **named(SUMS, moments.total),
         **named(PRODUCTS, moments.product),
         **named(VIEWS, moments.view),
@@ -296,13 +302,15 @@ def encodings(columns: Columns) -> dict[str, Any]:
 
 def derived_columns(surfel_map: SurfelMap) -> Columns:
     """Return the quantities derived from the moments of a map, sorted by voxel."""
-    surfels = surfel_map.surfels()
+    surfels = surfel_map.surfels(covariance=True)
     surfels = surfels.select(np.argsort(pack_keys(surfels.voxel_index)))
     return {
         **named(('x', 'y', 'z'), surfels.position + surfel_map.origin_m),
         **named(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32)),
         'planarity': surfels.planarity.astype(np.float32),
         'curvature': surfels.curvature.astype(np.float32),
+        **{name: getattr(surfels, name).astype(np.float32) for name in QUALITY if name != SCANS},
+        **{name: c.astype(np.float32) for name, c in surfels.covariance_columns().items()},
     }
 
 
@@ -316,9 +324,11 @@ def channel_columns(surfel_map: SurfelMap) -> tuple[str, ...]:
     return tuple(f'sum_{name}' for name in channel_names(surfel_map.columns))
 
 
-def moment_names(surfel_map: SurfelMap) -> tuple[str, ...]:
-    """Return the names of the columns from which a map is rebuilt."""
-    return (*INDEX, 'num_points', *SUMS, *PRODUCTS, *VIEWS, *channel_columns(surfel_map))
+def moment_names(surfel_map: SurfelMap, in_file: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the columns of a file from which a map is rebuilt."""
+    scans = (SCANS,) if SCANS in in_file else ()
+    channels = channel_columns(surfel_map)
+    return (*INDEX, 'num_points', *scans, *SUMS, *PRODUCTS, *VIEWS, *channels)
 
 
 def read_attributes(path: str | Path, metadata: Mapping[bytes, bytes]) -> dict[str, Any]:
@@ -375,13 +385,17 @@ def moment_arrays(num_rows: int, surfel_map: SurfelMap) -> Columns:
     arrays: Columns = {
         name: np.empty((num_rows, width), np.int64) for name, width in widths.items()
     }
-    return {'key': np.empty(num_rows, np.int64), 'count': np.empty(num_rows, np.int64), **arrays}
+    for name in ('key', 'count', SCANS):
+        arrays[name] = np.ones(num_rows, np.int64)
+    return arrays
 
 
 def fill_rows(arrays: Columns, rows: slice, columns: Columns, surfel_map: SurfelMap) -> None:
     """Write columns of a file into some rows of the arrays of moments."""
     arrays['key'][rows] = pack_keys(np.stack([columns[name] for name in INDEX], axis=1))
     arrays['count'][rows] = columns['num_points']
+    if SCANS in columns:
+        arrays[SCANS][rows] = columns[SCANS]
     tables = {'total': SUMS, 'product': PRODUCTS, 'view': VIEWS}
     for target, names in {**tables, 'channels': channel_columns(surfel_map)}.items():
         for number, name in enumerate(names):

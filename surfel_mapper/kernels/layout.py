@@ -53,8 +53,14 @@ ROW = 12
 PIECE = 16
 """Bits of a word of VIEW or SUM that belong to another number."""
 
-# Stamp of a row, kept beside the rows: the last change of its voxel. Bit 0 says that the change
-# emptied it, the 31 upper bits are the lower ones of the version of the map.
+# Two words for each row, uint32, in a slab of their own.
+STAMP = 0
+"""The last change of the voxel: bit 0 says that the change emptied it, the 31 upper bits are the
+lower ones of the version of the map."""
+SCANS = 1
+"""Number of scans with points in the voxel, 0 for an empty row; sums wrap around at 2^32."""
+STAMP_ROW = 2
+
 EMPTIED = 1
 STAMPS = (1 << 32) - 1
 """Mask of a stamp. Versions repeat after 2^31 changes, 1.7 years of a window at 20 scans/s. A row

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.layout import BITS, ROW
+from surfel_mapper.kernels.layout import BITS, ROW, SCANS, STAMP_ROW
 from surfel_mapper.mapping.channels import means
 from surfel_mapper.mapping.kernels.rows import write_rows
 from surfel_mapper.mapping.kernels.voxels import coarse_rows, sum_coarse
@@ -34,17 +34,19 @@ def coarse_moments(
     moments : ScanMoments
         Moments of a map, with summed views.
     level : int
-        0 or more.
+        0 or more. The number of scans of a larger voxel is the largest of its voxels, as a scan
+        has points in several.
     chosen : (K,) int64, optional
         The voxels, of those of the moments; by default all.
 
     """
     chosen = np.arange(len(moments)) if chosen is None else chosen
     keys, rows = coarse_keys(moments.key[chosen], level)
-    shapes = ((), (3,), (6,), (3,))
-    count, total, product, view = (np.zeros((len(keys), *shape), np.int64) for shape in shapes)
-    sums = count, total, product, view
-    sum_coarse(moments.arrays, chosen, rows, moments.level, level, sums)
+    shapes = ((), (3,), (6,), (3,), ())
+    sums = tuple(np.zeros((len(keys), *shape), np.int64) for shape in shapes)
+    fine = *moments.arrays, moments.scans
+    sum_coarse(fine, chosen, rows, moments.level, level, sums)
+    count, total, product, view, num_scans = sums
     channels = np.zeros((len(keys), moments.channels.shape[1]), np.int64)
     if channels.size:
         np.add.at(channels, rows, moments.channels[chosen])
@@ -58,6 +60,7 @@ def coarse_moments(
         product=product,
         view=view,
         channels=channels,
+        num_scans=num_scans,
     )
     object.__setattr__(coarse, 'num_reduced', int(count.sum()))  # sums of a map need no test
     return coarse
@@ -71,9 +74,10 @@ def coarse_surfels(
     coarse = coarse.select(coarse.count >= min_points)
     slab = np.empty((len(coarse), ROW), np.int64)
     write_rows(coarse.arrays, slab)
-    surfels = derive(
-        slab, np.arange(len(slab), dtype=np.int32), coarse.voxel_size_m, BITS + coarse.level
-    )
+    stamps = np.zeros((len(coarse), STAMP_ROW), np.uint32)
+    stamps[:, SCANS] = coarse.scans
+    chosen_rows = np.arange(len(slab), dtype=np.int32)
+    surfels = derive((slab, stamps), chosen_rows, coarse.voxel_size_m, BITS + coarse.level)
     channels = means(coarse.channels, coarse.count, coarse.channel_names)
     return replace(surfels, channels=channels)
 

@@ -4,7 +4,8 @@
 MomentMap: the exact moments of voxels, which scans enter and leave.
 
 A voxel is a row of integers in a slab: count, sum and second moment of its points in units of
-voxel_size / 65536 about the voxel centre, and the sum of the directions to the sensor. Adding a
+voxel_size / 65536 about the voxel centre, and the sum of the directions to the sensor. A second
+slab counts its scans, which the digest does not cover. Adding a
 scan is integer addition and removing it integer subtraction, so that after any sequence of both
 the map equals, bit for bit, the map of the remaining scans. With float32 moments the smallest
 eigenvalue is 2.5 to 6 % off at 1 km after 1e5 cycles.
@@ -95,7 +96,7 @@ class VoxelTable:
 
     def __init__(self, num_channels: int = 0) -> None:
         self.rows = Slab(1024, layout.ROW)
-        self._stamps = Slab(1024, 1, np.uint32)
+        self._stamps = Slab(1024, layout.STAMP_ROW, np.uint32)
         self._version = 0
         self._channels = Slab(1024, num_channels) if num_channels else None
         self._hash = HashTable(MAX_DEPTH)
@@ -214,6 +215,22 @@ class VoxelTable:
         if not self._channels:
             return np.empty((len(chosen), 0), np.int64)
         return np.asarray(self._channels.array[chosen.astype(np.intp)])
+
+    def num_scans(
+        self, chosen: npt.NDArray[Any], count: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.int64]:
+        """
+        Return the numbers of scans of some rows of ``count`` points, (K,), 1 to count.
+
+        A number would be beyond if scans were removed in other pieces than they were added in.
+        """
+        num_scans = self._stamps.array[chosen.astype(np.intp), layout.SCANS].view(np.int32)
+        return np.asarray(np.clip(num_scans, 1, count), np.int64)
+
+    @property
+    def slabs(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint32]]:
+        """Rows (R, 12) and their stamps (R, 2), of which surfels are derived."""
+        return self.rows.array, self._stamps.array
 
     def changed_after(self, version: int, min_points: int) -> npt.NDArray[np.int32]:
         """
@@ -344,13 +361,16 @@ def kernel_arrays(moments: ScanMoments) -> tuple[Arrays, Arrays]:
     """
     key, count, total, product, view = moments.arrays
     count = count.view(np.uint32) if count.dtype == np.int32 else count.astype(np.uint32)
+    scans: npt.NDArray[np.uint32] = np.ones(len(key), np.uint32)
+    if moments.num_scans is not None:
+        scans = moments.num_scans.astype(np.uint32)
     if total.dtype == np.int32 and view.dtype == np.int16:
-        return (key, count, total, product, view), ()
+        return (key, count, total, product, view, scans), ()
     if not moments.view_is_sum:
         view = view * moments.count[:, None].astype(np.int64)
     sums = np.asarray(total, np.int64), np.ascontiguousarray(view, np.int64)
     zeros = np.zeros((len(key), 3), np.int32), np.zeros((len(key), 3), np.int16)
-    return (key, count, zeros[0], product, zeros[1]), sums
+    return (key, count, zeros[0], product, zeros[1], scans), sums
 
 
 def stamp_of(version: int) -> int:
@@ -597,6 +617,7 @@ class MomentMap:
         read_rows(self._table.rows.array, chosen, arrays)
         key, count, total, product, view = arrays
         return ScanMoments(
+            num_scans=self._table.num_scans(chosen, count),
             voxel_size_m=self.voxel_size_m,
             level=self.level,
             key=key,

@@ -75,6 +75,8 @@ class ScanMoments:
         Sums of the channels over the points; units in mapping/channels.py.
     left_out : mapping of str to int
         Number of points left out by cause: not_finite, too_near, too_far, beyond_map.
+    num_scans : (K,) int64, optional
+        Number of scans of which these are the sums, of each voxel. None: one scan.
     rows : (K,) int32, optional
         Rows of the voxels in the map that inserted these moments last. Only hints, which save
         the look-up at removal: a map confirms each by the key in the row.
@@ -94,6 +96,7 @@ class ScanMoments:
     channel_names: tuple[str, ...] = ()
     channels: npt.NDArray[np.int64] = None  # type: ignore[assignment]  # none: (K, 0)
     left_out: Mapping[str, int] = field(default_factory=dict)
+    num_scans: npt.NDArray[np.int64] | None = None
     rows: npt.NDArray[np.int32] | None = field(default=None, init=False, repr=False)
     num_reduced: int | None = field(default=None, init=False, repr=False)
 
@@ -130,7 +133,13 @@ class ScanMoments:
         """Bytes of the arrays, without the hints."""
         key, count, total, product, view = self.arrays
         num_bytes = key.nbytes + count.nbytes + total.nbytes + product.nbytes + view.nbytes
-        return num_bytes + self.channels.nbytes
+        num_scans = 0 if self.num_scans is None else self.num_scans.nbytes
+        return num_bytes + self.channels.nbytes + num_scans
+
+    @property
+    def scans(self) -> npt.NDArray[np.int64]:
+        """Number of scans of each voxel, (K,): ``num_scans``, or 1."""
+        return np.ones(len(self), np.int64) if self.num_scans is None else self.num_scans
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
@@ -145,7 +154,7 @@ class ScanMoments:
     def select(self, voxels: slice | npt.NDArray[Any]) -> ScanMoments:
         """Return the moments of selected voxels: a slice, a mask (K,) bool or row indices."""
         check_rows('voxels', voxels)
-        names = ('key', 'count', 'total', 'product', 'view', 'channels')
+        names = (*HASHED_ARRAYS, 'channels', *([] if self.num_scans is None else ['num_scans']))
         return replace(self, **{name: getattr(self, name)[voxels] for name in names})
 
 
@@ -257,7 +266,7 @@ def joined_moments(shards: Sequence[ScanMoments]) -> ScanMoments:
         If a voxel occurs twice.
 
     """
-    names = (*HASHED_ARRAYS, 'channels')
+    names = (*HASHED_ARRAYS, 'channels', 'scans')
     arrays: dict[str, Any] = {
         name: np.concatenate([getattr(shard, name) for shard in shards]) for name in names
     }
@@ -266,13 +275,14 @@ def joined_moments(shards: Sequence[ScanMoments]) -> ScanMoments:
     if len(twice):
         index = unpack_keys(key[twice[:1]])[0].tolist()
         raise MapError(f'{len(twice)} voxels occur twice, expected once each: {index}, ...')
-    return replace(shards[0], **arrays)
+    return replace(shards[0], num_scans=arrays.pop('scans'), **arrays)
 
 
 def check_arrays(moments: ScanMoments) -> None:
     """Raise MapError unless the arrays have the shapes and types that the kernels read."""
     channels = len(moments.channel_names)
-    for name, width, types in (*ARRAYS, ('channels', (channels,), (np.int64,))):
+    others = ('channels', (channels,), (np.int64,)), ('scans', (), (np.int64,))
+    for name, width, types in (*ARRAYS, *others):
         array = getattr(moments, name)
         shape = (len(moments), *width)
         if not (isinstance(array, np.ndarray) and array.shape == shape and array.dtype in types):
@@ -293,7 +303,8 @@ def check_possible(moments: ScanMoments) -> None:
         raise MapError(
             f'row {row} of the moments: key {moments.key[row]}, {moments.count[row]} points, '
             f'sums {moments.total[row].tolist()}, products {moments.product[row].tolist()}, '
-            f'views {moments.view[row].tolist()}; expected those of points in a voxel'
+            f'views {moments.view[row].tolist()}, {moments.scans[row]} scans; expected those of '
+            'points in a voxel'
         )
 
 
@@ -302,8 +313,9 @@ def impossible(moments: ScanMoments) -> npt.NDArray[np.bool_]:
     Return which rows, (K,), hold moments that no points of a voxel can have.
 
     Tested: keys that are not negative, counts of 1 or more, sums within the voxel, second moments
-    that satisfy the inequality of Cauchy and Schwarz, views no longer than their unit. Others
-    would overflow the integers of the map or give negative eigenvalues later, far from the cause.
+    that satisfy the inequality of Cauchy and Schwarz, views no longer than their unit, 1 to count
+    scans. Others would overflow the integers of the map or give negative eigenvalues later, far
+    from the cause.
     """
     half = float(HALF << moments.level)
     count = moments.count.astype(np.float64)[:, None]
@@ -316,7 +328,8 @@ def impossible(moments: ScanMoments) -> npt.NDArray[np.bool_]:
         | (total * total > count * square * SLACK)
         | (np.abs(view) > farthest)
     )
-    return np.asarray((moments.key < 0) | (moments.count < 1) | beyond.any(axis=1))
+    beyond_scans = (moments.scans < 1) | (moments.scans > moments.count)
+    return np.asarray((moments.key < 0) | (moments.count < 1) | beyond.any(axis=1) | beyond_scans)
 
 
 def digest_of(

@@ -28,7 +28,6 @@ from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import means
 from surfel_mapper.mapping.coarsening import coarse_moments
-from surfel_mapper.mapping.kernels.surfels import derive_covariances
 from surfel_mapper.mapping.moment_map import MAX_LEVEL, MomentMap
 from surfel_mapper.mapping.moments import (
     looks_like_other_unit,
@@ -205,7 +204,9 @@ class SurfelMap(MomentMap):
             columns=columns,
         )
 
-    def surfels(self, min_points: int = 1, at_most: int | None = None) -> Surfels:
+    def surfels(
+        self, min_points: int = 1, at_most: int | None = None, *, covariance: bool = False
+    ) -> Surfels:
         """
         Return the surfels of all voxels of at least min_points points, in unspecified order.
 
@@ -216,6 +217,8 @@ class SurfelMap(MomentMap):
         at_most : int, optional
             Maximum number of surfels; a larger map is subsampled evenly in space, by a hash of
             the voxel, so that the selection changes little while the map grows.
+        covariance : bool
+            With the covariances of the points.
 
         Raises
         ------
@@ -227,28 +230,22 @@ class SurfelMap(MomentMap):
         """
         min_points = as_whole('min_points', min_points)
         if at_most is None:
-            return self._derive(self._table.occupied(min_points))
+            return self._derive(self._table.occupied(min_points), covariance)
         if as_whole('at_most', at_most) < 0:
             raise ValueError(f'at_most: {at_most}, expected 0 or more')
-        return self._derive(self._table.thinned(min_points, at_most))
+        return self._derive(self._table.thinned(min_points, at_most), covariance)
 
     def num_surfels(self, min_points: int = 1) -> int:
         """Return the number of voxels of at least min_points points."""
         return len(self._table.occupied(as_whole('min_points', min_points)))
 
-    def surfels_of(self, rows: npt.NDArray[np.int32]) -> Surfels:
+    def surfels_of(self, rows: npt.NDArray[np.int32], *, covariance: bool = False) -> Surfels:
         """Return the surfels of rows (K,) that ``find`` returned; IndexError for others."""
-        return self._derive(self._table.checked(rows))
+        return self._derive(self._table.checked(rows), covariance)
 
-    def covariances_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
-        """Return the covariances of rows (K,): (K, 6), xx xy xz yy yz zz, m^2."""
-        rows = self._table.checked(rows)
-        covariances = np.empty((len(rows), 6))
-        bits = layout.BITS + self.level
-        derive_covariances(self._table.rows.array, rows, self.voxel_size_m, bits, covariances)
-        return covariances
-
-    def surfels_changed(self, since: int | None = None, min_points: int = 1) -> Surfels:
+    def surfels_changed(
+        self, since: int | None = None, min_points: int = 1, *, covariance: bool = False
+    ) -> Surfels:
         """
         Return the surfels of the voxels that changed.
 
@@ -258,6 +255,8 @@ class SurfelMap(MomentMap):
             A ``version`` of the map; by default the version at the last call without ``since``.
         min_points : int
             Voxels with fewer points are skipped.
+        covariance : bool
+            With the covariances of the points.
 
         """
         if type(min_points) is not int:
@@ -270,7 +269,7 @@ class SurfelMap(MomentMap):
         changed = self._changes.since(since, self._table, least)
         if changed is None:
             changed = self._table.changed_after(since, least)
-        return self._derive(changed)
+        return self._derive(changed, covariance)
 
     def index(self, min_points: int = 1) -> SurfelIndex:
         """Return a snapshot of the surfels of at least min_points points for spatial queries."""
@@ -394,9 +393,9 @@ class SurfelMap(MomentMap):
         settings = {'columns': self.columns, 'level': self.level}
         return _rebuilt, (self.voxel_size_m, settings, self.origin_m, self.moments())
 
-    def _derive(self, chosen: npt.NDArray[np.int32]) -> Surfels:
+    def _derive(self, chosen: npt.NDArray[np.int32], covariance: bool = False) -> Surfels:
         bits = layout.BITS + self.level
-        surfels = derive(self._table.rows.array, chosen, self.voxel_size_m, bits)
+        surfels = derive(self._table.slabs, chosen, self.voxel_size_m, bits, covariance)
         if not self._channel_names:
             return surfels
         sums = self._table.channels(chosen)

@@ -27,6 +27,11 @@ logger = logging.getLogger(__name__)
 FLOAT_REACH_M = 8192.0
 """Coordinates to which float32 is exact to 0.5 mm."""
 
+QUALITY = ('thickness', 'normal_sigma', 'radius', 'num_scans', 'size')
+"""Names of the columns that tell how good a surfel is."""
+
+COVARIANCE = ('cov_xx', 'cov_xy', 'cov_xz', 'cov_yy', 'cov_yz', 'cov_zz')
+
 Columns = dict[str, npt.NDArray[Any]]
 
 
@@ -40,6 +45,11 @@ class OneSurfel(NamedTuple):
     eigenvalues: npt.NDArray[np.float64]
     num_points: int
     voxel_index: tuple[int, int, int]
+    thickness: float
+    normal_sigma: float
+    radius: float
+    num_scans: int
+    size: float
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -68,6 +78,23 @@ class Surfels:
         Number of points.
     voxel_index : (K, 3) int32
         floor(point / voxel size).
+    thickness : (K,) float64, m
+        Standard deviation of the points along the normal about their plane: the square root of
+        e0 (n - 1) / (n - 3), as fitting the plane takes three of the n degrees of freedom. nan for
+        3 points or fewer.
+    normal_sigma : (K,) float64, rad
+        Standard error of the normal, at most pi/2, that of an undetermined normal: the square root
+        of the sum of s e_i / ((n - 1) (e_i - s)^2) for i = 1, 2, where s is thickness^2, at least
+        0.01^2 m^2. nan for 3 points or fewer, and if the normal is nan.
+    radius : (K,) float64, m
+        Radius of the uniform disc of equal spread in the plane: the square root of 2 (e1 + e2).
+    num_scans : (K,) int64
+        Number of scans with points in the voxel, exact if scans are removed as they were added; of
+        a coarser voxel the largest of its voxels.
+    size : (K,) float64, m
+        Edge of the voxel.
+    covariance : (K, 6) float64, m^2, optional
+        Covariance of the points, xx xy xz yy yz zz, if asked for.
     channels : mapping of str to (K,) float64
         Means of the channels of the map: ``intensity``; ``red``, ``green``, ``blue`` in 0 to 255.
 
@@ -80,6 +107,12 @@ class Surfels:
     eigenvalues: npt.NDArray[np.float64]
     num_points: npt.NDArray[np.int64]
     voxel_index: npt.NDArray[np.int32]
+    thickness: npt.NDArray[np.float64]
+    normal_sigma: npt.NDArray[np.float64]
+    radius: npt.NDArray[np.float64]
+    num_scans: npt.NDArray[np.int64]
+    size: npt.NDArray[np.float64]
+    covariance: npt.NDArray[np.float64] | None = None
     channels: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
 
     @classmethod
@@ -133,6 +166,11 @@ class Surfels:
             eigenvalues=self.eigenvalues[row],
             num_points=int(self.num_points[row]),
             voxel_index=tuple(self.voxel_index[row].tolist()),
+            thickness=float(self.thickness[row]),
+            normal_sigma=float(self.normal_sigma[row]),
+            radius=float(self.radius[row]),
+            num_scans=int(self.num_scans[row]),
+            size=float(self.size[row]),
         )
 
     def __iter__(self) -> Iterator[OneSurfel]:
@@ -147,8 +185,9 @@ class Surfels:
         """
         Return the surfels as a structured array of shape (K,).
 
-        Fields x y z, normal_x normal_y normal_z, planarity, curvature, e0 e1 e2, num_points, i j k
-        and the channels; the names of columns of ``to_pandas``.
+        Fields x y z, normal_x normal_y normal_z, planarity, curvature, e0 e1 e2, num_points,
+        i j k, thickness, normal_sigma, radius, num_scans, size, cov_xx ... cov_zz if there are
+        covariances, and the channels; the names of columns of ``to_pandas``.
         """
         columns = self._columns()
         table = np.empty(len(self), [(name, values.dtype) for name, values in columns.items()])
@@ -206,8 +245,16 @@ class Surfels:
             **dict(zip(('e0', 'e1', 'e2'), self.eigenvalues.T, strict=True)),
             'num_points': self.num_points,
             **dict(zip('ijk', self.voxel_index.T, strict=True)),
+            **{name: getattr(self, name) for name in QUALITY},
+            **self.covariance_columns(),
             **self.channels,
         }
+
+    def covariance_columns(self) -> dict[str, npt.NDArray[np.float64]]:
+        """Return cov_xx, cov_xy, cov_xz, cov_yy, cov_yz, cov_zz, (K,) each; {} without them."""
+        if self.covariance is None:
+            return {}
+        return dict(zip(COVARIANCE, self.covariance.T, strict=True))
 
     def select(self, rows: Any) -> Surfels:
         """
@@ -235,35 +282,31 @@ class Surfels:
             elif rows.size and not 0 <= rows.min() <= rows.max() < len(self):
                 worst = rows.min() if rows.min() < 0 else rows.max()
                 raise IndexError(no_row(int(worst), len(self)))
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in ARRAYS}
         return Surfels(
-            position=self.position[rows],
-            normal=self.normal[rows],
-            planarity=self.planarity[rows],
-            curvature=self.curvature[rows],
-            eigenvalues=self.eigenvalues[rows],
-            num_points=self.num_points[rows],
-            voxel_index=self.voxel_index[rows],
+            **arrays,
+            covariance=None if self.covariance is None else self.covariance[rows],
             channels={name: values[rows] for name, values in self.channels.items()},
         )
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """All arrays but the channels, in the order of declaration."""
-        return (
-            self.position,
-            self.normal,
-            self.planarity,
-            self.curvature,
-            self.eigenvalues,
-            self.num_points,
-            self.voxel_index,
-        )
+        """All arrays but covariance and channels, in the order of declaration."""
+        return tuple([getattr(self, name) for name in ARRAYS])
+
+
+ARRAYS = tuple(f.name for f in fields(Surfels) if f.name not in ('covariance', 'channels'))
+"""Names of the arrays that all surfels have."""
 
 
 def concatenated(tables: Sequence[Surfels]) -> Surfels:
-    """Return the surfels of all tables."""
-    names = [field.name for field in fields(Surfels) if field.name != 'channels']
-    columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
+    """Return the surfels of all tables, with covariances if all have them."""
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(table, name) for table in tables]) for name in ARRAYS
+    }
+    covariances = [table.covariance for table in tables if table.covariance is not None]
+    if len(covariances) == len(tables):
+        columns['covariance'] = np.concatenate(covariances)
     channels = {
         name: np.concatenate([table.channels[name] for table in tables])
         for name in tables[0].channels
@@ -278,24 +321,27 @@ def no_row(row: int, num_surfels: int) -> str:
 
 
 def derive(
-    rows: npt.NDArray[np.int64],
+    slabs: tuple[npt.NDArray[np.int64], npt.NDArray[np.uint32]],
     chosen: npt.NDArray[np.int32],
     voxel_size_m: float,
     bits: int,
+    covariance: bool = False,
 ) -> Surfels:
     """
     Derive the surfels of selected rows of a slab.
 
     Parameters
     ----------
-    rows : (R, 12) int64
-        In the layout of kernels/layout.py.
+    slabs : (R, 12) int64 and (R, 2) uint32
+        Rows and their stamps, in the layout of kernels/layout.py.
     chosen : (K,) int32
         Rows that hold points.
     voxel_size_m : float
         Edge of a voxel, m.
     bits : int
         A voxel is 2^bits lattice units wide.
+    covariance : bool
+        With the covariances.
 
     """
     num = len(chosen)
@@ -307,12 +353,30 @@ def derive(
         np.empty((num, 3)),
         np.empty(num, np.int64),
         np.empty((num, 3), np.int32),
+        np.empty(num),
+        np.empty(num),
+        np.empty(num),
+        np.empty(num, np.int64),
     )
+    covariances = np.empty((num if covariance else 0, 6))
     if num:  # readers of files import this module, and need no compiler
         from surfel_mapper.mapping.kernels.surfels import derive_surfels
 
-        derive_surfels(rows, chosen, voxel_size_m, bits, arrays)
-    return Surfels(*arrays)
+        derive_surfels(*slabs, chosen, voxel_size_m, bits, (*arrays, covariances))
+    size = np.full(num, voxel_size_m)
+    return Surfels(*arrays, size=size, covariance=covariances if covariance else None)
+
+
+def quality(
+    eigenvalues: npt.NDArray[np.float64], num_points: npt.NDArray[np.int64]
+) -> npt.NDArray[np.float64]:
+    """Return thickness, normal_sigma and radius, (3, K), of eigenvalues (K, 3) and counts (K,)."""
+    columns = np.empty((3, len(num_points)))
+    if len(num_points):
+        from surfel_mapper.mapping.kernels.surfels import derive_quality
+
+        derive_quality(eigenvalues, num_points, tuple(columns))
+    return columns
 
 
 def surfel_columns(surfels: Surfels) -> Columns:

@@ -75,8 +75,9 @@ class WindowedScan:
         return num_bytes
 
 
-VOXEL_BYTES = 128
-"""A row of a voxel with its stamp, 100 bytes, its share of free rows and of the hash table."""
+VOXEL_BYTES = 132
+"""A row of a voxel with its stamp and number of scans, 104 bytes, its share of free rows and of
+the hash table."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -102,6 +102,7 @@ def surfels_in(msg: Any) -> Surfels:
     columns = {name: values[kept] for name, values in columns.items()}
     count = columns['num_points'].astype(np.int64)
     unknown = np.full(len(count), np.iinfo(np.int32).min, np.int32)
+    nan = np.full(len(count), np.nan)
 
     def stacked(names: Iterable[str]) -> npt.NDArray[np.float64]:
         return np.stack([columns[name] for name in names], axis=1).astype(np.float64)
@@ -114,6 +115,11 @@ def surfels_in(msg: Any) -> Surfels:
         eigenvalues=np.full((len(count), 3), np.nan),
         num_points=count,
         voxel_index=np.stack([columns.get(name, unknown) for name in VOXEL], axis=1),
+        thickness=columns.get('thickness', nan).astype(np.float64),
+        normal_sigma=columns.get('normal_sigma', nan).astype(np.float64),
+        radius=columns.get('radius', nan).astype(np.float64),
+        num_scans=columns.get('num_scans', np.zeros(len(count))).astype(np.int64),
+        size=columns.get('size', nan).astype(np.float64),
         channels=means_in(columns),
     )
 

@@ -25,7 +25,7 @@ from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.kernels.layout import INDEX_BITS
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.surfels import quality, Surfels
 from surfel_mapper.models.kernels.surfel_classes import (
     classify,
     classify_sparse,
@@ -69,7 +69,7 @@ class SurfelGraph:
     ----------
     key : (R,) int64
         Key of the voxel in each row, -1 for none.
-    count, position, normal, eigenvalues, covariance, axes
+    count, num_scans, position, normal, eigenvalues, covariance, axes
         Its surfel; covariance xx xy xz yy yz zz; axes as in models/kernels/surfel_classes.py.
     own_kind, own_normal
         Class and normal of the voxel alone; kind and normal take sparse voxels with those around.
@@ -132,7 +132,7 @@ class SurfelGraph:
         self._version = -1
         none = np.empty(0, np.int32)
         self.key = np.empty(0, np.int64)
-        self.count = np.empty(0, np.int64)
+        self.count = self.num_scans = np.empty(0, np.int64)
         self.position, self.normal, self.own_normal, self.eigenvalues = np.empty((4, 0, 3))
         self.covariance, self.axes = np.empty((0, 6)), np.empty((0, 2, 3))
         self.kind = self.own_kind = self.level = np.empty(0, np.uint8)
@@ -208,17 +208,23 @@ class SurfelGraph:
     def surfels(self) -> Surfels:
         """Return all voxels as surfels, in the order of their rows."""
         rows = np.flatnonzero(self.key >= 0)
-        eigenvalues = self.eigenvalues[rows]
+        eigenvalues, num_points = self.eigenvalues[rows], self.count[rows]
         e0, e1, e2 = eigenvalues.T
         total = np.where(e2 > 0.0, e0 + e1 + e2, np.nan)
+        thickness, normal_sigma, radius = quality(eigenvalues, num_points)
         return Surfels(
             position=self.position[rows],
             normal=self.own_normal[rows],
             planarity=2.0 * (e1 - e0) / total,
             curvature=e0 / total,
             eigenvalues=eigenvalues,
-            num_points=self.count[rows],
+            num_points=num_points,
             voxel_index=unpack_keys(self.key[rows]),
+            thickness=thickness,
+            normal_sigma=normal_sigma,
+            radius=radius,
+            num_scans=self.num_scans[rows],
+            size=np.full(len(rows), self.map.voxel_size_m),
         )
 
     def _forgotten(self) -> RemovedVoxels:
@@ -274,10 +280,10 @@ class SurfelGraph:
         classes of both.
         """
         old_kind, normals = self.kind[around], self.normal[around]
-        surfels = self.map.surfels_of(rows)
+        surfels = self.map.surfels_of(rows, covariance=True)
         self.count[rows], self.position[rows] = surfels.num_points, surfels.position
         self.own_normal[rows], self.eigenvalues[rows] = surfels.normal, surfels.eigenvalues
-        self.covariance[rows] = self.map.covariances_of(rows)
+        self.covariance[rows], self.num_scans[rows] = surfels.covariance, surfels.num_scans
         classify(
             rows,
             self.count,

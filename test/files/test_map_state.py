@@ -179,3 +179,46 @@ def test_a_window_of_points_that_the_map_does_not_hold_is_refused(points):
         check_held(surfel_map.moments(), other.moments())
     with pytest.raises(NotInMapError):
         check_held(SurfelMap(0.5).moments(), other.moments())
+
+
+def test_numbers_of_scans_come_back_and_leave_with_the_window(tmp_path):
+    surfel_map, window = driven()
+    save_map(tmp_path / 'map.npz', surfel_map, window)
+
+    loaded, scans = load_map(tmp_path / 'map.npz')
+
+    expected = surfel_map.moments().num_scans
+    np.testing.assert_array_equal(loaded.moments().num_scans, expected)
+    np.testing.assert_array_equal(load_moments(tmp_path / 'map.npz')[0].num_scans, expected)
+    for scan in scans[:2]:
+        loaded.remove(scan.moments)
+    assert loaded.num_voxels
+    assert (loaded.moments().num_scans == 1).all()
+
+
+def test_a_map_without_numbers_of_scans_gets_those_of_its_window(tmp_path):
+    surfel_map, window = driven()
+    surfel_map.add(np.full((2, 3), 0.1))  # a scan that does not leave
+    save_map(tmp_path / 'map.npz', surfel_map, window)
+    arrays, attributes = load_state(tmp_path / 'map.npz')
+    del arrays['map.num_scans']
+    save_state(tmp_path / 'map.npz', arrays, attributes)
+
+    loaded, scans = load_map(tmp_path / 'map.npz')
+
+    np.testing.assert_array_equal(loaded.moments().num_scans, surfel_map.moments().num_scans)
+    for scan in scans:
+        loaded.remove(scan.moments)
+    assert loaded.moments().num_scans.tolist() == [1]
+
+
+@pytest.mark.parametrize('wrong', [0, 10**6])
+def test_impossible_numbers_of_scans_in_a_file_are_refused(tmp_path, wrong):
+    save_map(tmp_path / 'map.npz', *driven())
+    arrays, attributes = load_state(tmp_path / 'map.npz')
+    numbers = arrays['map.num_scans'].copy()
+    numbers[3] = wrong
+    save_state(tmp_path / 'map.npz', {**arrays, 'map.num_scans': numbers}, attributes)
+
+    with pytest.raises(FileFormatError, match='impossible numbers of scans'):
+        load_map(tmp_path / 'map.npz')

@@ -121,3 +121,23 @@ def test_another_voxel_size_than_asked_for_is_refused(tmp_path):
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(FileFormatError, match='cannot be read: No such file'):
         read_map(tmp_path / 'map.parquet')
+
+
+def test_quality_is_in_the_file_and_numbers_of_scans_come_back(tmp_path):
+    path, surfel_map = tmp_path / 'map.parquet', some_map()
+    surfel_map.add(surfel_map.surfels().position[:50])
+    write_map(path, surfel_map)
+    rows, surfels = pq.read_table(path), surfel_map.surfels(covariance=True)
+    order = np.lexsort(surfels.voxel_index.T[::-1])
+
+    assert set(rows['num_scans'].to_pylist()) == {1, 2}
+    moments = surfel_map.moments()
+    np.testing.assert_array_equal(read_map(path).moments().num_scans, moments.num_scans)
+    for name, values in surfels.to_pandas().items():
+        if name in ('thickness', 'normal_sigma', 'radius', 'size') or name.startswith('cov_'):
+            np.testing.assert_array_equal(rows[name], values.to_numpy()[order].astype(np.float32))
+
+    pq.write_table(rows.drop(['num_scans', 'thickness', 'cov_xx']), path)  # of earlier versions
+    earlier = read_map(path)
+    assert earlier.digest() == surfel_map.digest()
+    assert (earlier.moments().num_scans == 1).all()

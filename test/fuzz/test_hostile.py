@@ -180,7 +180,7 @@ def test_rows_beyond_the_table_are_refused(rows):
     """They were read from other memory."""
     surfel_map = SurfelMap(0.5)
     surfel_map.add(np.zeros((5, 3)))
-    for read in (surfel_map.surfels_of, surfel_map.covariances_of, surfel_map.keys_of):
+    for read in (surfel_map.surfels_of, surfel_map.keys_of):
         with pytest.raises(IndexError, match='rows'):
             read(np.array(rows))
 

@@ -24,6 +24,7 @@ import pytest
 from surfel_mapper.errors import NotInMapError
 from surfel_mapper.mapping import moment_map as module
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import ARRAYS
 from test.reference import add_moments, as_twin, digest, scan_moments
 
 FRACTION = (
@@ -37,9 +38,9 @@ ORIGIN = st.none() | st.tuples(*[st.floats(-50.0, 50.0)] * 3)
 
 
 def in_order(surfels):
-    """Return the bits of surfels, sorted by voxel."""
+    """Return the bits of surfels, sorted by voxel, without the numbers of scans."""
     surfels = surfels.select(np.lexsort(surfels.voxel_index.T))
-    return [values.tobytes() for values in surfels.arrays]
+    return [getattr(surfels, name).tobytes() for name in ARRAYS if name != 'num_scans']
 
 
 class MapBesideTwin(RuleBasedStateMachine):
@@ -55,6 +56,7 @@ class MapBesideTwin(RuleBasedStateMachine):
         self.map, self.twin = SurfelMap(size_m), {}
         self.size_m, self.offset_m = size_m, offset_m
         self.live, self.gone, self.touched, self.reported = [], [], {}, 0
+        self.scans = {}
 
     def teardown(self):
         if hasattr(self, 'saved'):
@@ -65,8 +67,13 @@ class MapBesideTwin(RuleBasedStateMachine):
         points = np.array(fractions, np.float64).reshape(-1, 3) * self.size_m + self.offset_m
         return points.astype(dtype)
 
-    def note(self, scan):
-        self.touched[self.map.version] = set(scan)
+    def note(self, moments, sign=1):
+        """Note the voxels that changed, and add or subtract their numbers of scans."""
+        numbers = [1] * len(moments) if moments.num_scans is None else moments.num_scans.tolist()
+        voxels = list(map(tuple, moments.voxel_index.tolist()))
+        for voxel, number in zip(voxels, numbers, strict=True):
+            self.scans[voxel] = self.scans.get(voxel, 0) + sign * number
+        self.touched[self.map.version] = set(voxels)
 
     @rule(fractions=POINTS, origin=ORIGIN, dtype=st.sampled_from([np.float32, np.float64]))
     def add(self, fractions, origin, dtype):
@@ -74,7 +81,7 @@ class MapBesideTwin(RuleBasedStateMachine):
         twin = scan_moments(points, self.size_m, origin)
         moments = self.map.add(points, origin)
         assert as_twin(moments) == twin
-        self.note(twin)
+        self.note(moments)
         add_moments(self.twin, twin)
         self.live.append((moments, twin))
 
@@ -84,7 +91,7 @@ class MapBesideTwin(RuleBasedStateMachine):
         whole = self.map.reduce(points, origin=origin)
         for part in (points[cut:], points[:cut]):
             moments = self.map.add(part, origin)
-            self.note(as_twin(moments))
+            self.note(moments)
         twin = scan_moments(points, self.size_m, origin)
         add_moments(self.twin, twin)
         self.live.append((whole, twin))  # to be removed at once
@@ -97,7 +104,7 @@ class MapBesideTwin(RuleBasedStateMachine):
             other.add(points, origin)
             add_moments(twin, scan_moments(points, self.size_m, origin))
         self.map.merge(other)
-        self.note(twin)
+        self.note(other.moments())
         add_moments(self.twin, twin)
         self.live.append((other.moments(), twin))
 
@@ -107,8 +114,9 @@ class MapBesideTwin(RuleBasedStateMachine):
         moments, twin = self.live.pop(number % len(self.live))
         before = set(self.twin)
         emptied = self.map.remove(moments)
-        self.note(twin)
+        self.note(moments, -1)
         add_moments(self.twin, twin, -1)
+        self.scans = {voxel: self.scans[voxel] for voxel in self.twin}
         assert sorted(map(tuple, emptied.tolist())) == sorted(before - set(self.twin))
         self.gone.append((moments, twin))
 
@@ -125,6 +133,7 @@ class MapBesideTwin(RuleBasedStateMachine):
     def clear(self):
         self.map.clear()
         self.twin, self.live, self.reported = {}, [], self.map.version
+        self.scans = {}
         self.touched = {self.map.version: set()}
 
     @rule(back=st.integers(0, 12), least=st.integers(0, 4))
@@ -156,6 +165,12 @@ class MapBesideTwin(RuleBasedStateMachine):
             assert self.map.num_voxels == len(self.twin)
             assert self.map.num_points == sum(row[0] for row in self.twin.values())
             assert self.map.digest() == digest(self.twin, self.size_m)
+            surfels = self.map.surfels()
+            voxels = map(tuple, surfels.voxel_index.tolist())
+            expected = [min(max(self.scans[v], 1), self.twin[v][0]) for v in voxels]
+            assert surfels.num_scans.tolist() == expected
+            moments = self.map.moments()
+            assert sorted(moments.num_scans.tolist()) == sorted(expected)
 
     def check_against_the_live_scans_alone(self):
         alone = SurfelMap(self.size_m)

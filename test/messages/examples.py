@@ -11,12 +11,18 @@ def make_surfels(number, centre=(0.0, 0.0, 0.0)):
     """Return ``number`` surfels within 50 m of a place, with values of every kind."""
     rng = np.random.default_rng(1)
     normal = rng.normal(size=(number, 3))
+    num_points = rng.integers(1, 2**31, number, endpoint=True)
     return Surfels(
         position=rng.uniform(-50.0, 50.0, (number, 3)) + np.array(centre),
         normal=normal / np.linalg.norm(normal, axis=1)[:, None],
         planarity=rng.uniform(size=number),
         curvature=rng.uniform(size=number) / 3.0,
         eigenvalues=np.sort(rng.uniform(0.0, 0.02, (number, 3)), axis=1),
-        num_points=rng.integers(1, 2**31, number, endpoint=True),
+        num_points=num_points,
         voxel_index=rng.integers(-500, 500, (number, 3)).astype(np.int32),
+        thickness=rng.uniform(0.0, 0.1, number),
+        normal_sigma=rng.uniform(0.0, 1.5, number),
+        radius=rng.uniform(0.0, 0.5, number),
+        num_scans=rng.integers(1, num_points, endpoint=True),
+        size=np.full(number, 0.5),
     )

@@ -9,7 +9,7 @@ from PIL import Image
 import pytest
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.surfels import concatenated, Surfels
 from surfel_mapper.viz.picture import draw_map, Frame, limits, views, X, Y, Z
 
 YELLOW, PURPLE = np.array([[0.993, 0.906, 0.144], [0.267, 0.005, 0.329]])
@@ -30,13 +30,12 @@ def sheet(height_m, up, planarity, size_m=(20.0, 10.0), centre=(0.0, 0.0)):
         eigenvalues=np.tile([0.0, 0.25 / 12.0, 0.25 / 12.0], (num, 1)),
         num_points=np.full(num, 9),
         voxel_index=np.floor(position / 0.5).astype(np.int32),
+        thickness=np.zeros(num),
+        normal_sigma=np.full(num, 0.01),
+        radius=np.full(num, 0.25 / 3.0**0.5),
+        num_scans=np.ones(num, np.int64),
+        size=np.full(num, 0.5),
     )
-
-
-def joined(*parts):
-    names = ('position', 'normal', 'planarity', 'curvature', 'eigenvalues', 'num_points')
-    columns = [np.concatenate([getattr(part, name) for part in parts]) for name in names]
-    return Surfels(*columns, np.concatenate([part.voxel_index for part in parts]))
 
 
 def drawn(tmp_path, surfels, **options):
@@ -49,7 +48,7 @@ def num_pixels(image, colour):
 
 
 def test_a_ceiling_does_not_hide_the_floor(tmp_path):
-    image = drawn(tmp_path, joined(sheet(0.0, 1.0, 1.0), sheet(5.0, -1.0, 0.0)))
+    image = drawn(tmp_path, concatenated([sheet(0.0, 1.0, 1.0), sheet(5.0, -1.0, 0.0)]))
 
     assert num_pixels(image, YELLOW) > 10 * num_pixels(image, PURPLE)
 
@@ -68,7 +67,7 @@ def test_planes_are_of_one_colour_whatever_their_planarity(tmp_path):
 
 
 def test_a_roof_hides_the_ground(tmp_path):
-    image = drawn(tmp_path, joined(sheet(0.0, 1.0, 1.0), sheet(5.0, 1.0, 0.0)))
+    image = drawn(tmp_path, concatenated([sheet(0.0, 1.0, 1.0), sheet(5.0, 1.0, 0.0)]))
 
     assert num_pixels(image, PURPLE) > 10 * num_pixels(image, YELLOW)
 
@@ -89,7 +88,7 @@ def test_a_few_far_surfels_do_not_shrink_the_rest(tmp_path):
     near = sheet(0.0, 1.0, 1.0)
     far = sheet(0.0, 1.0, 1.0, size_m=(0.5, 0.5), centre=(5000.0, 300.0))
 
-    alone, both = (limits(part) for part in (near, joined(near, far)))
+    alone, both = (limits(part) for part in (near, concatenated([near, far])))
 
     np.testing.assert_allclose(both, alone, atol=0.5)
 
@@ -138,7 +137,7 @@ def test_surfels_without_a_normal_are_left_out(tmp_path):
     odd = sheet(1.0, 1.0, np.nan)
     odd.normal[:] = np.nan
 
-    image = drawn(tmp_path, joined(sheet(0.0, 1.0, 1.0), odd))
+    image = drawn(tmp_path, concatenated([sheet(0.0, 1.0, 1.0), odd]))
 
     assert num_pixels(image, YELLOW) > 10_000
 

@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Derive surfels from the moments of voxels: mean, eigenvalues, normal, planarity, curvature.
+Derive surfels from the moments of voxels: mean, eigenvalues, normal, shape and its quality.
 
 Moments are first moved, in exact arithmetic, from the voxel centre to the lattice point nearest to
 the mean. The scatter is taken there, so nothing cancels: identical points give a scatter of
 exactly 0 anywhere in the voxel. Voxels are gathered in chunks that stay in the cache and are
 decomposed with vector instructions.
+
+Source: Anderson 1963 (Asymptotic theory for principal component analysis) for the standard error
+of an eigenvector.
 """
 
 import math
@@ -14,8 +17,8 @@ import math
 import numpy as np
 
 from surfel_mapper.kernels.compiling import inlined, kernel, U
-from surfel_mapper.kernels.layout import KEY, PRODUCT
-from surfel_mapper.kernels.prefetch import LINE_BYTES, prefetch_to_write
+from surfel_mapper.kernels.layout import KEY, PRODUCT, SCANS, STAMP_ROW
+from surfel_mapper.kernels.prefetch import LINE_BYTES, prefetch, prefetch_to_write
 from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.kernels.symmetric3 import decompose_one
 from surfel_mapper.mapping.kernels.rows import (
@@ -43,6 +46,12 @@ EXACT_BITS = 54
 """A second moment of n points of b bits is below n 4^(b - 1), so float64 holds it exactly for
 n < 2^(54 - 2 b), with a margin of two."""
 
+NOISE_SQ = 0.01**2
+"""Smallest variance of points about their plane that normal_sigma assumes, m^2."""
+
+RIGHT_ANGLE = math.pi / 2.0
+"""Largest normal_sigma, rad: the normal is undetermined."""
+
 # Rows of the chunk of moments: count, sums, products and views as in a row of the slab.
 N = 0
 S = 1
@@ -52,29 +61,36 @@ MOMENTS = 13
 
 
 @kernel(error_model='numpy')
-def derive_surfels(rows, chosen, voxel_size, bits, outputs):
+def derive_surfels(rows, stamps, chosen, voxel_size, bits, outputs):
     """
     Derive the surfels of some rows of the slab.
 
     rows        (R, 12) int64
+    stamps      (R, 2) uint32, see kernels/layout.py
     chosen      (K,) int32 or int64, rows to derive; each holds at least one point
     voxel_size  float64, m
     bits        a voxel is 2^bits lattice units wide
     outputs     position (K, 3) float64 m, normal (K, 3), planarity (K,), curvature (K,),
-                eigenvalues (K, 3) m^2, num_points (K,) int64, voxel_index (K, 3) int32
+                eigenvalues (K, 3) m^2, num_points (K,) int64, voxel_index (K, 3) int32,
+                thickness (K,) m, normal_sigma (K,) rad, radius (K,) m, num_scans (K,) int64,
+                covariance (K, 6) m^2, or (0, 6) to leave it out
 
     A single point or identical points: eigenvalues 0; normal, planarity and curvature nan.
     """
     keys, moments = np.empty(CHUNK, np.int64), np.empty((MOMENTS, CHUNK))
     mean, scatter = np.empty((3, CHUNK)), np.empty((6, CHUNK))
-    values, normals, shape = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((2, CHUNK))
+    values, normals, shape = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((5, CHUNK))
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     unit = voxel_size / (1 << bits)
     vectors = outputs[0].ravel(), outputs[1].ravel(), outputs[4].ravel()
-    written = *vectors, outputs[2], outputs[3], outputs[5], outputs[6].ravel()
+    written = (
+        *(*vectors, outputs[2], outputs[3], outputs[5], outputs[6].ravel()),
+        *(outputs[7], outputs[8], outputs[9], outputs[10]),
+    )
+    changes, covariance = stamps.ravel(), outputs[11]
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
-        most = gather(rows, chosen, start, num, keys, moments, written)
+        most = gather(rows, changes, chosen, start, num, keys, moments, written)
         center(moments, num, mean, scatter)
         if most >= many:
             center_exactly(rows, chosen, start, num, scatter)
@@ -91,6 +107,9 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
             scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
             values[0, i], values[1, i], values[2, i] = e0 * scale, e1 * scale, e2 * scale
         for i in range(num):
+            quality = quality_of(values[0, i], values[1, i], values[2, i], moments[N, i])
+            shape[2, i], shape[3, i], shape[4, i] = quality
+        for i in range(num):
             nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
             side = side_of(nx, ny, nz, moments[V, i], moments[V + 1, i], moments[V + 2, i])
             side = math.nan if math.isnan(shape[0, i]) else side
@@ -98,6 +117,44 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
         write_surfels(
             start, num, keys, moments, mean, normals, values, shape, voxel_size, bits, outputs
         )
+        write_scans(start, num, chosen, moments, changes, outputs[10])
+        if len(covariance):
+            write_covariances(start, num, moments, scatter, unit, covariance)
+
+
+@inlined(error_model='numpy')
+def quality_of(e0, e1, e2, n):
+    """
+    Return thickness (m), normal_sigma (rad) and radius (m) of a surfel; see Surfels.
+
+    e0, e1, e2  float64, m^2, eigenvalues of the covariance, ascending
+    n           float64, number of points
+    """
+    freedom = n - 3.0  # of n points about their plane
+    variance = e0 * (n - 1.0) / freedom if freedom > 0.0 else math.nan
+    noise_sq = variance if variance > NOISE_SQ else NOISE_SQ
+    first, second = e1 - noise_sq, e2 - noise_sq
+    spread = e1 / (first * first) + e2 / (second * second)
+    sigma = math.sqrt(noise_sq * spread / (n - 1.0))
+    sigma = sigma if (first > 0.0) & (sigma < RIGHT_ANGLE) else RIGHT_ANGLE
+    sigma = sigma if (freedom > 0.0) & (e2 > 0.0) else math.nan
+    return math.sqrt(variance), sigma, math.sqrt(2.0 * (e1 + e2))
+
+
+@kernel(error_model='numpy')
+def derive_quality(eigenvalues, num_points, outputs):
+    """
+    Derive the quality of surfels from their eigenvalues, as derive_surfels does.
+
+    eigenvalues  (K, 3) float64, m^2
+    num_points   (K,) int64
+    outputs      thickness (K,) m, normal_sigma (K,) rad, radius (K,) m
+    """
+    thickness, normal_sigma, radius = outputs
+    for i in range(len(num_points)):
+        e0, e1, e2 = eigenvalues[i, 0], eigenvalues[i, 1], eigenvalues[i, 2]
+        quality = quality_of(e0, e1, e2, np.float64(num_points[i]))
+        thickness[i], normal_sigma[i], radius[i] = quality
 
 
 @inlined()
@@ -106,9 +163,10 @@ def prefetch_outputs(written, row):
     Prefetch the memory of LINE surfels from a row on, to be written.
 
     written  position, normal and eigenvalues, each (3 K,) float64; planarity and curvature (K,)
-             float64; num_points (K,) int64; voxel_index (3 K,) int32
+             float64; num_points (K,) int64; voxel_index (3 K,) int32; further columns (K,) of
+             64 bits
     """
-    position, normal, eigenvalues, planarity, curvature, num_points, voxel_index = written
+    position, normal, eigenvalues, planarity, curvature, num_points, voxel_index = written[:7]
     for line in range(3):
         at = min(3 * row + LINE * line, len(position) - 1)
         prefetch_to_write(position, at)
@@ -119,6 +177,11 @@ def prefetch_outputs(written, row):
     prefetch_to_write(num_points, row)
     prefetch_to_write(voxel_index, 3 * row)
     prefetch_to_write(voxel_index, min(3 * row + 2 * LINE, len(voxel_index) - 1))
+    thickness, normal_sigma, radius, num_scans = written[7:]
+    prefetch_to_write(thickness, row)
+    prefetch_to_write(normal_sigma, row)
+    prefetch_to_write(radius, row)
+    prefetch_to_write(num_scans, row)
 
 
 @inlined()
@@ -144,9 +207,10 @@ def write_surfels(
 
     mean             (3, CHUNK) float64, lattice units about the centre of the voxel
     normals, values  (3, CHUNK) float64, as in the outputs
-    shape            (2, CHUNK) float64, planarity and curvature
+    shape            (5, CHUNK) float64, planarity, curvature, thickness, normal_sigma, radius
     """
-    position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs
+    position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs[:7]
+    thickness, normal_sigma, radius = outputs[7:10]
     cell = 1.0 / (1 << bits)
     half = (1 << (bits - 1)) + 0.5  # a lattice coordinate stands for the middle of its cell
     first = U(start)
@@ -156,6 +220,7 @@ def write_surfels(
         num_points[row] = np.int64(moments[N, i])
         voxel_index[row, 0], voxel_index[row, 1], voxel_index[row, 2] = x, y, z
         planarity[row], curvature[row] = shape[0, i], shape[1, i]
+        thickness[row], normal_sigma[row], radius[row] = shape[2, i], shape[3, i], shape[4, i]
         normal[row, 0], normal[row, 1], normal[row, 2] = (
             normals[0, i],
             normals[1, i],
@@ -169,53 +234,41 @@ def write_surfels(
 
 
 @inlined()
-def write_vectors(vectors, first, num, out):
-    """Write the vectors of a chunk, (3, CHUNK), to rows of (K, 3) from a first one, uint64, on."""
+def write_scans(start, num, chosen, moments, changes, num_scans):
+    """Write the numbers of scans of a chunk, 1 to the number of points; see VoxelTable."""
     for i in range(U(num)):
-        row = first + i
-        out[row, 0], out[row, 1], out[row, 2] = vectors[0, i], vectors[1, i], vectors[2, i]
+        row = U(start) + i
+        scans = np.int64(np.int32(changes[U(chosen[row]) * U(STAMP_ROW) + U(SCANS)]))
+        num_scans[row] = min(max(scans, 1), np.int64(moments[N, i]))
 
 
-@kernel(error_model='numpy')
-def derive_covariances(rows, chosen, voxel_size, bits, covariance):
-    """
-    Derive the covariances of the points of some rows of the slab.
-
-    rows, chosen, voxel_size, bits: as of derive_surfels
-    covariance  (K, 6) float64, out: xx xy xz yy yz zz, m^2
-    """
-    keys, moments = np.empty(CHUNK, np.int64), np.empty((MOMENTS, CHUNK))
-    mean, scatter = np.empty((3, CHUNK)), np.empty((6, CHUNK))
-    many = 1 << max(EXACT_BITS - 2 * bits, 0)
-    unit = voxel_size / (1 << bits)
-    for start in range(0, len(chosen), CHUNK):
-        num = min(CHUNK, len(chosen) - start)
-        most = gather(rows, chosen, start, num, keys, moments, None)
-        center(moments, num, mean, scatter)
-        if most >= many:
-            center_exactly(rows, chosen, start, num, scatter)
-        for i in range(num):
-            scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
-            for pair in range(6):
-                covariance[start + i, pair] = scatter[pair, i] * scale
+@inlined(error_model='numpy')
+def write_covariances(start, num, moments, scatter, unit, covariance):
+    """Write the covariances of a chunk, (K, 6) m^2; unit: of the lattice, m."""
+    for i in range(num):
+        scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
+        for pair in range(6):
+            covariance[start + i, pair] = scatter[pair, i] * scale
 
 
 @inlined()
-def gather(rows, chosen, start, num, keys, moments, written):
+def gather(rows, changes, chosen, start, num, keys, moments, written):
     """
     Gather the moments of num voxels from start on; return the largest count.
 
+    changes  (R * 2,) uint32, the stamps, which are prefetched
     keys     (CHUNK,) int64, out
     moments  (MOMENTS, CHUNK) float64, out
-    written  arrays that are written next, see prefetch_outputs; None for others
+    written  arrays that are written next, see prefetch_outputs
     """
     flat, last = rows.ravel(), len(chosen) - 1
     most = np.int64(0)
     for i in range(num):
-        if written is not None and i % LINE == 0:
+        if i % LINE == 0:
             prefetch_outputs(written, start + i)
         prefetch_row_early(flat, np.int64(chosen[min(start + i + EARLY, last)]))
         prefetch_row(flat, np.int64(chosen[min(start + i + AHEAD, last)]))
+        prefetch(changes, np.int64(chosen[min(start + i + AHEAD, last)]) * STAMP_ROW)
         at = first_word(chosen[start + i])
         n = count_of(flat, at)
         most = max(most, n)

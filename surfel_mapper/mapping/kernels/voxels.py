@@ -47,6 +47,9 @@ from surfel_mapper.kernels.layout import (
     KEY,
     PRODUCT,
     ROW,
+    SCANS,
+    STAMP,
+    STAMP_ROW,
     STAMPS,
     SUM,
     VIEW,
@@ -135,9 +138,9 @@ def add_moments(moments, rows, stamps, table, state, stamp, start, row_of):
     """
     Add the moments of the voxels of a scan from start on; return the first that was not added.
 
-    moments  keys (K,) int64, count (K,) uint32, total (K, 3) int32, product (K, 6) int64 and view
-             (K, 3) int16 of every point of the voxel
-    stamps   (R,) uint32, out: the last change of each row
+    moments  keys (K,) int64, count (K,) uint32, total (K, 3) int32, product (K, 6) int64, view
+             (K, 3) int16 of every point of the voxel, and num_scans (K,) uint32
+    stamps   (R * 2,) uint32, in and out: the last change of each row and its number of scans
     stamp    uint32, of this change; see kernels/layout.py
     start    int64, the first voxel to add
     row_of   (K,) int32, out: row of each voxel
@@ -145,7 +148,7 @@ def add_moments(moments, rows, stamps, table, state, stamp, start, row_of):
     Returns K if all were added. Otherwise slab, segments or directory have no room for a voxel:
     make room and continue from there.
     """
-    keys, count, _, _, _ = moments
+    keys, count, _, _, _, scans = moments
     words = words_of(moments)
     directory, buckets, counts, _ = table
     flat = rows.ravel()
@@ -176,18 +179,20 @@ def add_moments(moments, rows, stamps, table, state, stamp, start, row_of):
         row_of[voxel] = row
     state[POINTS] += num_points
     state[VOXELS] += num_new
-    set_stamps(stamps, row_of[start:done], stamp)
+    set_stamps(stamps, row_of[start:done], stamp, scans[start:done], 1)
     return done
 
 
 @njit(cache=True, nogil=True, inline='always')
-def set_stamps(stamps, rows, stamp):
-    """Stamp the rows (K,) int32."""
+def set_stamps(stamps, rows, stamp, scans, sign):
+    """Stamp the rows (K,) int32, and add their numbers of scans; subtract them with sign -1."""
     num = U(len(rows))
     for index in range(num):
         if index + U(EARLY) < num:
-            prefetch_early(stamps, np.int64(rows[index + U(EARLY)]))
-        stamps[U(rows[index])] = stamp
+            prefetch_early(stamps, np.int64(rows[index + U(EARLY)]) * STAMP_ROW)
+        at = U(rows[index]) * U(STAMP_ROW)
+        stamps[at + U(STAMP)] = stamp
+        stamps[at + U(SCANS)] += np.uint32(sign * np.int64(scans[index]))
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -218,7 +223,7 @@ def remove_moments(moments, rows, stamps, table, state, stamp, row_of, min_point
     Subtract moments, or nothing if a voxel does not hold its own; free the rows that get empty.
 
     moments     as of add_moments
-    stamps      (R,) uint32, out: the last change of each row
+    stamps      as of add_moments
     stamp       uint32, of this change; see kernels/layout.py
     row_of      (K,) int32, in: row of each voxel, or a hint of it; out: the row
     min_points  smallest number of points of a surfel, at least 1
@@ -232,7 +237,7 @@ def remove_moments(moments, rows, stamps, table, state, stamp, row_of, min_point
     as are subtracted; if it holds no others, its sums must be equal. One pass that is undone on
     failure: a pass of checks before it would read every row from memory twice.
     """
-    keys, count, _, _, _ = moments
+    keys, count, _, _, _, scans = moments
     words = words_of(moments)
     directory, buckets, counts, _ = table
     depth, num = state[DEPTH], U(len(keys))
@@ -276,7 +281,7 @@ def remove_moments(moments, rows, stamps, table, state, stamp, row_of, min_point
         return missing, 0
     state[POINTS] -= num_points
     state[VOXELS] -= num_emptied
-    set_stamps(stamps, row_of, stamp)
+    set_stamps(stamps, row_of, stamp, scans, -1)
     for i in range(U(num_emptied)):
         if i + U(HASHED) < U(num_emptied):
             prefetch(directory, hashes[i + U(HASHED)] >> (32 - depth))
@@ -285,7 +290,8 @@ def remove_moments(moments, rows, stamps, table, state, stamp, row_of, min_point
             prefetch(buckets, first_bucket(nearer, directory, depth))
         row = np.int64(row_of[U(emptied[i])])
         remove_entry(hashes[i], row, directory, buckets, counts, depth)
-        stamps[U(row)] = stamp | EMPTIED
+        stamps[U(row) * U(STAMP_ROW) + U(STAMP)] = stamp | EMPTIED
+        stamps[U(row) * U(STAMP_ROW) + U(SCANS)] = 0
     return missing, num_fallen
 
 
@@ -315,8 +321,8 @@ def clear_row(flat, at, key):
 
 @njit(cache=True, nogil=True, inline='always')
 def words_of(moments):
-    """Return the moments of a scan without keys, tables as their words one after another."""
-    _, count, total, product, view = moments
+    """Return count to view of the moments of a scan, tables as their words one after another."""
+    _, count, total, product, view, _ = moments
     return count, total.ravel(), product.ravel(), view.ravel()
 
 
@@ -374,7 +380,7 @@ def rows_changed_at(rows, stamps, changed, stamp, min_points):
     Return the rows of at least min_points points whose last change has a stamp.
 
     rows        (R, 12) int64, the slab
-    stamps      (R,) uint32, the last change of each row
+    stamps      (R * 2,) uint32, see kernels/layout.py
     changed     (K,) int32, the rows in question
     stamp       uint32
     min_points  0: emptied rows too
@@ -386,10 +392,10 @@ def rows_changed_at(rows, stamps, changed, stamp, min_points):
     num, num_changed = U(0), U(len(changed))
     for index in range(num_changed):
         if index + U(EARLY) < num_changed:
-            prefetch_early(stamps, np.int64(changed[index + U(EARLY)]))
+            prefetch_early(stamps, np.int64(changed[index + U(EARLY)]) * STAMP_ROW)
         row = changed[index]
         kept[num] = row  # a branch would be mispredicted half of the time
-        num += U((stamps[U(row)] ^ stamp) <= ignored)
+        num += U((stamps[U(row) * U(STAMP_ROW) + U(STAMP)] ^ stamp) <= ignored)
     return kept[:num] if min_points <= 1 else kept[: keep_full(rows, kept, num, min_points)]
 
 
@@ -413,7 +419,7 @@ def rows_changed_after(rows, stamps, used, stamp, changes, min_points):
     Return the rows of at least min_points points that the latest changes changed.
 
     rows        (R, 12) int64, the slab
-    stamps      (R,) uint32, the last change of each row
+    stamps      (R * 2,) uint32, see kernels/layout.py
     used        number of rows ever used
     stamp       uint32, of the latest change
     changes     int64, number of changes
@@ -423,7 +429,7 @@ def rows_changed_after(rows, stamps, used, stamp, changes, min_points):
     ignored = EMPTIED if min_points < 1 else 0
     num = 0
     for row in range(used):
-        last = np.int64(stamps[row])
+        last = np.int64(stamps[row * STAMP_ROW + STAMP])
         age = (((stamp | EMPTIED) - last) & STAMPS) >> 1
         kept[num] = row
         num += (age < changes) & (last & EMPTIED <= ignored)
@@ -469,14 +475,16 @@ def sum_coarse(moments, chosen, rows, fine_level, level, coarse):
     """
     Sum the moments of voxels in rows of voxels 2^level times larger.
 
-    moments     keys (N,) int64, count (N,), total (N, 3), product (N, 6), view (N, 3)
+    moments     keys (N,) int64, count (N,), total (N, 3), product (N, 6), view (N, 3),
+                num_scans (N,)
     chosen      (K,) int64, the voxels to sum, of the N
     rows        (K,) int32, row of the coarse voxel of each, as coarse_rows finds it
     fine_level  level of the given moments
-    coarse      count (C,) int64, total (C, 3), product (C, 6), view (C, 3), zeros, out
+    coarse      count (C,) int64, total (C, 3), product (C, 6), view (C, 3), num_scans (C,) int64,
+                zeros, out: num_scans is the largest of the voxels
     """
-    fine_keys, count, total, product, view = moments
-    counts, sums, products, views = coarse
+    fine_keys, count, total, product, view, num_scans = moments
+    counts, sums, products, views, most_scans = coarse
     fine = np.int64(1) << (BITS + fine_level)
     middle = fine // 2 - (fine << level) // 2
     below = (np.int64(1) << level) - 1
@@ -491,6 +499,7 @@ def sum_coarse(moments, chosen, rows, fine_level, level, coarse):
         dz = (z & below) * fine + middle
         sx, sy, sz = np.int64(total[i, 0]), np.int64(total[i, 1]), np.int64(total[i, 2])
         counts[row] += n
+        most_scans[row] = max(most_scans[row], np.int64(num_scans[i]))
         sums[row, 0] += sx + n * dx
         sums[row, 1] += sy + n * dy
         sums[row, 2] += sz + n * dz

@@ -11,6 +11,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from surfel_mapper.kernels.layout import STAMP_ROW
 from surfel_mapper.mapping.kernels.surfels import derive_surfels
 from surfel_mapper.mapping.moments import pack_keys
 from test import reference
@@ -40,6 +41,9 @@ def outputs_for(num):
         np.full((num, 3), -7.0),
         np.full(num, -7, np.int64),
         np.full((num, 3), -7, np.int32),
+        *np.full((3, num), -7.0),
+        np.full(num, -7, np.int64),
+        np.full((num, 6), -7.0),
     )
 
 
@@ -55,7 +59,8 @@ def test_eigenvalues_are_exact_to_rounding_for_any_number_of_points(call, times,
         row = row_of(places, times=times)
         outputs = outputs_for(1)
         chosen = np.zeros(1, np.int32)
-        call(derive_surfels, np.array([row]), chosen, 0.5, bits, outputs)
+        stamps = np.ones((1, STAMP_ROW), np.uint32)
+        call(derive_surfels, np.array([row]), stamps, chosen, 0.5, bits, outputs)
         exact = twin_of(row, (0, 0, 0), 1.0)['scatter']
         trace = sum(exact[i][i] for i in range(3))
         norm_sq = sum(exact[i][j] ** 2 for i in range(3) for j in range(3))
