@@ -130,6 +130,13 @@ class Scan:
     TypeError
         If the frame is no name, or the columns are no mapping.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> scan = Scan(points=np.zeros((2, 3), np.float32), stamp_ns=10**9, frame_id='lidar')
+    >>> len(scan)
+    2
+
     """
 
     points: npt.NDArray[Any]
@@ -198,6 +205,11 @@ class Scan:
             points = self._lazy.decode()  # two threads may do so at once, to the same bits
             object.__setattr__(self, 'points', points)
             return points
+
+    def __repr__(self) -> str:
+        """Return the number of points, stamp, frame and columns."""
+        about = [f'{len(self)} points', f'{self.stamp_ns / 1e9:.3f} s', f'frame {self.frame_id!r}']
+        return f'Scan({", ".join([*about, *self.columns])})'
 
     def __len__(self) -> int:
         """Return the number of points."""

@@ -5,8 +5,10 @@
 from __future__ import annotations
 
 import ast
+import doctest
 import inspect
 from pathlib import Path
+import pydoc
 import re
 import subprocess
 import sys
@@ -16,6 +18,8 @@ import pytest
 import surfel_mapper
 
 ROOT = Path(__file__).parents[1]
+
+PUBLIC = [name for name in dir(surfel_mapper) if not name.startswith('_')]
 
 HEAVY = ('dask', 'matplotlib', 'numba', 'numpy', 'rclpy', 'rosbags', 'scipy', 'yaml')
 
@@ -29,10 +33,6 @@ def loaded_by(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def test_public_names_are_sorted_and_unique():
-    assert surfel_mapper.__all__ == sorted(set(surfel_mapper.__all__))
-
-
 def test_type_checkers_see_the_public_names():
     tree = ast.parse(Path(surfel_mapper.__file__).read_text(encoding='utf-8'))
     typed = {
@@ -41,13 +41,13 @@ def test_type_checkers_see_the_public_names():
         if isinstance(node, ast.ImportFrom) and node.module.startswith('surfel_mapper')
         for alias in node.names
     }
-    assert sorted([*typed, '__version__']) == surfel_mapper.__all__
+    assert sorted(typed) == PUBLIC
     for name, module in typed.items():
         assert inspect.getmodule(getattr(surfel_mapper, name)).__name__.startswith(module)
 
 
 def test_every_public_name_is_there_listed_and_the_same_each_time():
-    for name in surfel_mapper.__all__:
+    for name in PUBLIC:
         assert getattr(surfel_mapper, name) is getattr(surfel_mapper, name)
         assert name in dir(surfel_mapper)
 
@@ -63,7 +63,7 @@ def own_members(of_class):
 
 def members():
     """Yield every public name, and those of public classes, with what carries its docstring."""
-    for name in sorted(set(surfel_mapper.__all__) - {'__version__'}):
+    for name in PUBLIC:
         value = getattr(surfel_mapper, name)
         yield name, value
         for of_class, member in own_members(value) if inspect.isclass(value) else ():
@@ -109,7 +109,7 @@ def test_importing_the_package_loads_nothing_heavy():
 
 
 def test_importing_all_public_names_loads_neither_ros_nor_bags_nor_pictures():
-    loaded = loaded_by('from surfel_mapper import *')
+    loaded = loaded_by(f'from surfel_mapper import {", ".join(PUBLIC)}')
     assert {'numba', 'numpy'} <= loaded
     assert not loaded & {'dask', 'matplotlib', 'rclpy', 'rosbags'}
 
@@ -144,3 +144,19 @@ def test_a_mapper_loads_neither_solvers_nor_models_nor_pictures():
         [sys.executable, '-c', script], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert done.stdout == '[]\n'
+
+
+@pytest.mark.parametrize('name', sorted(PUBLIC))
+def test_the_examples_of_docstrings_are_true(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    value = getattr(surfel_mapper, name)
+    module = inspect.getmodule(value)
+    (examples,) = doctest.DocTestFinder(recurse=False).find(value, name, module)
+    assert len(examples.examples) > 0
+    assert doctest.DocTestRunner().run(examples).failed == 0
+
+
+def test_help_of_the_package_is_short():
+    text = pydoc.plain(pydoc.render_doc(surfel_mapper))
+    assert len(text.splitlines()) <= 300
+    assert [name for name in PUBLIC if f' {name}' not in text] == []

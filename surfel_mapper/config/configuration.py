@@ -56,7 +56,17 @@ _LAYER_STAGES: dict[str, type[Stage]] = {}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
-    """All settings of the pipeline: one field a stage, and those of no stage."""
+    """
+    All settings of the pipeline: one field a stage, and those of no stage.
+
+    Examples
+    --------
+    >>> Config().map.voxel_size_m
+    0.5
+    >>> Config.from_mapping({'map.voxel_size_m': 0.2, 'window': {'max_scans': 50}})
+    Config(map.voxel_size_m=0.2, window.max_scans=50)
+
+    """
 
     map: MapConfig = field(default_factory=MapConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
@@ -111,6 +121,16 @@ class Config:
                 f'align.every_scans: {self.align.every_scans}, but window.keep_points is false; '
                 'scans are moved by their points'
             )
+
+    def __repr__(self) -> str:
+        """Return the settings that differ from their defaults."""
+        defaults = {declared.name: declared.default for declared in declarations()}
+        changed = [
+            f'{name}={value!r}'
+            for name, value in self.to_mapping().items()
+            if value != defaults[name]
+        ]
+        return f'Config({", ".join(changed)})'
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Config:
@@ -280,6 +300,11 @@ def load_config(path: str | Path | None = None) -> Config:
     ------
     ConfigError
         If the file cannot be read, is not YAML, or a setting is unknown or refused.
+
+    Examples
+    --------
+    >>> load_config().map.voxel_size_m
+    0.5
 
     """
     if path is None:

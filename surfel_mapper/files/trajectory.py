@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -88,6 +88,15 @@ class Trajectory:
     q_xyzw : (S, 4) float64
         Of squared norm 1 within 1e-2.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> poses = np.repeat(np.eye(4)[None], 3, axis=0)
+    >>> poses[:, 0, 3] = [0, 1, 2]
+    >>> trajectory = Trajectory.from_matrices(poses, np.arange(3) * 10**9)
+    >>> trajectory, trajectory[2][:3, 3].tolist()
+    (Trajectory(3 poses in 2.000 s), [2.0, 0.0, 0.0])
+
     """
 
     stamp_ns: npt.NDArray[np.int64] | None
@@ -117,6 +126,12 @@ class Trajectory:
     def __len__(self) -> int:
         """Return the number of poses."""
         return len(self.xyz)
+
+    @overload
+    def __getitem__(self, row: int | np.integer[Any]) -> npt.NDArray[np.float64]: ...
+
+    @overload
+    def __getitem__(self, row: slice) -> Trajectory: ...
 
     def __getitem__(self, row: Any) -> Any:
         """

@@ -56,6 +56,14 @@ def estimate_normals(
     ConfigError
         If a number is out of bounds.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> floor = np.random.default_rng(0).uniform(0, [1, 1, 0], (100, 3))
+    >>> normals = estimate_normals(floor, num_neighbours=10, viewpoint=[0, 0, 2])
+    >>> bool(np.allclose(normals, [0, 0, 1]))
+    True
+
     """
     chosen = SurfaceNormal(
         num_neighbours=num_neighbours, max_distance_m=max_distance_m, threads=threads

@@ -77,6 +77,16 @@ def diff(
         If the maps differ in voxel size or level, or their origins are not a whole number of
         voxels apart.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from surfel_mapper import SurfelMap
+    >>> earlier, later = SurfelMap(0.5), SurfelMap(0.5)
+    >>> floor = np.random.default_rng(0).uniform([0, 0, 0.2], [2, 2, 0.2], (1000, 3))
+    >>> _ = earlier.add(floor), later.add(floor), later.add(floor + [0, 0, 2])
+    >>> print(diff(earlier, later))
+    16 surfels came, 0 went, 0 turned; 16 voxels have one in both
+
     """
     for surfel_map in (before, after):
         if not isinstance(surfel_map, SurfelMap):

@@ -84,6 +84,13 @@ class ScanMoments:
         Number of points of which a Reducer made these moments, so that a map need not test if
         points can have them. None for others, copies with other values too.
 
+    Examples
+    --------
+    >>> from surfel_mapper import SurfelMap
+    >>> moments = SurfelMap(0.5).add([[0.1, 0.1, 0.1], [0.2, 0.2, 0.1], [0.7, 0.1, 0.1]])
+    >>> moments
+    ScanMoments(3 points in 2 voxels of 0.5 m)
+
     """
 
     voxel_size_m: float
@@ -106,6 +113,11 @@ class ScanMoments:
             raise ValueError(f'key: a {type(self.key).__name__}, expected an array (K,)')
         if self.channels is None:
             object.__setattr__(self, 'channels', np.empty((len(self.key), 0), np.int64))
+
+    def __repr__(self) -> str:
+        """Return the numbers of points and voxels."""
+        size = f'{self.voxel_size_m:g} m'
+        return f'ScanMoments({self.num_points} points in {len(self)} voxels of {size})'
 
     def __len__(self) -> int:
         """Return the number of voxels."""

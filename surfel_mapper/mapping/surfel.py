@@ -41,6 +41,13 @@ class Surfel:
     eigenvalues are 0, and normal, planarity and curvature nan. On a line the two smaller
     eigenvalues and the planarity are 0, and the normal is some unit vector orthogonal to the
     line. No eigenvalue is negative.
+
+    Examples
+    --------
+    >>> surfel = Surfel([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    >>> surfel.num_points, surfel.normal().tolist(), surfel.planarity()
+    (4, [0.0, 0.0, 1.0], 1.0)
+
     """
 
     __slots__ = ('_sums',)

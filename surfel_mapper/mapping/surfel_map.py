@@ -84,6 +84,20 @@ class SurfelMap(MomentMap):
         If the voxel size is not positive and finite, a column cannot be summed, the level is
         negative or beyond 15, or the origin is not finite.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> floor = np.random.default_rng(0).uniform([0, 0, 0.2], [2, 2, 0.2], (1000, 3))
+    >>> surfel_map = SurfelMap(0.5)
+    >>> moments = surfel_map.add(floor, origin=[1, 1, 2])
+    >>> surfel_map
+    SurfelMap(0.5 m: 1000 points in 16 voxels)
+    >>> bool(np.allclose(surfel_map.surfels(min_points=5).normal, [0, 0, 1]))
+    True
+    >>> _ = surfel_map.remove(moments)  # the exact inverse
+    >>> surfel_map
+    SurfelMap(0.5 m: 0 points in 0 voxels)
+
     """
 
     def __init__(

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 import logging
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -98,6 +98,18 @@ class Surfels:
     channels : mapping of str to (K,) float64
         Means of the channels of the map: ``intensity``; ``red``, ``green``, ``blue`` in 0 to 255.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from surfel_mapper import SurfelMap
+    >>> surfel_map = SurfelMap(0.5)
+    >>> _ = surfel_map.add(np.random.default_rng(0).uniform(0, [2, 2, 0.1], (1000, 3)))
+    >>> surfels = surfel_map.surfels(min_points=5)
+    >>> surfels.position.shape, len(surfels[surfels.num_points > 1000])
+    ((16, 3), 0)
+    >>> [surfel.voxel_index for surfel in surfels if max(surfel.voxel_index) == 0]
+    [(0, 0, 0)]
+
     """
 
     position: npt.NDArray[np.float64]
@@ -151,6 +163,12 @@ class Surfels:
             return 'Surfels(0)'
         low, high = (np.round(f(self.position, axis=0), 2).tolist() for f in (np.min, np.max))
         return f'Surfels({len(self)}, from {low} to {high} m)'
+
+    @overload
+    def __getitem__(self, row: int | np.integer[Any]) -> OneSurfel: ...
+
+    @overload
+    def __getitem__(self, row: slice | Sequence[int] | npt.NDArray[Any]) -> Surfels: ...
 
     def __getitem__(self, row: Any) -> Any:
         """Return one surfel (OneSurfel) for an integer, Surfels for a slice, mask or rows."""

@@ -158,6 +158,21 @@ class SlidingWindow:
         Scans are evicted while the voxels and the kept scans need more bytes; 0 means no such
         limit.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from surfel_mapper import SurfelMap
+    >>> from surfel_mapper.config import WindowConfig
+    >>> surfel_map = SurfelMap(0.5)
+    >>> window = SlidingWindow(surfel_map, WindowConfig(max_scans=2))
+    >>> for second in range(3):
+    ...     moments = surfel_map.reduce(np.full((10, 3), float(second)))
+    ...     evictions = window.insert(
+    ...         WindowedScan(moments=moments, stamp_ns=second * 10**9, T_map_sensor=np.eye(4))
+    ...     )
+    >>> window, len(evictions), surfel_map.num_points
+    (SlidingWindow(2 scans), 1, 20)
+
     """
 
     def __init__(
@@ -176,6 +191,10 @@ class SlidingWindow:
         self._map = surfel_map
         self._scans: deque[tuple[WindowedScan, float]] = deque()
         self._reset()
+
+    def __repr__(self) -> str:
+        """Return the number of scans."""
+        return f'SlidingWindow({len(self)} scans)'
 
     def _reset(self) -> None:
         self._scans.clear()

@@ -242,6 +242,12 @@ class MapMirror:
     is_complete : bool
         Whether a full map has come; until then the copy has only the changes since the start.
 
+    Examples
+    --------
+    >>> mirror = MapMirror(voxel_size_m=0.5)
+    >>> mirror.is_complete, mirror.map.num_points
+    (False, 0)
+
     """
 
     def __init__(self, voxel_size_m: float, columns: tuple[str, ...] = ()) -> None:
@@ -250,6 +256,10 @@ class MapMirror:
         self.is_complete = False
         self._channels = channel_names(columns)
         self._recent: deque[tuple[int, ScanMoments]] = deque(maxlen=MAX_RECENT)
+
+    def __repr__(self) -> str:
+        """Return the copy, and whether a full map has come."""
+        return f'MapMirror({self.map!r}, {"" if self.is_complete else "not yet "}complete)'
 
     def replace(self, msg: Any) -> None:
         """

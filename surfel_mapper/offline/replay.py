@@ -152,6 +152,15 @@ def replay(
     MapError
         If it was stopped before any scan was mapped.
 
+    Examples
+    --------
+    >>> from surfel_mapper.simulation import Lidar, record, Simulation, World
+    >>> street = Simulation(World.street(length_m=50.0), Lidar(beams=16, columns=360), num_scans=5)
+    >>> bag = record(street, 'drive')
+    >>> result = replay('drive', output='mapped')
+    >>> result.summary['scans']['mapped'], [path.name for path in result.written][:2]
+    (5, ['map.ply', 'map.npz'])
+
     """
     from surfel_mapper.memory import keep_freed_memory
     from surfel_mapper.offline.outputs import output_directory, write_files, write_maps

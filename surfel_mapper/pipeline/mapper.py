@@ -70,6 +70,18 @@ class Mapper:
     ConfigError
         If ``filters`` names a file that holds no chain, or the configuration is no Config.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from surfel_mapper import Config, Scan
+    >>> mapper = Mapper(Config.from_mapping({'pose': {'source': 'identity'}}))
+    >>> floor = np.random.default_rng(0).uniform([0, 0, 0.2], [2, 2, 0.2], (1000, 3))
+    >>> mapper.add_scan(Scan(points=floor, stamp_ns=10**9, frame_id='odom'))
+    >>> [update.stamp_ns for update in mapper.insert_ready()]
+    [1000000000]
+    >>> len(mapper.surfels())
+    16
+
     """
 
     def __init__(self, config: Config | None = None) -> None:
@@ -84,6 +96,10 @@ class Mapper:
         self.window = self._pipeline.window
         self.layers = self._pipeline.layers.by_name
         self.transforms = self._pipeline.poses.transforms
+
+    def __repr__(self) -> str:
+        """Return the map and the number of scans of the window."""
+        return f'Mapper({self.map!r}, {len(self.window)} scans in the window)'
 
     @property
     def config(self) -> Config:

@@ -67,6 +67,15 @@ def show(
     TypeError
         If it is neither a map nor surfels.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from surfel_mapper import SurfelMap
+    >>> surfel_map = SurfelMap(0.5)
+    >>> _ = surfel_map.add(np.random.default_rng(0).uniform(0, [2, 2, 0.1], (1000, 3)))
+    >>> show(surfel_map)  # the last line of a cell of a notebook
+    InlineView(16 surfels)
+
     """
     if not isinstance(shown, (SurfelMap, Surfels)):
         raise TypeError(

@@ -47,6 +47,16 @@ class DistanceField:
     blocks : BlockMap, optional
         Existing voxels, whose settings then count; empty by default.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from surfel_mapper.config import TsdfConfig
+    >>> field = DistanceField(TsdfConfig(voxel_size_m=0.1))
+    >>> x, y = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-1, 1, 80))
+    >>> _ = field.add(np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], axis=1), np.eye(4))
+    >>> bool(abs(np.median(field.mesh().vertices[:, 2]) - 2.0) < 0.02)  # a wall at z = 2 m
+    True
+
     """
 
     def __init__(
@@ -59,6 +69,10 @@ class DistanceField:
         self.blocks = BlockMap(config or TsdfConfig()) if blocks is None else blocks
         self.config = self.blocks.config
         self._mesher = Mesher(self.blocks)
+
+    def __repr__(self) -> str:
+        """Return voxel size and number of blocks."""
+        return f'DistanceField({self.config.voxel_size_m:g} m: {len(self)} blocks)'
 
     def __len__(self) -> int:
         """Return the number of blocks."""
