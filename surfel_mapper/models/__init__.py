@@ -3,7 +3,7 @@
 """
 Planes, B-spline surfaces and Gaussians that represent a cloud.
 
-``fit`` computes them from the points of one cloud; see docs/models.md.
+``fit`` computes them from the points of one cloud, ``read`` reads a file; see docs/models.md.
 """
 
 from surfel_mapper.config import ModelsConfig
@@ -11,7 +11,7 @@ from surfel_mapper.models.bspline import HeightField
 from surfel_mapper.models.evaluation import Evaluation
 from surfel_mapper.models.fitting import fit
 from surfel_mapper.models.grid import Grid
-from surfel_mapper.models.multi_model import evaluate, Gaussians, MultiModel, Plane, Surface
+from surfel_mapper.models.multi_model import evaluate, Gaussians, MultiModel, Plane, read, Surface
 
 __all__ = [
     'Evaluation',
@@ -24,4 +24,5 @@ __all__ = [
     'Surface',
     'evaluate',
     'fit',
+    'read',
 ]

@@ -98,12 +98,6 @@ class Grid:
         step_m = self.pitch_m / per_side
         return float(len(self.samples(step_m)) * step_m**2)
 
-    @property
-    def size_bytes(self) -> int:
-        """Bytes when packed: header, two bits a cell, two bits and three bytes a boundary cell."""
-        cuts = int(self.rim.sum())
-        return 16 + 2 * -(-self.filled.size // 8) + 3 * cuts + -(-cuts // 4)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:

@@ -1,210 +1,31 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Planes, surfaces and Gaussians of a cloud, and clouds sampled from them.
-
-A patch has a frame: R_patch_map rotates offsets from its mean to x, y and z, with z towards the
-viewpoint.
-"""
+"""MultiModel: planes, surfaces and Gaussians of a cloud, and clouds sampled from them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_real
-from surfel_mapper.models.bspline import HeightField
+from surfel_mapper.budget import open_regular
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.models.evaluation import compare, Evaluation
-from surfel_mapper.models.grid import Grid
+from surfel_mapper.models.packing import ModelsHeader, pack, unpack, Unpacked
+from surfel_mapper.models.primitives import Gaussians, Plane, Surface
+
+__all__ = ['Gaussians', 'MultiModel', 'Plane', 'Surface', 'evaluate', 'read']
 
 Array = npt.NDArray[np.float64]
 
-PATCH_BYTES = 4 + 1 + 8 + 24 + 16 + 24 + 4 + 12
-"""Id, kind, number of points, mean, rotation, covariance, rms and viewing direction."""
-
-GAUSSIAN_BYTES = 4 + 8 + 12 + 24 + 4
-"""Id, number of points, mean, covariance and weight."""
-
-SIGMAS = 3.0
-"""Samples of a Gaussian beyond this number of sigmas are drawn again."""
-
-SAMPLES_PER_VOXEL = 2.0
-"""
-A Gaussian has at most this number of samples a voxel along each axis of its box of SIGMAS, plus
-one: 88 if it fills one voxel evenly. A thinned cloud, one point a voxel, has fewer points.
-"""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Plane:
-    """
-    A bounded piece of a plane.
-
-    Attributes
-    ----------
-    id : int
-        Its label.
-    num_points : int
-        Points of the thinned cloud.
-    mean : (3,) float64, m
-        Mean of the points.
-    covariance : (3, 3) float64, m^2
-        Covariance of the points.
-    R_patch_map : (3, 3) float64
-        Rows x, y and normal; right-handed.
-    rms_m : float
-        Root mean square distance of the points along the normal.
-    grid : Grid
-        Covered area.
-
-    """
-
-    id: int
-    num_points: int
-    mean: Array
-    covariance: Array
-    R_patch_map: Array
-    rms_m: float
-    grid: Grid
-
-    @property
-    def normal(self) -> Array:
-        """Unit normal, (3,), towards the viewpoint; the mean direction for a surface."""
-        normal: Array = self.R_patch_map[2]
-        return normal
-
-    @property
-    def offset_m(self) -> float:
-        """Offset d of the plane normal . p + d = 0."""
-        return -float(self.normal @ self.mean)
-
-    def heights(self, xy: Array) -> Array:
-        """Return z at (M, 2) locations in the frame, m."""
-        return np.zeros(len(xy))
-
-    def to_local(self, points: Array) -> Array:
-        """Transform (M, 3) points to the frame of the patch."""
-        local: Array = (points - self.mean) @ self.R_patch_map.T
-        return local
-
-    def lifted(self, xy: Array) -> Array:
-        """Return the points (M, 3) of the patch at (M, 2) locations in its frame."""
-        local = np.column_stack([xy, self.heights(xy)])
-        points: Array = local @ self.R_patch_map + self.mean
-        return points
-
-    def samples(self, step_m: float) -> Array:
-        """Return points (M, 3) on the patch at about this spacing."""
-        return self.lifted(self.grid.samples(step_m))
-
-    @property
-    def size_bytes(self) -> int:
-        """Bytes when packed."""
-        return PATCH_BYTES + self.grid.size_bytes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Surface(Plane):
-    """A bounded piece of a curved surface: a height field over its frame."""
-
-    spline: HeightField
-
-    def heights(self, xy: Array) -> Array:
-        """Return z at (M, 2) locations in the frame, m."""
-        return self.spline.heights(xy)
-
-    def normals(self, xy: Array) -> Array:
-        """Return the unit normals, (M, 3), at (M, 2) locations in the frame."""
-        slopes = self.spline.slopes(xy)
-        local = np.column_stack([-slopes, np.ones(len(xy))])
-        normals: Array = local @ self.R_patch_map
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return normals
-
-    @property
-    def size_bytes(self) -> int:
-        """Bytes when packed; control points as float32, and two degrees."""
-        return PATCH_BYTES + self.grid.size_bytes + 2 + 4 * self.spline.control.size
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Gaussians:
-    """
-    Gaussians of the points on neither plane nor surface, G rows.
-
-    Attributes
-    ----------
-    id : (G,) int64
-        Their labels.
-    num_points : (G,) int64
-        Points of the thinned cloud; in a map, all points.
-    mean : (G, 3) float64, m
-    covariance : (G, 3, 3) float64, m^2
-
-    """
-
-    id: npt.NDArray[np.int64]
-    num_points: npt.NDArray[np.int64]
-    mean: Array
-    covariance: Array
-
-    def __len__(self) -> int:
-        """Return the number of Gaussians."""
-        return len(self.id)
-
-    def sample_counts(self, voxel_size_m: float) -> npt.NDArray[np.int64]:
-        """
-        Return how many samples stand for the points of each, (G,).
-
-        One a point, see SAMPLES_PER_VOXEL for the most: voxels of a map without a window gain
-        points with every scan. A sample of a Gaussian with more points has a larger weight,
-        num_points by this number.
-
-        Parameters
-        ----------
-        voxel_size_m : float
-            Edge of the voxels, m.
-
-        """
-        sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance), 0.0))
-        per_axis = 1.0 + SAMPLES_PER_VOXEL / voxel_size_m * 2.0 * SIGMAS * sigma
-        most = np.minimum(per_axis.prod(axis=1), np.iinfo(np.int32).max)
-        counts: npt.NDArray[np.int64] = np.minimum(self.num_points, most.astype(np.int64))
-        return counts
-
-    def samples(self, seed: int = 0, counts: npt.NDArray[np.int64] | None = None) -> Array:
-        """
-        Draw points of each, (M, 3), none farther out than SIGMAS.
-
-        Without that limit the tails alone make the samples a tenth less precise.
-
-        Parameters
-        ----------
-        seed : int
-            Seed of the samples.
-        counts : (G,) int64, optional
-            Number of points of each; num_points if omitted.
-
-        """
-        counts = self.num_points if counts is None else counts
-        values, vectors = np.linalg.eigh(self.covariance)
-        scale = np.repeat(np.sqrt(np.maximum(values, 0.0)), counts, axis=0)
-        rng = np.random.default_rng(seed)
-        drawn = rng.standard_normal(scale.shape)
-        while (far := np.flatnonzero((drawn**2).sum(axis=1) > SIGMAS**2)).size:
-            drawn[far] = rng.standard_normal((len(far), 3))
-        turned = np.einsum('nij,nj->ni', np.repeat(vectors, counts, axis=0), drawn * scale)
-        points: Array = turned + np.repeat(self.mean, counts, axis=0)
-        return points
-
-    @property
-    def size_bytes(self) -> int:
-        """Bytes when packed."""
-        return GAUSSIAN_BYTES * len(self)
+MOST_BYTES = 1 << 28
+"""Size limit of files of models: 15 million Gaussians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,8 +68,73 @@ class MultiModel:
 
     @property
     def size_bytes(self) -> int:
-        """Bytes of all primitives when packed, without the labels."""
-        return sum(patch.size_bytes for patch in self.patches) + self.gaussians.size_bytes
+        """Bytes of a file of the models (see packing), 0 without any."""
+        return len(self.to_bytes()) if self.patches or len(self.gaussians) else 0
+
+    def to_bytes(
+        self,
+        versions: Mapping[int, int] | None = None,
+        removed: Sequence[int] = (),
+        **message: Any,
+    ) -> bytes:
+        """
+        Return the models as bytes, without the labels; see packing.
+
+        Parameters
+        ----------
+        versions : mapping of int to int, optional
+            Versions of the primitives by id; 1 if omitted.
+        removed : sequence of int
+            Ids that are gone since the previous message.
+        message : optional
+            number, is_complete, stamp_ns and frame_id of a ModelsHeader.
+
+        Raises
+        ------
+        ModelError
+            If a number is not finite, or too large to be packed.
+
+        """
+        header = ModelsHeader(
+            voxel_size_m=self.voxel_size_m,
+            noise=self.noise,
+            num_thinned=self.num_thinned,
+            **message,
+        )
+        return pack(header, (self.planes, self.surfaces), self.gaussians, versions, removed)
+
+    @classmethod
+    def from_bytes(cls, data: bytes, name: str | Path = 'bytes') -> MultiModel:
+        """
+        Return the models in bytes of ``to_bytes``; they have no labels.
+
+        Parameters
+        ----------
+        data : bytes
+            The bytes.
+        name : str or Path
+            File or topic, for errors.
+
+        Raises
+        ------
+        FileFormatError
+            If they are no models, damaged, of another version, or need too much memory.
+
+        """
+        return cls.from_unpacked(unpack(data, name))
+
+    @classmethod
+    def from_unpacked(cls, unpacked: Unpacked) -> MultiModel:
+        """Return models of primitives; they have no labels."""
+        return cls(
+            planes=unpacked.planes,
+            surfaces=unpacked.surfaces,
+            gaussians=unpacked.gaussians,
+            labels=np.empty(0, np.int32),
+            voxel_size_m=unpacked.header.voxel_size_m,
+            num_thinned=unpacked.header.num_thinned,
+            noise=unpacked.header.noise,
+        )
 
     def translated(self, offset: npt.ArrayLike) -> MultiModel:
         """Return the models moved by an offset (3,), m; labels and figures stay."""
@@ -281,12 +167,26 @@ class MultiModel:
             If the spacing is not positive and finite.
 
         """
-        step_m = self.voxel_size_m if step_m is None else as_real('step_m', step_m)
-        if not 0.0 < step_m < math.inf:
-            raise ValueError(f'step_m: {step_m:g}, expected a positive distance, m')
+        step_m = self._step_m(step_m)
         samples = [patch.samples(step_m) for patch in self.patches]
         counts = self.gaussians.sample_counts(self.voxel_size_m)
         return np.concatenate([*samples, self.gaussians.samples(seed, counts)])
+
+    def num_samples(self, step_m: float | None = None) -> int:
+        """Return about how many points ``resample`` returns, without sampling them."""
+        step_m = self._step_m(step_m)
+        cells = (
+            np.count_nonzero(patch.grid.filled) * max(round(patch.grid.pitch_m / step_m), 1) ** 2
+            for patch in self.patches
+        )
+        return sum(cells) + int(self.gaussians.sample_counts(self.voxel_size_m).sum())
+
+    def _step_m(self, step_m: float | None) -> float:
+        """Return the spacing of samples, m; the voxel size if omitted."""
+        step_m = self.voxel_size_m if step_m is None else as_real('step_m', step_m)
+        if not 0.0 < step_m < math.inf:
+            raise ValueError(f'step_m: {step_m:g}, expected a positive distance, m')
+        return step_m
 
     def evaluate(self, reference: npt.NDArray[Any], seed: int = 0) -> Evaluation:
         """
@@ -321,3 +221,23 @@ class MultiModel:
 def evaluate(model: MultiModel, reference: npt.NDArray[Any], seed: int = 0) -> Evaluation:
     """Compare samples of models with a cloud; see MultiModel.evaluate."""
     return model.evaluate(reference, seed)
+
+
+def read(path: str | Path) -> MultiModel:
+    """
+    Return the models in a file of ``extract`` or ``replay``, models.smm; they have no labels.
+
+    Raises
+    ------
+    FileFormatError
+        If it cannot be read, is damaged, or of another version.
+
+    """
+    try:
+        with open_regular(path) as file:
+            data = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise FileFormatError(f'{path}: {error.strerror}') from error
+    if len(data) > MOST_BYTES:
+        raise FileFormatError(f'{path}: larger than {MOST_BYTES} bytes')
+    return MultiModel.from_bytes(data, path)
