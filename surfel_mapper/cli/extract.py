@@ -3,6 +3,8 @@
 """
 ``surfel-mapper extract``: planes, surfaces and Gaussians of a cloud or a map, as files.
 
+models.smm is always written; the figures of the report are those of its content.
+
 Every surfel of a map becomes nine points across its disc, so that its slope counts too, and the
 voxels are half as large as those of the map.
 """
@@ -96,10 +98,11 @@ def run(args: argparse.Namespace) -> int:
     """Fit models, write the files, report."""
     from surfel_mapper.config import ModelsConfig
     from surfel_mapper.files.atomic import check_free, make_directory
-    from surfel_mapper.files.model_files import write_models
+    from surfel_mapper.files.model_files import PACKED, write_models, write_packed
     from surfel_mapper.layers.drawings import PointsPicture
     from surfel_mapper.layers.models.pictures import panels_of
     from surfel_mapper.models import evaluate, fit
+    from surfel_mapper.models import read as read_models
     from surfel_mapper.viz.drawings import draw_points
 
     check_free(args.output, args.overwrite)
@@ -112,7 +115,10 @@ def run(args: argparse.Namespace) -> int:
     with stage(2, 2, 'fitting'):
         model = fit(points, config, viewpoint)
     make_directory(args.output)
-    write_models(args.output, model.translated(origin_m), args.formats or DEFAULT)
+    whole = model.translated(origin_m)
+    packed = write_packed(args.output / PACKED, whole)
+    write_models(args.output, whole, args.formats or DEFAULT)
+    model = replace(read_models(packed).translated(-origin_m), labels=model.labels)
     picture = PointsPicture(
         file_name='models.png', panels=panels_of(points, model), viewpoint=viewpoint
     )

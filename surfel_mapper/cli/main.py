@@ -44,6 +44,7 @@ VERBS = (
     'filter',
     'filters',
     'extract',
+    'resample',
     'simulate',
     'merge',
     'view',
@@ -54,7 +55,7 @@ VERBS = (
 WITH_SIGNALS = ('node', 'view')
 """Verbs that handle SIGTERM themselves."""
 
-FILE_VERBS = ('replay', 'info', 'filter', 'extract', 'merge', 'evaluate')
+FILE_VERBS = ('replay', 'info', 'filter', 'extract', 'resample', 'merge', 'evaluate')
 """Verbs whose memory is limited; those of ROS and browsers reserve address space at will."""
 
 _log = logging.getLogger('surfel_mapper.cli')  # __name__ is __main__ with `python -m`

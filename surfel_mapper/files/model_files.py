@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Models as files: complete as JSON, a row per primitive as Parquet, triangles as OBJ and GLB.
+Models as files: packed (SMM), which ``models.read`` reads, and for other programs.
 
-Each plane and surface is an object of its own in OBJ and GLB; Gaussians are left out.
+JSON is complete, Parquet has a row per primitive. OBJ and GLB have triangles, an object for each
+plane and surface, without Gaussians.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ from surfel_mapper.models.shapes import shape_of
 
 FORMAT, VERSION = 'surfel_mapper models', 1
 
+PACKED = 'models.smm'
+"""File name of packed models."""
+
 TRIANGLES = ('obj', 'glb')
 
 
@@ -36,7 +40,7 @@ def write_models(
     versions: Mapping[int, int] | None = None,
 ) -> list[Path]:
     """
-    Write models as ``models`` in some formats; return the files.
+    Write models as ``models`` for other programs; return the files.
 
     Without planes and surfaces there is no file of triangles.
 
@@ -70,6 +74,25 @@ def write_models(
         else:
             write_meshes(path, model)
     return paths
+
+
+def write_packed(
+    path: str | Path, model: MultiModel, versions: Mapping[int, int] | None = None
+) -> Path:
+    """
+    Write models packed, for models.read; return the file.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+    ModelError
+        If a number is not finite.
+
+    """
+    with replace_file(path) as file:
+        file.write(model.to_bytes(versions))
+    return Path(path)
 
 
 def write_json(

@@ -36,6 +36,9 @@ READERS: dict[str, Callable[[Path], Columns]] = {
 }
 """The reader of each format but .bin, which takes a layout, by the ending in lower case."""
 
+WRITERS = {'.ply': ply.write_points, '.pcd': pcd.write_points}
+"""The writer of points with any columns, by the ending of the file."""
+
 RAW = '.bin'
 
 SUFFIXES = ('.ply', '.pcd', RAW, *list(READERS)[2:])

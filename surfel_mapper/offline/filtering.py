@@ -25,7 +25,14 @@ from surfel_mapper.counters import Counters
 from surfel_mapper.errors import BagError, CloudFormatError, FileFormatError, FilterError
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.atomic import check_free, make_directory
-from surfel_mapper.files.scan_files import Points, read_scan, scan_files, scan_reader, SUFFIXES
+from surfel_mapper.files.scan_files import (
+    Points,
+    read_scan,
+    scan_files,
+    scan_reader,
+    SUFFIXES,
+    WRITERS,
+)
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.columns import as_fields
 from surfel_mapper.geometry import Transform
@@ -33,9 +40,6 @@ from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.scan import Scan
 
 log = logging.getLogger(__name__)
-
-WRITTEN = ('.ply', '.pcd')
-"""Suffixes of files that hold all columns."""
 
 Show = Callable[[int, int], None]
 """Progress: scans done and expected."""
@@ -147,8 +151,8 @@ def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
         yield inputs[0], output
         return
     if len(inputs) == 1 and inputs[0].is_file():
-        if output.suffix.lower() not in WRITTEN:
-            raise FileFormatError(f'{output}: expected a file ending in {" or ".join(WRITTEN)}')
+        if output.suffix.lower() not in WRITERS:
+            raise FileFormatError(f'{output}: expected a file ending in {" or ".join(WRITERS)}')
         yield inputs[0], output
         return
     for source in inputs:
@@ -161,7 +165,7 @@ def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
                 f'{source}: no bag, no scans in it; expected files ending in {", ".join(SUFFIXES)}'
             )
         for file in files:
-            suffix = file.suffix if file.suffix.lower() in WRITTEN else '.ply'
+            suffix = file.suffix if file.suffix.lower() in WRITERS else '.ply'
             yield file, output / f'{file.stem}{suffix}'
 
 

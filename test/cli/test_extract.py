@@ -17,7 +17,7 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from test import extras
 from test.models.scenes import room, sheet, VIEW
 
-FILES = ('models.json', 'models.png')
+FILES = ('models.smm', 'models.json', 'models.png')
 
 
 def write_cloud(path, points):
