@@ -18,6 +18,7 @@ Maps::
     SlidingWindow     the scans of a map, and the limits that evict the oldest
     diff              the differences of two maps
     MapMirror         an exact copy of the map of a node, from its topics
+    ModelsMirror      an exact copy of its planes, surfaces and Gaussians
     DistanceField     a signed distance field and its mesh
 
 Pipeline::
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels as Surfels
     from surfel_mapper.mapping.window import SlidingWindow as SlidingWindow
     from surfel_mapper.messages.map_cloud import MapMirror as MapMirror
+    from surfel_mapper.messages.model_packets import ModelsMirror as ModelsMirror
     from surfel_mapper.offline.replay import replay as replay
     from surfel_mapper.pipeline import Mapper as Mapper
     from surfel_mapper.scan import Scan as Scan
@@ -71,6 +73,7 @@ _HOMES = {
     'DistanceField': 'layers.distance_field',
     'MapMirror': 'messages.map_cloud',
     'Mapper': 'pipeline',
+    'ModelsMirror': 'messages.model_packets',
     'Scan': 'scan',
     'ScanMoments': 'mapping.moments',
     'SlidingWindow': 'mapping.window',

@@ -18,13 +18,14 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt8MultiArray
 from visualization_msgs.msg import Marker, MarkerArray
 
-from surfel_mapper import Mapper
+from surfel_mapper import Mapper, ModelsMirror
 from surfel_mapper.config import Config
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import poses_in
-from surfel_mapper.models.multi_model import Surface
+from surfel_mapper.models.multi_model import MultiModel, Surface
 from test.ros.live import cloud, LATCHED, NODE, odometry, RVIZ, START_NS
 
 ALL_OUTLINES = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -36,6 +37,7 @@ SETTINGS = {
     'layers.models.extract_period_s': 0.0,
     'publish.diagnostics_rate_hz': 20.0,
 }
+ALL_MODELS = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PERIOD_NS = 100_000_000
 TOPICS = {
     'planes': (MarkerArray, LATCHED),
@@ -237,6 +239,41 @@ def check_surfels(rows, models):
     gaussian = np.isin(labels, models.model.gaussians.id)
     assert np.array_equal(rows.columns['kind'] == 2, gaussian)
     assert np.array_equal(rows.columns['kind'] == 255, labels == -1)
+
+
+def mirrored(messages):
+    """Return the copy that a client has after some messages on ~/models."""
+    mirror = ModelsMirror()
+    for message in list(messages):
+        mirror.update(message)
+    return mirror
+
+
+def wait_for_mirror(peer, received, models):
+    """Spin until a client has a copy of models; check that it is exact."""
+    packed = models.model.to_bytes(models.versions)
+    versions = models.versions
+    peer.spin_until(
+        lambda: mirrored(received).is_complete and mirrored(received).versions == versions,
+        what=lambda: f'{len(received)} messages, versions {mirrored(received).versions}',
+    )
+    mirror = mirrored(received)
+    assert mirror.model.to_bytes(mirror.versions) == packed
+    again = MultiModel.from_bytes(packed)
+    assert (mirror.model.resample(0.1) == again.resample(0.1)).all()
+
+
+def test_a_mirror_has_the_models_of_the_node_also_if_it_comes_late(start, peer):
+    start_node(start, peer)
+    early = peer.collect(UInt8MultiArray, f'{NODE}/models', ALL_MODELS)
+    messages = drive(True, True, False, False)
+    send(peer, messages[:2])
+    wait_for_mirror(peer, early, models_of(messages[:2]))
+    late = peer.collect(UInt8MultiArray, f'{NODE}/models', RVIZ)
+    wait_for_mirror(peer, late, models_of(messages[:2]))
+    send(peer, messages[2:])  # the scans with the wall leave the window
+    for received in (early, late):
+        wait_for_mirror(peer, received, models_of(messages))
 
 
 def test_removed_models_are_deleted(start, peer):

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config
-from surfel_mapper.files.model_files import TRIANGLES, write_models
+from surfel_mapper.files.model_files import PACKED, TRIANGLES, write_models, write_packed
 from surfel_mapper.files.triangles import import_trimesh
 from surfel_mapper.layers.drawings import Drawing, PointsPicture, Section
 from surfel_mapper.layers.layer import InsertedScan, Layer, Moment, Publication, Surroundings
@@ -29,6 +29,7 @@ from surfel_mapper.messages.model_messages import (
     primitive_columns,
     surfel_primitive_columns,
 )
+from surfel_mapper.messages.model_packets import COMPLETE_EVERY, ModelStream
 from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
 from surfel_mapper.models.fitting import above, surfel_points
 from surfel_mapper.models.live import LiveModels, ModelUpdate
@@ -62,6 +63,7 @@ class ModelsLayer(Layer):
         self.models = LiveModels(config.models, around.surfel_map)
         self._last_ns: int | None = None
         self._shapes = Shapes()
+        self._stream = ModelStream()
         self._published: dict[int, int] = {}
         """Versions of the outlines that were published, by id."""
 
@@ -97,8 +99,15 @@ class ModelsLayer(Layer):
         return self.models.summary()
 
     def publications(self) -> Sequence[Publication]:
-        """Return markers, tables and outlines of the models."""
+        """Return the models, and their markers, tables and outlines."""
         return (
+            Publication(
+                topic='~/models',
+                type_name='std_msgs/msg/UInt8MultiArray',
+                messages=self._changed_models,
+                all_messages=self._all_models,
+                depth=COMPLETE_EVERY,
+            ),
             Publication(
                 topic='~/planes',
                 type_name='visualization_msgs/msg/MarkerArray',
@@ -133,10 +142,12 @@ class ModelsLayer(Layer):
             import_trimesh()
 
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
-        """Write models.json, and Parquet, OBJ and GLB if asked for."""
+        """Write models.smm and models.json, and Parquet, OBJ and GLB if asked for."""
         wanted = ['json', *(name for name in ('parquet', *TRIANGLES) if name in formats)]
-        model = self.models.model.translated(self.around.surfel_map.origin_m)
-        return write_models(directory, model, wanted, self.models.versions)
+        model, versions = self.models.model, self.models.versions
+        model = model.translated(self.around.surfel_map.origin_m)
+        packed = write_packed(directory / PACKED, model, versions)
+        return [packed, *write_models(directory, model, wanted, versions)]
 
     def drawings(self) -> Sequence[Drawing]:
         """Return patches and their outlines, and Gaussians as ellipsoids."""
@@ -159,6 +170,15 @@ class ModelsLayer(Layer):
 
     def _current_shapes(self) -> list[PatchShape]:
         return self._shapes.of(self.models.model, self.models.versions)
+
+    def _changed_models(self, moment: Moment) -> list[bytes]:
+        facts = {'stamp_ns': moment.stamp_ns, 'frame_id': moment.frame_id}
+        message = self._stream.changes(self.models.model, self.models.versions, **facts)
+        return [] if message is None else [message]
+
+    def _all_models(self, moment: Moment) -> list[bytes]:
+        facts = {'stamp_ns': moment.stamp_ns, 'frame_id': moment.frame_id}
+        return [self._stream.complete(self.models.model, self.models.versions, **facts)]
 
     def _marker_messages(self, moment: Moment) -> list[bytes]:
         markers = model_markers(
