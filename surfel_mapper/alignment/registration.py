@@ -67,6 +67,9 @@ SEARCH_CELLS = 3000
 SEARCH_STARTS = 4
 """Number of best places of the search from which the whole scan is aligned."""
 
+RELOCATED = 8
+"""Number of best places in the whole map from which the whole scan is aligned."""
+
 MAX_SEEN_THROUGH = 0.1
 """Share of surfaces seen through from which on a pose far from the prediction has to be searched
 for: at most 0.05 at right poses of a dense lidar, 0.14 and more at wrong ones."""
@@ -229,6 +232,41 @@ class Registration:
         ]
         chosen = self._chosen([result, *searched], starts, is_lost)
         return replace(chosen, is_found=not self._is_near(chosen, result.T_map_sensor))
+
+    def relocate(
+        self,
+        cells: npt.NDArray[np.float64],
+        surfel_map: SurfelMap,
+        places: Sequence[Transform],
+    ) -> RegistrationResult:
+        """
+        Return the pose of a scan that may be at any of some places, of PlaceSearch.
+
+        Each place that fits about as well as the best one is its rival.
+
+        Parameters
+        ----------
+        cells : (K, 3) float64, m
+            Cells of the scan, from ``cells``.
+        surfel_map : SurfelMap
+            A map of the given voxel size.
+        places : sequence of (4, 4) float64
+            Possible poses, at least one.
+
+        """
+        level, some = self.config.coarse_levels, thinned(cells, ROUGH_CELLS)
+        rough = []
+        for place in places:  # levels of its own: those of all would be the whole map
+            planes = PlaneLevels(self.config, surfel_map, some, [place]).planes(level)
+            size_m = planes.voxel_size_m
+            tolerance_m = COARSE_TOLERANCE * size_m
+            rough.append(self._converge(some, planes, place, size_m, tolerance_m, ROUGH_STEPS))
+        view, results = ScanView(cells), []
+        for pose in self._distinct_poses(rough, RELOCATED):
+            levels = PlaneLevels(self.config, surfel_map, cells, [pose])
+            result = self._descend(cells, levels, pose, levels.voxel_size_m(level))
+            results.append(self._viewed(result, view, levels))
+        return replace(self._chosen(results, places[:1], is_lost=True), is_found=True)
 
     def seen_through(
         self, cells: npt.NDArray[np.float64], surfel_map: SurfelMap, T_map_sensor: Transform
