@@ -22,13 +22,11 @@ from surfel_mapper.files import map_state, parquet
 from surfel_mapper.files.arrays import is_cloud
 from surfel_mapper.files.latest_map import DRAWABLE, map_in, TILES
 from surfel_mapper.files.parquet_tiles import read_tiles
+from surfel_mapper.files.point_columns import NORMAL_NAMES
 from surfel_mapper.files.scan_files import scan_reader, SUFFIXES
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 Floats = npt.NDArray[np.float64]
-
-NORMALS = (('nx', 'ny', 'nz'), ('normal_x', 'normal_y', 'normal_z'))
-"""Names of the components of normals."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +104,7 @@ def of_map(surfel_map: SurfelMap, min_points: int) -> Discs:
 
 def of_columns(points: npt.NDArray[Any], columns: Mapping[str, npt.NDArray[Any]]) -> Discs:
     """Return the points of a cloud, with normals scaled to unit length; none if all are zero."""
-    names = next((names for names in NORMALS if set(names) <= set(columns)), None)
+    names = next((names for names in NORMAL_NAMES if set(names) <= set(columns)), None)
     normal = None
     if names is not None:
         normal = np.stack([columns[name].astype(np.float64) for name in names], axis=1)

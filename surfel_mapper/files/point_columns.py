@@ -26,6 +26,9 @@ PACKED = ('rgb', 'rgba')
 
 NORMALS = ('nx', 'ny', 'nz')
 
+NORMAL_NAMES = (NORMALS, ('normal_x', 'normal_y', 'normal_z'))
+"""Names of normals in files."""
+
 
 def named_columns(table: npt.NDArray[Any]) -> Columns:
     """

@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator
 import logging
 from pathlib import Path
 
+from surfel_mapper.files import parquet
+from surfel_mapper.files.cloud_map import is_cloud, read_cloud_map
 from surfel_mapper.files.latest_map import map_in, RESTORABLE
 from surfel_mapper.files.map_state import FILE, load_map, save_map
 from surfel_mapper.files.parquet_tiles import read_tiles
@@ -109,7 +111,8 @@ def load_mapper(
     Parameters
     ----------
     path : str or Path
-        As of load_map, or a dataset of tiles, which has no window and no layers.
+        As of load_map; or a dataset of tiles, map.parquet or a cloud of points, which have no
+        window and no layers.
     mapper : Mapper
         Takes them.
     with_window : bool
@@ -133,6 +136,10 @@ def load_mapper(
     restores = []
     if path.is_dir():  # tiles: layers beside them are of the file of an earlier run
         surfel_map = read_tiles(path, voxel_size_m=size_m)
+    elif path.suffix.lower() == '.parquet':
+        surfel_map = parquet.read_map(path, voxel_size_m=size_m)
+    elif is_cloud(path):
+        surfel_map = read_cloud_map(path, mapper.config.map.voxel_size_m)
     else:
         surfel_map, scans = load_map(path, voxel_size_m=size_m)
         restores = [layer.load(file) for file, layer in layer_files(path, mapper) if file.exists()]
