@@ -23,7 +23,8 @@ class RegistrationConfig(Stage):
 
     start: tuple[float, ...] = setting(
         (),
-        'Initial pose of the base in the fixed frame, x y z in m, qx qy qz qw; empty: the origin.',
+        'Initial pose of the base in the fixed frame, x y z in m, qx qy qz qw; empty: the origin, '
+        'or found by a search with map.mode frozen.',
     )
     noise_m: float = setting(
         0.02,

@@ -54,9 +54,10 @@ class MapConfig(Stage):
     )
     load: str = setting(
         '',
-        'Map to start from: an .npz file of ~/save_map, the output directory of a replay, or '
-        'tiles; its surfels stay. latest: the newest map or checkpoint in output.directory, if '
-        'any, with its window. Empty: none.',
+        'Map to start from: a file of ~/save_map or replay (.npz, .parquet), the output directory '
+        'of a replay, tiles, or a cloud of points (.ply, .pcd, .las, ...); its surfels stay. '
+        'latest: the newest map or checkpoint in output.directory, if any, with its window. '
+        'Empty: none.',
     )
     max_bytes: int = setting(
         -1,

@@ -427,9 +427,9 @@ def mapped(
 
 
 def refuse_empty(recording: Recording, mapper: Mapper, was_stopped: bool) -> None:
-    """Raise if no scan was mapped, with the causes."""
+    """Raise if no scan was mapped, with the causes, unless none has a place on a frozen map."""
     counters = mapper.counters
-    if counters.mapped or counters.localised:
+    if counters.mapped or counters.localised or {'apart', 'not_aligned'} & counters.dropped.keys():
         return
     description = recording.describe()
     if was_stopped:

@@ -12,6 +12,7 @@ spoil all that is mapped later.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -20,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.registration import is_near, Registration, RegistrationResult
+from surfel_mapper.alignment.surfel_planes import means
 from surfel_mapper.alignment.tracking import FIRST_SUPPORT, Tracker
 from surfel_mapper.config import Config
 from surfel_mapper.errors import AlignmentError
@@ -156,8 +158,19 @@ class MapPart:
         self._map = SurfelMap(config.map.voxel_size_m)
         self._T_map_part: Transform | None = None
         self._num_agreeing = 0
+        self._refusal = ''
         self.scans: list[WaitingScan] = []
         self.tracker = Tracker(registration, np.eye(4))
+
+    @property
+    def points(self) -> npt.NDArray[np.float64]:
+        """One point of each voxel of the part, (N, 3) m."""
+        return means(self._map.moments())
+
+    @property
+    def reasons(self) -> str:
+        """Why its first scan was not mapped, and why the last one has no place."""
+        return f'{self.reason}; {self._refusal}' if self._refusal else self.reason
 
     @property
     def has_place(self) -> bool:
@@ -200,7 +213,11 @@ class MapPart:
         self._T_map_part, self._num_agreeing = compose(T_map_middle, inverse(T_part_middle)), 0
 
     def confirmed(
-        self, cells: npt.NDArray[np.float64], surfel_map: SurfelMap, T_part_middle: Transform
+        self,
+        cells: npt.NDArray[np.float64],
+        surfel_map: SurfelMap,
+        T_part_middle: Transform,
+        places: Sequence[Transform] = (),
     ) -> tuple[Transform, RegistrationResult] | None:
         """
         Compare the newest scan with the map; return T_map_part once enough scans agree.
@@ -213,19 +230,21 @@ class MapPart:
             The map.
         T_part_middle : (4, 4) float64
             Pose of the scan on the part.
+        places : sequence of (4, 4) float64
+            Poses of the scan on the map that a search found; by default the guess.
 
         """
         settings = self._registration.config
         start = compose(
             self.guess if self._T_map_part is None else self._T_map_part, T_part_middle
         )
-        result = self._registration.align(
-            cells, surfel_map, [start], settings.max_deviation_m, is_lost=self._T_map_part is None
-        )
-        fits = result.converged and self._registration.fits(result)
-        usual_support, max_seen_through = self.limits
-        fits &= result.support >= SHARE_OF_USUAL * usual_support
-        if not fits or result.rival > 0.0 or result.seen_through > max_seen_through:
+        if places:
+            result = self._registration.relocate(cells, surfel_map, [start, *places])
+        else:
+            is_lost, most_m = self._T_map_part is None, settings.max_deviation_m
+            result = self._registration.align(cells, surfel_map, [start], most_m, is_lost=is_lost)
+        self._refusal = self._refused(result)
+        if self._refusal:
             self._T_map_part = None
             return None
         if self._T_map_part is None:
@@ -238,11 +257,23 @@ class MapPart:
         self._num_agreeing += 1
         return (self._T_map_part, result) if self._num_agreeing >= CONFIRMING else None
 
+    def _refused(self, result: RegistrationResult) -> str:
+        """Return why a scan has no certain place on the map; empty if it has."""
+        usual_support, max_seen_through = self.limits
+        fits = result.converged and self._registration.fits(result)
+        if not fits or result.support < SHARE_OF_USUAL * usual_support:
+            return f'no place in the map fits the last scan (the best: {result.support:.0%})'
+        if result.rival > 0.0:
+            return f'the last scan fits two places about equally well ({result.support:.0%})'
+        if result.seen_through > max_seen_through:
+            return f'the last scan sees through {result.seen_through:.0%} of the map in view'
+        return ''
+
     def apart(self) -> ApartMap:
         """Return the part as a map that stays apart."""
         return ApartMap(
             map=self._map,
             stamps_ns=tuple(scan.prepared.scan.stamp_ns for scan in self.scans),
             poses=[scan.T_part_sensor for scan in self.scans],
-            reason=self.reason,
+            reason=self.reasons,
         )

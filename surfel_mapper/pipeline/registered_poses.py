@@ -21,8 +21,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.alignment.place_search import PlaceSearch
 from surfel_mapper.alignment.registration import Registration, RegistrationResult
-from surfel_mapper.alignment.tracking import Tracker
+from surfel_mapper.alignment.surfel_planes import means
+from surfel_mapper.alignment.tracking import MORE_SEEN_THROUGH, Tracker
 from surfel_mapper.config import Config
 from surfel_mapper.counters import LATEST
 from surfel_mapper.errors import AlignmentError, PoseError, PoseNotYetError
@@ -42,6 +44,8 @@ MOST_PARTS = 20
 
 STATES = ('lost', 'unconfirmed', 'ambiguous', 'degenerate', 'surrounded')
 """States of tracking; surrounded: most of a scan seems to move along, its pose may be wrong."""
+
+UNKNOWN_START = 'its initial pose is unknown, and searched for in the map'
 
 MAX_STEP_S = 10.0
 """Longest time between two scans that counts for a state, s; more is a gap of the recording."""
@@ -115,6 +119,9 @@ class RegisteredPoses:
         self._registration = Registration(config.registration, config.map.voxel_size_m)
         start = config.registration.start
         self._start = pose_matrix(start[:3], start[3:]) if start else np.eye(4)
+        self._searches_start = config.map.mode == 'frozen' and not start
+        self._knows_start = not self._searches_start
+        self._search: tuple[tuple[int, int], PlaceSearch] | None = None
         self._tracker = Tracker(self._registration, self._start)
         self.body = ''
         self.scans_ended = False
@@ -148,6 +155,7 @@ class RegisteredPoses:
     def restart(self, T_fixed_body: Transform | None = None) -> None:
         """Go on from a pose, by default the one of registration.start."""
         self.finish()
+        self._knows_start = T_fixed_body is not None or not self._searches_start
         self._tracker.restart(self._start if T_fixed_body is None else T_fixed_body)
 
     def learn_motion(self, scan: Scan, following: Scan | None) -> None:
@@ -259,7 +267,7 @@ class RegisteredPoses:
         is_kept = len(map_part.scans) >= LEAST_SCANS
         for waiting in map_part.scans:
             cause = 'apart' if is_kept else 'not_aligned'
-            self._drops.scan(waiting.prepared.scan, cause, map_part.reason)
+            self._drops.scan(waiting.prepared.scan, cause, map_part.reasons)
         if is_kept:
             self.apart = [*self.apart, map_part.apart()][-MOST_PARTS:]
             self._num_parts += 1
@@ -284,6 +292,10 @@ class RegisteredPoses:
         """Align a scan at its expected pose; if its place is uncertain, begin a part with it."""
         T_map_middle = compose(T_map_fixed, self._tracker.predict(sighting.stamp_ns))
         twist = self._tracker.twist
+        if not self._knows_start:
+            limits = self._tracker.expected_support, MORE_SEEN_THROUGH
+            self._begin_part(sighting, T_map_middle, twist, limits, UNKNOWN_START)
+            return []
         try:
             fit = self._tracker.track(sighting.cells, sighting.stamp_ns, surfel_map, T_map_fixed)
         except AlignmentError as error:
@@ -324,14 +336,17 @@ class RegisteredPoses:
             T_part_middle = map_part.add(sighting)
         except AlignmentError:
             return self._leave(sighting, map_part, twist, surfel_map, T_map_fixed)
-        confirmed = map_part.confirmed(sighting.cells, surfel_map, T_part_middle)
+        places = self._places(map_part, surfel_map, T_part_middle)
+        confirmed = None
+        if self._knows_start or places or map_part.has_place:
+            confirmed = map_part.confirmed(sighting.cells, surfel_map, T_part_middle, places)
         if confirmed is None:
             if len(map_part.scans) >= MOST_SCANS:
                 self.finish()
             return []
         T_map_part, result = confirmed
         T_fixed_part = compose(inverse(T_map_fixed), T_map_part)
-        self._map_part = None
+        self._map_part, self._knows_start = None, True
         T_fixed_middle = compose(T_fixed_part, T_part_middle)
         twist = map_part.tracker.twist
         self._tracker.resume(T_fixed_middle, sighting.stamp_ns, twist, sighting.cells)
@@ -341,6 +356,24 @@ class RegisteredPoses:
             self._at(waiting.prepared, compose(T_fixed_part, waiting.T_part_body), result)
             for waiting in map_part.scans
         ]
+
+    def _places(
+        self, map_part: MapPart, surfel_map: SurfelMap, T_part_middle: Transform
+    ) -> list[Transform]:
+        """
+        Return places of a part in a whole frozen map, for its newest scan.
+
+        The search takes longer than a scan: it is made for the 2nd, 4th, 8th ... scan.
+        """
+        number = len(map_part.scans)
+        is_due = self._config.map.mode == 'frozen' and not number & (number - 1)
+        if map_part.has_place or not is_due:
+            return []
+        version = id(surfel_map), surfel_map.version
+        if self._search is None or self._search[0] != version:
+            points = means(surfel_map.moments())
+            self._search = version, PlaceSearch(points, surfel_map.voxel_size_m)
+        return self._search[1].poses(transformed(inverse(T_part_middle), map_part.points))
 
     def _leave(
         self,
@@ -396,6 +429,8 @@ class RegisteredPoses:
         self, sighting: Sighting, placed: list[Prepared], surfel_map: SurfelMap
     ) -> bool:
         """Return whether most of what a scan on the track sees seems to move along; warn then."""
+        if self._config.map.mode == 'frozen':  # its map lacks what came later
+            return False
         if len(placed) != 1 or placed[0].registration is None:
             self._surroundings.clear()
             return False

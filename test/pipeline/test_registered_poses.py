@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import itertools
 
 import numpy as np
 import pytest
@@ -308,6 +309,42 @@ def test_an_initial_pose_is_used_on_a_frozen_map():
     near = compose(TRUE, se3_exp(np.array([0.5, -0.4, 0.0, 0.0, 0.0, 0.15])))
 
     mapper.start_from('odom', near[:3, 3], q_xyzw(near))
+
+    (update,) = feed(mapper, [scan_at(1)])
+    np.testing.assert_allclose(update.T_map_sensor, pose_at(1), atol=3e-3)
+
+
+def test_the_initial_pose_on_a_frozen_map_is_searched_for():
+    mapper = frozen()
+    away = compose(se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.5])), TRUE)
+    poses = [compose(compose(away, inverse(TRUE)), pose_at(number)) for number in range(6)]
+    scans = [scan_at(number, poses[number]) for number in range(6)]
+
+    updates = [feed(mapper, [scan]) for scan in scans]
+
+    assert [len(mapped) for mapped in updates] == [0, 0, 0, 4, 1, 1]
+    for update, pose in zip(itertools.chain(*updates), poses, strict=True):
+        np.testing.assert_allclose(update.T_map_sensor, pose, atol=3e-3)
+    assert mapper.counters.localised == 6
+
+
+def test_scans_of_another_room_are_not_placed_on_a_frozen_map():
+    mapper = frozen()
+    corridor = [scan_at(number, faces=CORRIDOR, reach_m=20.0) for number in range(6)]
+
+    assert feed(mapper, corridor) == []
+    mapper.finish()
+
+    assert mapper.counters.dropped == {'apart': 6}
+    (apart,) = mapper.registered.apart
+    assert 'its initial pose is unknown, and searched for in the map; ' in apart.reason
+
+
+def test_an_initial_pose_ends_the_search():
+    mapper = frozen()
+    assert feed(mapper, [scan_at(0)]) == []
+
+    mapper.start_from('odom', TRUE[:3, 3], q_xyzw(TRUE))
 
     (update,) = feed(mapper, [scan_at(1)])
     np.testing.assert_allclose(update.T_map_sensor, pose_at(1), atol=3e-3)

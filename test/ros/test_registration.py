@@ -16,11 +16,12 @@ from nav_msgs.msg import Odometry, Path
 
 from surfel_mapper.config import Config
 from surfel_mapper.files.map_state import save_map
+from surfel_mapper.files.ply import write_points
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.pose_outputs import covariance
-from test.alignment.test_registration import map_of, ROOM
+from test.alignment.test_registration import map_of, points_on, ROOM
 from test.pipeline.test_registered_poses import pose_at, scan_at
 from test.ros.live import cloud, LATCHED, RVIZ, START_NS
 
@@ -107,6 +108,23 @@ def test_registration_on_a_frozen_map_starts_from_an_initial_pose(start, peer, t
         np.testing.assert_allclose(pose_of(odometry), pose_at(number), atol=5e-3)
     assert node.stop() == 0
     assert map_of(ROOM).digest() in node.output
+
+
+def test_a_cloud_is_a_map_to_localise_on_without_an_initial_pose(start, peer, tmp_path):
+    columns = dict(zip('xyz', points_on(ROOM, 100, seed=50).astype(np.float32).T, strict=True))
+    write_points(tmp_path / 'room.ply', columns)
+    node = start('node', *arguments(map__mode='frozen', map__load='room.ply'))
+    node.wait_for_output('ready')
+    odometry = peer.collect(Odometry, '/surfel_mapper/odometry', RVIZ)
+    peer.advertise('/points')
+
+    send(peer, clouds(range(6)))
+    peer.spin_until(lambda: len(odometry) == 6, what=lambda: node.output)
+
+    for number, message in enumerate(odometry):
+        np.testing.assert_allclose(pose_of(message), pose_at(number), atol=5e-3)
+    assert 'its initial pose is unknown, and searched for in the map' in node.output
+    assert node.stop() == 0
 
 
 def test_a_missing_map_ends_the_node_with_a_message(start):
