@@ -29,7 +29,6 @@ from surfel_mapper.filters.grids import AXIS_BITS, KEY_BITS
 from surfel_mapper.kernels.selection import number_ranges
 from surfel_mapper.mapping.moments import are_far_apart, OTHER_UNIT
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.models.cloud_noise import estimate_noise
 from surfel_mapper.models.coarse_growth import (
     CoarseRules,
     extend_coarse,
@@ -45,6 +44,7 @@ from surfel_mapper.models.growth import (
 )
 from surfel_mapper.models.kernels.frames import LEAST_WIDTH
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
+from surfel_mapper.models.noise import estimate_noise, NoiseSamples
 from surfel_mapper.models.patches import fit_patches, PatchPoints
 from surfel_mapper.models.seams import with_smooth_seams
 from surfel_mapper.models.segmentation import (
@@ -147,7 +147,8 @@ def fit_points(
     voxels = thinned.by_voxel()
     core = voxels.core()
     if config.noise_m == config.noise_per_range_sq == 0.0:
-        noise = estimate_noise(voxels, thinned.means, core, config.voxel_size_m, view)
+        samples = NoiseSamples(voxels.points, voxels.starts, thinned.means, view=view)
+        noise = estimate_noise(samples, config.voxel_size_m)
         config = replace(config, noise_m=min(noise[0], 1.0), noise_per_range_sq=min(noise[1], 1.0))
     laps.append(clock())
     rows = np.flatnonzero(core)

@@ -20,7 +20,6 @@ Source: Gao and Dong 2025 for the tests and the models; surfels as clusters are 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-import math
 from typing import Any
 
 import numpy as np
@@ -46,14 +45,14 @@ from surfel_mapper.models.multi_model import Gaussians, MultiModel, Surface
 from surfel_mapper.models.shapes import ellipsoid_corners, Shapes
 from surfel_mapper.models.surfel_graph import GraphChange, SurfelGraph
 from surfel_mapper.models.surfel_joining import SurfelJoining
-from surfel_mapper.models.surfel_noise import estimate_noise, MOST_VOXELS
+from surfel_mapper.models.surfel_noise import map_noise, MOST_VOXELS
 
 __all__ = ['LiveModels', 'ModelUpdate']
 
-LEAST_ESTIMATED = 256
-"""Voxels of a map at the first estimate of the noise, at least."""
+LEAST_ESTIMATED, GROWTH = 256, 1.25
+"""Voxels at the first estimate of the noise; growth of voxels or updates until the next one."""
 
-OTHER_NOISE = 0.8
+OTHER_NOISE = 0.9
 """Ratio of estimates of the noise from which all voxels are measured anew."""
 
 Rows = npt.NDArray[np.int32]
@@ -86,7 +85,7 @@ class LiveModels:
         self._fitter = PatchFitter(self._graph)
         self._joining = SurfelJoining(self._graph, config)
         self._next_id = 0
-        self._estimate_at: float = LEAST_ESTIMATED
+        self._estimate_at, self._updates = (0.0, 0.0), 0
         self.clear()
 
     def clear(self) -> None:
@@ -180,7 +179,7 @@ class LiveModels:
             Shapes().of(models.model, models.versions)
             ellipsoid_corners(models.model.gaussians)
             bisected(models._graph, np.arange(2, dtype=np.int32), 0.5, 1)
-            estimate_noise(surfel_map)
+            map_noise(surfel_map)
             surfel_map.remove(moments[1])
             models.update()
             surfel_map.remove(moments[0])
@@ -198,12 +197,15 @@ class LiveModels:
         }
 
     def _follow_noise(self) -> None:
-        """Estimate the noise whenever the map has twice as many voxels as at the last estimate."""
+        """Estimate the noise if voxels or updates grew by GROWTH since the last estimate."""
+        self._updates += 1
         number = self.map.num_voxels
-        if number < self._estimate_at:
+        if number < self._estimate_at[0] and self._updates < self._estimate_at[1]:
             return
-        self._estimate_at = 2 * number if 2 * number <= MOST_VOXELS else math.inf
-        noise_m = estimate_noise(self.map)
+        if number < LEAST_ESTIMATED or number > MOST_VOXELS:
+            return
+        self._estimate_at = GROWTH * number, GROWTH * self._updates
+        noise_m = map_noise(self.map)
         if not OTHER_NOISE * noise_m <= self.noise_m <= noise_m / OTHER_NOISE:
             self._graph.assume_noise(noise_m)
 

@@ -1,63 +1,56 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The noise of the sensor, estimated from the surfels of a map.
+The noise of the sensor, estimated from the surfels of a map as from the points of a cloud.
 
-A voxel on a plane is as thick as the noise; edges, corners and vegetation only add to that, so the
-estimate is a low quantile of the thickness. A voxel clips noise of more than a tenth of its edge,
-so larger voxels, which the map sums exactly, are taken until they do not. The constants are those
-of the estimate from points (growth.py).
+Eight points stand for the points of a voxel: one standard deviation from their mean along each
+principal axis, to either side. They have the mean and the covariance of all, so residuals over
+many voxels are as thick as those of the points.
 """
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
-from surfel_mapper.kernels import layout
-from surfel_mapper.mapping.coarsening import coarse_surfels
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.models.cloud_noise import CLIPPED_VOXELS, CLIPPING, NOISE_QUANTILE
+from surfel_mapper.models.frames import PACKED
+from surfel_mapper.models.noise import estimate_noise, NoiseSamples
 
-LEVELS = 4
-"""Voxels of up to 8 times the size are tried."""
-
-LEAST_POINTS, LEAST_VOXELS = 20, 30
-"""Points of a voxel, and voxels, for an estimate."""
-
-LEAST_WIDTH = 0.15
-"""Least standard deviation of the points of a voxel along its surface, in voxels: half of that
-of a surface that fills it."""
-
-SPREAD = 1.15
-"""Noise over the quantile: voxels of LEAST_POINTS points scatter, and a plane only grazes some."""
+LEAST_EDGE_VOXELS = 3.0
+"""Edge of the cubes in voxels, at least: a surfel resolves nothing within its voxel."""
 
 MOST_M = 0.02
 """Largest estimate, m: rougher surfaces are vegetation or rubble in large voxels, not noise."""
 
-MOST_VOXELS = 1 << 17
+MOST_VOXELS = 1 << 15
 """Voxels that are looked at, those added first: neighbours are mostly added together."""
 
+CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
+"""Signs of the axes of the eight points."""
 
-def estimate_noise(surfel_map: SurfelMap) -> float:
-    """
-    Return the standard deviation of the points about the flat surfaces of a map, m.
 
-    It is at most MOST_M, and 0 if fewer than LEAST_VOXELS voxels have the points and the width for
-    an estimate.
+def map_noise(surfel_map: SurfelMap) -> float:
     """
-    moments = surfel_map.moments().select(slice(MOST_VOXELS))
-    noise_m = 0.0
-    for level in range(LEVELS):
-        size_m = surfel_map.voxel_size_m * 2**level
-        # 8^level voxels in one have to stay within its limit of points, which 4^level divides
-        most = layout.MAX_MAP_COUNT >> (5 * level + 2 * surfel_map.level)
-        chosen = np.flatnonzero(moments.count <= most)
-        thin, wide, _ = coarse_surfels(moments, level, chosen, LEAST_POINTS).eigenvalues.T
-        sigma = np.sqrt(thin[wide > (LEAST_WIDTH * size_m) ** 2])
-        if len(sigma) < LEAST_VOXELS:
-            continue
-        low = float(np.quantile(sigma, NOISE_QUANTILE))
-        noise_m = SPREAD * low * (1.0 + CLIPPING * (low / size_m) ** 2)
-        if low < CLIPPED_VOXELS * size_m:
-            break
-    return min(noise_m, MOST_M)
+    Return the standard deviation of the points across the smooth surfaces of a map, m.
+
+    It is at most MOST_M, and 0 for too few voxels.
+    """
+    rows = surfel_map.rows_changed(-1)[:MOST_VOXELS]
+    rows = rows[surfel_map.keys_of(rows) >= 0]
+    surfels = surfel_map.surfels_of(rows, covariance=True)
+    order, number = np.argsort(surfels.position[:, 2], kind='stable'), len(rows)
+    means, counts = surfels.position[order], surfels.num_points[order].astype(np.float64)
+    assert surfels.covariance is not None
+    covariances = np.where(counts[:, None] > 1.0, surfels.covariance[order], 0.0)
+    values, axes = np.linalg.eigh(covariances[:, PACKED])
+    signs = np.random.default_rng(0).permuted(np.tile(CORNERS, (number, 1, 1)), axis=1)
+    away = np.einsum('kcj,kj,kij->kci', signs, np.sqrt(np.maximum(values, 0.0)), axes)
+    samples = NoiseSamples(
+        points=(means[:, None] + away).reshape(-1, 3),
+        starts=8 * np.arange(number + 1),
+        means=means,
+        weights=np.repeat(counts, 8),
+    )
+    return min(estimate_noise(samples, LEAST_EDGE_VOXELS * surfel_map.voxel_size_m)[0], MOST_M)

@@ -107,3 +107,37 @@ def owner_means(points, starts, owner, owners, means, counts, first):
                 means[k, j] /= counts[k]
     first[len(starts) - 1] = num
     return num
+
+
+@kernel(error_model='numpy')
+def sample_cubes(starts, means, ends, seeds, halves, rows):
+    """
+    Sample the points of cubes about voxels evenly: those of the voxels with their means inside.
+
+    starts  (V + 1,) int64, first point of each voxel
+    means   (V, 3) float64, m
+    ends    (2, V) float64, m: greatest z up to each voxel, and least from it on
+    seeds   (B,) int64, voxels
+    halves  (B,) float64, m: half the edge of their cubes
+    rows    (B, n) int64, out: rows of points, -1 behind the last
+    """
+    inside, rows[:] = np.empty(len(means), np.int64), -1
+    for b in range(len(seeds)):
+        x, y, z = means[seeds[b]]
+        half, num, total = halves[b], 0, 0
+        stop = np.searchsorted(ends[1], z + half, 'right')
+        for v in range(np.searchsorted(ends[0], z - half), stop):
+            if (
+                abs(means[v, 0] - x) <= half
+                and abs(means[v, 1] - y) <= half
+                and abs(means[v, 2] - z) <= half
+            ):
+                inside[num] = v
+                num += 1
+                total += starts[v + 1] - starts[v]
+        most, last, k = min(total, rows.shape[1]), 0, 0
+        for i in range(num):
+            last += starts[inside[i] + 1] - starts[inside[i]]
+            while k < most and k * total // most < last:
+                rows[b, k] = starts[inside[i] + 1] - last + k * total // most
+                k += 1

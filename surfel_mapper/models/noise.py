@@ -1,0 +1,248 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Noise of the sensor that made a cloud, from the residuals of quadrics over cubes of 0.3 m.
+
+Depth cameras do not have white noise. Block matching correlates pixels over centimetres, and
+disparities come in steps: neighbouring points of a Kinect are equal. Residuals within a few
+centimetres are a fifth of the noise, those over tens of centimetres show it whole.
+
+A quadric removes curvature. If a quartic fits much better, the residual is shape, and the cube
+does not count. If too few cubes count, smaller ones are used. A wall that faces the camera may be
+one step of disparity. Steps show in the coordinates along its axis, and bound the noise below.
+
+All cubes are fitted together by numpy: there are at most 128, with 64 points each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.models.joining import LEAST_COSINE
+from surfel_mapper.models.kernels.voxel_points import sample_cubes
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+EDGE_M, EDGE_RANGE_M, COARSEST = 0.32, 2.0, 2
+"""Edge of cubes up to twice EDGE_RANGE_M; it doubles with the range, up to COARSEST times."""
+
+CUBES, CUBE_POINTS, LEAST_POINTS = 128, 64, 32
+"""Cubes for the estimate, most and least points used in each."""
+
+LEAST_CUBES, LEAST_SHARE = 20, 0.25
+"""Number and share of the cubes that are smooth surfaces, for an estimate."""
+
+NOISE_BINS = 4
+"""Bins of range."""
+
+MAP_QUANTILE, MAP_SAMPLES = 0.9, 2
+"""
+If ranges are unknown, quantile of the noise of surfaces, as most are nearer than the noisiest, and
+factor of the cubes and of their points, as a high quantile needs more.
+"""
+
+TRIMMING_ROUNDS = 2
+"""Fits of a cube without its outliers; one leaves a tenth of outliers half of their effect."""
+
+MEDIAN_TO_SIGMA = 1.4826
+"""Sigma of normally distributed values by the median of their absolute values."""
+
+LEAST_WIDTH, MOST_THICKNESS = 0.1, 0.1
+"""
+A cube with a smaller ratio of the tangential variances is a line; one with a larger ratio of the
+normal variance to the smaller tangential one is a corner, or folded.
+"""
+
+LEAST_KEPT, LEAST_QUARTIC = 0.9, 0.75
+"""
+A smooth surface with noise keeps this share of its points, and the residual of a quartic is at
+least this share of that of a quadric.
+"""
+
+RIDGE = 1e-10
+"""Added to the normal equations, relative to the weight, for points in one line."""
+
+STEP_SAMPLES, STEP_POINTS, STEP_SPREAD = 20_000, 8, 2.5
+"""
+Points for the steps of disparity; each step holds STEP_POINTS on average, and 80 % of the steps
+differ by a factor of at most STEP_SPREAD when divided by the squared distance.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseSamples:
+    """
+    Points by voxel, for an estimate of their noise.
+
+    Attributes
+    ----------
+    points : (P, 3) float64, m
+    starts : (V + 1,) int64
+        First point of each voxel, and P.
+    means : (V, 3) float64, m
+        Means of the points by voxel; those in one layer of z follow each other.
+    weights : (P,) float64, optional
+        Weights of the points; 1 if omitted.
+    view : (3,) float64, m, optional
+        Position of the sensor. Without it noise is across the surface, at any range.
+
+    """
+
+    points: Array
+    starts: Indices
+    means: Array
+    weights: Array | None = None
+    view: Array | None = None
+
+
+def estimate_noise(samples: NoiseSamples, least_edge_m: float) -> tuple[float, float]:
+    """
+    Return the noise of the points as n0, m, and n2, 1/m: sigma is n0 + n2 range^2.
+
+    Both are 0 if there are no smooth surfaces. Cubes have at least the given edge.
+    """
+    range_sq: Array = np.empty(0)
+    sigma: Array = np.empty(0)
+    edge_m = max(EDGE_M, least_edge_m)
+    while edge_m >= least_edge_m:
+        range_sq, sigma, share = cube_noise(samples, edge_m)
+        if len(sigma) >= LEAST_CUBES and share >= LEAST_SHARE:
+            break
+        edge_m *= 0.5
+    if not len(sigma):
+        return 0.0, 0.0
+    bins = NOISE_BINS if len(sigma) >= 5 * NOISE_BINS else 1
+    groups = np.array_split(np.argsort(range_sq, kind='stable'), bins)
+    x = np.array([np.median(range_sq[group]) for group in groups])
+    typical = MAP_QUANTILE if samples.view is None else 0.5
+    y = np.array([np.quantile(sigma[group], typical) for group in groups])
+    return line_above_zero(x, np.maximum(y, step_noise(samples) * x))
+
+
+def cube_noise(samples: NoiseSamples, edge_m: float) -> tuple[Array, Array, float]:
+    """Return squared range and sigma along the ray of smooth cubes, (B,), and their share."""
+    points, weight, share = sampled_cubes(samples, edge_m)
+    number = weight.sum(axis=1)
+    mean = (weight[:, :, None] * points).sum(axis=1) / number[:, None]
+    away = points - mean[:, None]
+    values, axes = np.linalg.eigh(away.transpose(0, 2, 1) @ (away * weight[:, :, None]))
+    is_sheet = values[:, 1] > LEAST_WIDTH * values[:, 2]
+    sheets = np.flatnonzero(is_sheet & (values[:, 0] < MOST_THICKNESS * values[:, 1]))
+    scale = np.sqrt(values[sheets, 2] / number[sheets])
+    local = away[sheets] @ axes[sheets][:, :, ::-1] / scale[:, None, None]
+    sigma, quartic, kept = trimmed_sigmas(local, weight[sheets])
+    smooth = (quartic >= LEAST_QUARTIC * sigma) | (sigma < math.sqrt(RIDGE))
+    smooth &= kept >= LEAST_KEPT
+    share *= float(smooth.sum()) / max(len(points), 1)
+    if samples.view is None:
+        return np.zeros(int(smooth.sum())), (scale * sigma)[smooth], share
+    ray = mean[sheets] - samples.view
+    range_m = np.sqrt(np.maximum((ray**2).sum(axis=1), 1e-24))
+    cosine = np.abs((ray * axes[sheets, :, 0]).sum(axis=1)) / range_m
+    along = scale * sigma / np.maximum(cosine, LEAST_COSINE)
+    return range_m[smooth] ** 2, along[smooth], share
+
+
+def sampled_cubes(samples: NoiseSamples, edge_m: float) -> tuple[Array, Array, float]:
+    """Return points (B, n, 3) of cubes, weights (B, n) of mean 1, and the share with enough."""
+    means, view = samples.means, samples.view
+    more = MAP_SAMPLES if view is None else 1
+    seeds = np.arange(0, len(means), -(-len(means) // (more * CUBES)) or 1)
+    halves = np.full(len(seeds), 0.5 * edge_m)
+    if view is not None:
+        range_m = np.sqrt(((means[seeds] - view) ** 2).sum(axis=1))
+        level = np.floor(np.log2(np.maximum(range_m / EDGE_RANGE_M, 1.0)))
+        halves *= 2.0 ** np.minimum(level, COARSEST)
+    z = np.stack([np.maximum.accumulate(means[:, 2]), np.minimum.accumulate(means[::-1, 2])[::-1]])
+    rows: Indices = np.empty((len(seeds), more * CUBE_POINTS), np.int64)
+    sample_cubes(samples.starts, means, z, seeds, halves, rows)
+    rows = rows[rows[:, LEAST_POINTS - 1] >= 0]
+    weight = (rows >= 0).astype(np.float64)
+    if samples.weights is not None:
+        counts = samples.weights[rows] * weight
+        weight = counts * (weight.sum(axis=1) / counts.sum(axis=1))[:, None]
+    return samples.points[rows], weight, len(rows) / max(len(seeds), 1)
+
+
+def trimmed_sigmas(points: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """
+    Return residuals (B,) of quadrics and quartics without the points beyond three sigma.
+
+    The third result is the share of points that remain.
+
+    Parameters
+    ----------
+    points : (B, n, 3) float64
+        Height over x and y.
+    weight : (B, n) float64
+        1 for points, 0 for none.
+
+    """
+    x, y, z = np.moveaxis(points, 2, 0)
+    terms = [np.ones_like(x)]
+    for degree in range(1, 5):
+        terms += [x * term for term in terms[-degree:]] + [y * terms[-1]]
+    basis = np.stack(terms, axis=2)
+    number = weight.sum(axis=1)
+    middle = ((number - 1.0) // 2.0).astype(np.int64)[:, None]
+    used = weight
+    for _ in range(TRIMMING_ROUNDS):
+        away = np.abs(residuals(basis[:, :, :6], used, z))
+        ascending = np.sort(np.where(weight > 0.0, away, np.inf), axis=1)
+        median = np.take_along_axis(ascending, middle, axis=1)
+        used = weight * (away <= 3.0 * MEDIAN_TO_SIGMA * median)
+    total, effective = used.sum(axis=1), used.sum(axis=1) ** 2 / (used**2).sum(axis=1)
+    sigmas = []
+    for order in (6, 15):
+        squares = used * residuals(basis[:, :, :order], used, z) ** 2
+        free = np.maximum(1.0 - order / effective, 0.1)
+        sigmas.append(np.sqrt(squares.sum(axis=1) / (total * free)))
+    return sigmas[0], sigmas[1], total / number
+
+
+def residuals(basis: Array, weight: Array, z: Array) -> Array:
+    """Return z less its best fit by a basis (B, n, T), (B, n)."""
+    weighted = basis * weight[:, :, None]
+    matrix = basis.transpose(0, 2, 1) @ weighted
+    matrix += RIDGE * weight.sum(axis=1)[:, None, None] * np.eye(basis.shape[2])
+    terms = np.linalg.solve(matrix, weighted.transpose(0, 2, 1) @ z[:, :, None])
+    away: Array = z - (basis @ terms)[:, :, 0]
+    return away
+
+
+def step_noise(samples: NoiseSamples) -> float:
+    """Return sigma / distance^2, 1/m, of the steps of disparity along an axis; 0 without steps."""
+    if samples.view is None:
+        return 0.0
+    points = samples.points[:: 1 + len(samples.points) // STEP_SAMPLES]
+    sample = np.abs(points - samples.view)
+    for values in sample.T:
+        levels = np.unique(values[values > 0.0])
+        if 2 < len(levels) < len(values) / STEP_POINTS:
+            low, step, high = np.quantile(np.diff(1.0 / levels[::-1]), [0.1, 0.5, 0.9])
+            if high < STEP_SPREAD * low:
+                return float(step / math.sqrt(12.0))
+    return 0.0
+
+
+def line_above_zero(x: Array, y: Array) -> tuple[float, float]:
+    """
+    Return a and b of a + b x, neither negative, nearest to y relative to y.
+
+    If x does not determine b, b is 0: noise at one range says nothing of other ranges.
+    """
+    weight = 1.0 / np.maximum(y, 1e-9)
+    design = np.stack([np.ones_like(x), x], axis=1) * weight[:, None]
+    best, least = (0.0, 0.0), math.inf
+    for used in ([0], [0, 1], [1]):
+        terms = np.zeros(2)
+        terms[used] = np.linalg.lstsq(design[:, used], y * weight, rcond=None)[0]
+        error = float(((design @ terms - y * weight) ** 2).sum())
+        if (terms >= 0.0).all() and error < least - 1e-12:
+            best, least = (float(terms[0]), float(terms[1])), error
+    return best
