@@ -311,7 +311,7 @@ class ModelsConfig(Stage):
         3.0, 'Edge of the cells of the outline of a plane, in voxels.', low=2.5, high=100.0
     )
     min_density_radius: float = setting(
-        2.0, 'Least density of a flat cluster; a full sheet has 2.', low=0.1, high=2.4
+        2.0, 'Least density of a flat cluster; a full sheet has 2.', low=0.1, high=3.0
     )
     outlier_share: float = setting(
         0.02, 'Largest share of the points of a flat cluster beyond 3 sigma.', low=0.0, high=1.0

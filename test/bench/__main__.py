@@ -7,19 +7,23 @@ from __future__ import annotations
 import argparse
 import ast
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib import import_module
 import json
 from pathlib import Path
 import sys
 from time import perf_counter
+from typing import Any
 
+import yaml
+
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.memory import keep_freed_memory
 from test.bench.machine import facts, load
 from test.bench.options import cache_directory, Options
 from test.bench.report import Row, table
 
-BENCHES = ('real', 'start', 'live', 'filters', 'lum', 'registration', 'tsdf', 'models')
+BENCHES = ('real', 'start', 'live', 'filters', 'lum', 'registration', 'tsdf', 'models', 'paper')
 """Modules of this folder that have run(options) -> list of rows, in the order to run them."""
 
 
@@ -53,13 +57,43 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument(
         '--cache', type=Path, default=cache_directory(), metavar='DIR', help='default: %(default)s'
     )
+    result.add_argument(
+        '--data',
+        action='append',
+        type=Path,
+        default=[],
+        metavar='PATH',
+        help='for paper: a folder of depth images (TUM RGB-D and others) or a bag of clouds; '
+        'repeatable',
+    )
+    result.add_argument(
+        '--frames', type=int, metavar='N', help='for paper: of each data set (default 10)'
+    )
+    result.add_argument(
+        '--models',
+        action='append',
+        type=setting,
+        default=[],
+        metavar='NAME=VALUE',
+        help='for paper: a setting of the models, such as min_density_radius=3; repeatable',
+    )
     return result
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """Return name and value of a setting of the models."""
+    name, _, value = text.partition('=')
+    if name not in {field.name for field in fields(ModelsConfig)} or not value:
+        raise argparse.ArgumentTypeError(f'{text!r}, expected NAME=VALUE of ModelsConfig')
+    return name, yaml.safe_load(value)
 
 
 def options(args: argparse.Namespace) -> Options:
     """Return the options that the arguments ask for."""
-    result = Options(peers=args.peers, cache=args.cache)
+    models = dict(args.models)
+    result = Options(peers=args.peers, cache=args.cache, data=tuple(args.data), models=models)
     result = result.quick() if args.quick else result
+    result = result if args.frames is None else replace(result, frames=args.frames)
     return result if args.scans is None else replace(result, scans=args.scans)
 
 
@@ -91,8 +125,9 @@ def rounded(row: Row) -> Row:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benches of the command line."""
     args = parser().parse_args(arguments)
-    if args.scans is not None and args.scans < 1:
-        parser().error(f'--scans: {args.scans}, expected one or more')
+    for name in ('scans', 'frames'):
+        if getattr(args, name) is not None and getattr(args, name) < 1:
+            parser().error(f'--{name}: {getattr(args, name)}, expected one or more')
     names = args.only or BENCHES
     keep_freed_memory()  # as node and replay do
     machine, chosen = facts(), options(args)

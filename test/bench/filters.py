@@ -16,8 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import json
-from pathlib import Path
-import tempfile
 from time import process_time
 from typing import Any
 
@@ -30,7 +28,7 @@ from surfel_mapper.scan import Scan
 from test.bench.machine import one_core
 from test.bench.options import Options
 from test.bench.peers import OPEN3D, PeerSpec, SMALL_GICP
-from test.bench.peers.run import environment, output, PeerError
+from test.bench.peers.run import PeerError, run_peer
 from test.bench.real import real_scans
 from test.bench.report import Row
 from test.bench.street import Street
@@ -118,7 +116,7 @@ def searches(name: str, points: Points, options: Options) -> Iterator[Row]:
     others: list[tuple[str, str, list[float]]] = []
     for spec in SEARCHES if options.peers else ():
         try:
-            found = json.loads(run_peer(spec, points, [','.join(NEIGHBOURS), '5'], options))
+            found = json.loads(run_peer(spec, points, [','.join(NEIGHBOURS), '5'], options.cache))
         except PeerError as error:
             yield {'scan': name, 'filter': spec.name, 'note': f'not measured: {error}'}
         else:
@@ -171,23 +169,5 @@ def peer(spec: PeerSpec, points: Points, options: Options) -> dict[str, Figures]
         If it cannot be had.
 
     """
-    said = run_peer(spec, points, [str(SIZE_M), str(CHAINS[VOXEL_GRID][1])], options)
+    said = run_peer(spec, points, [str(SIZE_M), str(CHAINS[VOXEL_GRID][1])], options.cache)
     return {who: (times, left) for who, (times, left) in json.loads(said).items()}
-
-
-def run_peer(spec: PeerSpec, points: Points, arguments: list[str], options: Options) -> str:
-    """
-    Return the last line that a peer prints, given the file of the points and arguments.
-
-    Raises
-    ------
-    PeerError
-        If it cannot be had.
-
-    """
-    python = environment(spec, options.cache)
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / 'points.npy'
-        np.save(path, np.ascontiguousarray(points))
-        command = [str(python), '-m', spec.module, str(path), *arguments]
-        return output(command, cwd=Path(__file__).parents[2]).splitlines()[-1]

@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 import os
 from pathlib import Path
+from typing import Any
 
 WARM_SCANS = 5
 """Number of scans mapped into a full window before timing starts; by then kernels are loaded."""
@@ -37,6 +39,12 @@ class Options:
         Whether other packages are installed and measured too.
     cache : Path
         Directory of files kept between runs.
+    data : tuple of Path
+        Data sets of users: folders of depth images, bags.
+    frames : int
+        Frames of each data set, at most.
+    models : mapping of str to value
+        Settings of the models.
 
     """
 
@@ -47,6 +55,9 @@ class Options:
     columns: int = 2048
     peers: bool = False
     cache: Path = field(default_factory=cache_directory)
+    data: tuple[Path, ...] = ()
+    frames: int = 10
+    models: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def num_points(self) -> int:
@@ -60,4 +71,4 @@ class Options:
 
     def quick(self) -> Options:
         """Return options for runs of some seconds, for use while working."""
-        return replace(self, scans=25, window=25)
+        return replace(self, scans=25, window=25, frames=2)

@@ -4,12 +4,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from surfel_mapper.bags.writer import BagWriter
+from surfel_mapper.messages.pointcloud2 import from_columns
 from test.bench import __main__ as bench
-from test.bench import real
+from test.bench import paper, real
 from test.bench.options import Options
+from test.models.scenes import sheet
+from test.offline.test_depth_folders import tum
 
 SCANS, WINDOW = 3, 4
 
@@ -47,6 +53,59 @@ def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_
     ]
     assert rows[0]['points'] == (np.isfinite(points).all(1) & points[:, :3].any(1)).sum()
     assert all(row['x_numpy'] > 0.0 and row['first_x'] > 0.0 for row in rows)
+
+
+def test_the_table_of_the_paper_has_rows_for_frames_of_the_user(options, monkeypatch, tmp_path):
+    monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
+    assert bench.run(['paper'], options) == []
+
+    tum(tmp_path / 'fr1_teddy')
+    wall = sheet(1.0, 1.0, 0.005, centre=(0.0, 0.0, 2.0)).astype(np.float32)
+    cloud = from_columns(dict(zip('xyz', wall.T, strict=True)))
+    with BagWriter(tmp_path / 'cow') as writer:
+        for stamp_ns in (1, 2, 3):
+            writer.write_cloud('/points', stamp_ns, stamp_ns, 'camera', cloud)
+    data = tmp_path / 'fr1_teddy', tmp_path / 'cow'
+    rows = bench.run(['paper'], replace(options, data=data, frames=2))
+
+    assert [(row['data'], row['voxel_m'], row['models']) for row in rows] == [
+        (name, size_m, models)
+        for name, size_m in (('fr1_teddy', 0.04), ('cow', 0.03))
+        for models in ('paper', 'default', 'gaussians')
+    ]
+    assert all(row['frames'] == 2 and row['bytes'] > 90 for row in rows)
+    for default, alone in (rows[1:3], rows[4:6]):
+        assert default['planes'] >= 1.0
+        assert (alone['planes'], alone['gain']) == (0.0, 1.0)
+        ratio = alone['precision_mm'] / default['precision_mm']
+        assert default['gain'] == pytest.approx(ratio, abs=1e-3)
+        assert ratio > 5.0
+    # the grid of the cloud is 5 mm: its points are at most 3.6 mm from any on the plane
+    assert rows[4]['precision_mm'] < 6.0
+
+
+def test_settings_of_the_models_apply_to_all_rows(options, monkeypatch, tmp_path, capsys):
+    monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
+    tum(tmp_path / 'fr1_teddy')
+    words = ['--data', str(tmp_path / 'fr1_teddy'), '--frames', '1']
+    strict = ['--models', 'min_density_radius=3', '--models', 'voxel_size_m=0.05']
+    chosen = bench.options(bench.parser().parse_args([*words, *strict]))
+    rows = bench.run(['paper'], chosen)
+    assert [row['voxel_m'] for row in rows] == [0.05] * 3
+    assert rows[0]['planes'] == 0.0  # by the paper, a full sheet has 2
+    for text in ('radius=3', 'min_points', 'min_points='):
+        with pytest.raises(SystemExit):
+            bench.parser().parse_args(['--models', text])
+    assert 'expected NAME=VALUE of ModelsConfig' in capsys.readouterr().err
+
+
+def test_a_rectangle_of_open3d_has_points_of_the_spacing_on_its_middle():
+    box = [[1.0, 2.0, 3.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.4, 0.2, 0.07]]
+    points = paper.rectangle(box, 0.1)
+    assert sorted(np.unique(points[:, 1])) == pytest.approx([1.85, 1.95, 2.05, 2.15])
+    assert sorted(np.unique(points[:, 2])) == pytest.approx([2.95, 3.05])
+    assert len(points) == 8
+    assert (points[:, 0] == 1.0).all()
 
 
 def test_every_bench_is_a_module_that_says_what_it_is():

@@ -58,6 +58,26 @@ def run_odometry(
         return times, np.load(poses)
 
 
+def run_peer(
+    spec: PeerSpec, points: npt.NDArray[Any], arguments: Sequence[str], cache: Path
+) -> str:
+    """
+    Return the last line that a peer prints, given the file of the points and arguments.
+
+    Raises
+    ------
+    PeerError
+        If it cannot be had.
+
+    """
+    python = environment(spec, cache)
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / 'points.npy'
+        np.save(path, np.ascontiguousarray(points))
+        command = [str(python), '-m', spec.module, str(path), *arguments]
+        return output(command, cwd=ROOT).splitlines()[-1]
+
+
 def environment(peer: PeerSpec, cache: Path) -> Path:
     """
     Return the python of the environment of a peer, made if it is not there yet.
