@@ -154,7 +154,7 @@ def read(
     origin_m: npt.NDArray[np.float64] = np.zeros(3)
     if args.cloud.is_dir() or (suffix in MAPS and not is_cloud(args.cloud)):
         surfel_map = SurfelMap.load(args.cloud)
-        surfels, origin_m = surfel_map.surfels(), surfel_map.origin_m
+        surfels, origin_m = surfel_map.surfels(covariance=True), surfel_map.origin_m
         points: npt.NDArray[Any] = surfel_points(surfels, surfel_map.voxel_size_m)
         voxel_size_m, viewpoint = 0.5 * surfel_map.voxel_size_m, above(surfels)
     else:

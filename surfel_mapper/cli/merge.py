@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         _log.warning('pyarrow is not installed: %s is written instead of tiles', output)
         make_directory(args.output)
         save_map(output, total)
-    surfels = total.surfels(args.min_points)
+    surfels = total.surfels(args.min_points, covariance=True)
     summary = {
         'maps': [str(path) for path in args.maps],
         'points': total.num_points,

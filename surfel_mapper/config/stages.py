@@ -341,6 +341,11 @@ class PublishConfig(Stage):
         'mirror the map.',
         live=True,
     )
+    covariance: bool = setting(
+        False,
+        'Add the covariance of the points to ~/normals and ~/changed, cov_xx to cov_zz, m^2.',
+        live=True,
+    )
     diagnostics_rate_hz: float = setting(
         1.0, 'Rate of /diagnostics, Hz; 0: never.', low=0.0, high=100.0
     )

@@ -26,6 +26,7 @@ from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import ConfigError, DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.point_columns import Columns, RGB
+from surfel_mapper.mapping.surfels import quality_columns
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
@@ -171,9 +172,9 @@ def write_surfels(
     """
     Write surfels as LAS 1.4, packed if the suffix is .laz, atomically.
 
-    Coordinates are multiples of 0.1 mm about a whole metre; normals, planarity, curvature and
-    num_points are extra columns, which CloudCompare and PDAL show by name. Intensity is rounded
-    to the 16 bits of the format.
+    Coordinates are multiples of 0.1 mm about a whole metre; normals, planarity, curvature,
+    num_points and the columns of QUALITY are extra columns, which CloudCompare and PDAL show by
+    name. Intensity is rounded to the 16 bits of the format.
 
     Parameters
     ----------
@@ -205,6 +206,7 @@ def write_surfels(
         'planarity': surfels.planarity.astype(np.float32),
         'curvature': surfels.curvature.astype(np.float32),
         'num_points': surfels.num_points.astype(np.uint32),
+        **quality_columns(surfels),
     }
     header.add_extra_dims([laspy.ExtraBytesParams(n, v.dtype) for n, v in extra.items()])
     las = laspy.LasData(header)

@@ -31,7 +31,7 @@ def save_surfel_map(path: Path, surfel_map: SurfelMap) -> str:
         raise FileFormatError(f'{path}: expected a file ending in {", ".join(EXACT + SURFELS)}')
     writers = {'.ply': ply.write_surfels, '.pcd': pcd.write_surfels}
     write = writers.get(suffix, las.write_surfels)
-    write(path, surfel_map.surfels(), surfel_map.origin_m)
+    write(path, surfel_map.surfels(covariance=True), surfel_map.origin_m)
     return surfel_map.digest()
 
 

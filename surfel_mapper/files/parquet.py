@@ -30,7 +30,12 @@ from surfel_mapper.files.map_state import checked_moments, NO_ORIGIN
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import check_possible, digest_of, pack_keys, ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import COVARIANCE, QUALITY
+from surfel_mapper.mapping.surfels import (
+    COVARIANCE,
+    covariance_columns,
+    QUALITY,
+    quality_columns,
+)
 from surfel_mapper.threads import share, usable_cores
 
 KIND, VERSION = 'surfel_mapper surfels', 1
@@ -309,8 +314,8 @@ def derived_columns(surfel_map: SurfelMap) -> Columns:
         **named(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32)),
         'planarity': surfels.planarity.astype(np.float32),
         'curvature': surfels.curvature.astype(np.float32),
-        **{name: getattr(surfels, name).astype(np.float32) for name in QUALITY if name != SCANS},
-        **{name: c.astype(np.float32) for name, c in surfels.covariance_columns().items()},
+        **quality_columns(surfels),
+        **covariance_columns(surfels),
     }
 
 

@@ -4,7 +4,8 @@
 Surfels and points as PLY, for CloudCompare and MeshLab.
 
 Files are binary and little endian, one vertex per surfel: x y z nx ny nz planarity curvature
-num_points. Numbers are float32, exact to 1e-5 deg for normals, and uint32 for counts. Beyond 8 km
+num_points thickness normal_sigma radius num_scans size, channels and cov_xx to cov_zz. Numbers
+are float32, exact to 1e-5 deg for normals, and uint32 for counts. Beyond 8 km
 from the origin positions are doubles: float32 rounds by 0.25 m at the northings of UTM, where the
 map still resolves 8 micrometres; programs that draw in float32 shift such coordinates on import.
 
@@ -31,7 +32,7 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import check_names, replace_file
 from surfel_mapper.files.point_columns import Columns, RGB
 from surfel_mapper.files.text_table import read_table
-from surfel_mapper.mapping.surfels import file_positions
+from surfel_mapper.mapping.surfels import covariance_columns, file_positions, quality_columns
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
@@ -94,7 +95,9 @@ def write_surfels(
         'planarity': surfels.planarity.astype(np.float32),
         'curvature': surfels.curvature.astype(np.float32),
         'num_points': surfels.num_points.astype(np.uint32),
+        **quality_columns(surfels),
         **channel_columns(surfels),
+        **covariance_columns(surfels),
     }
     write_points(path, values)
 

@@ -142,7 +142,9 @@ class Surfels:
         -------
         Surfels
             float32 values as float64. The message has no eigenvalues: they are nan. Without
-            ``publish.moments`` it has no ``voxel_index`` either, which is -2^31 then.
+            ``publish.moments`` it has no ``voxel_index`` either, which is -2^31 then. It has
+            covariances with ``publish.covariance``. Of messages of earlier versions thickness,
+            normal_sigma, radius and size are nan, num_scans is 0.
 
         Raises
         ------
@@ -255,6 +257,9 @@ class Surfels:
 
     def _columns(self) -> dict[str, npt.NDArray[Any]]:
         """Return all columns, (K,) each, by name."""
+        covariance = {}
+        if self.covariance is not None:
+            covariance = dict(zip(COVARIANCE, self.covariance.T, strict=True))
         return {
             **dict(zip('xyz', self.position.T, strict=True)),
             **dict(zip(('normal_x', 'normal_y', 'normal_z'), self.normal.T, strict=True)),
@@ -264,15 +269,9 @@ class Surfels:
             'num_points': self.num_points,
             **dict(zip('ijk', self.voxel_index.T, strict=True)),
             **{name: getattr(self, name) for name in QUALITY},
-            **self.covariance_columns(),
+            **covariance,
             **self.channels,
         }
-
-    def covariance_columns(self) -> dict[str, npt.NDArray[np.float64]]:
-        """Return cov_xx, cov_xy, cov_xz, cov_yy, cov_yz, cov_zz, (K,) each; {} without them."""
-        if self.covariance is None:
-            return {}
-        return dict(zip(COVARIANCE, self.covariance.T, strict=True))
 
     def select(self, rows: Any) -> Surfels:
         """
@@ -381,7 +380,7 @@ def derive(
         from surfel_mapper.mapping.kernels.surfels import derive_surfels
 
         derive_surfels(*slabs, chosen, voxel_size_m, bits, (*arrays, covariances))
-    size = np.full(num, voxel_size_m)
+    size = np.broadcast_to(voxel_size_m, num)  # of eight bytes
     return Surfels(*arrays, size=size, covariance=covariances if covariance else None)
 
 
@@ -399,9 +398,10 @@ def quality(
 
 def surfel_columns(surfels: Surfels) -> Columns:
     """
-    Return the columns of ~/normals and ~/changed: float32, and uint32 for num_points.
+    Return the columns of ~/normals and ~/changed: float32, and uint32 for counts.
 
-    If the map sums them, also the mean intensity, and the mean colour packed as RViz draws it.
+    If the map sums them, also the mean intensity, and the mean colour packed as RViz draws it;
+    last the covariance, if the surfels have it.
     """
     values = {
         **dict(zip('xyz', surfels.position.T, strict=True)),
@@ -413,12 +413,29 @@ def surfel_columns(surfels: Surfels) -> Columns:
     for name, column in values.items():
         columns[name] = column.astype(np.float32)
     columns['num_points'] = surfels.num_points.astype(np.uint32)
+    columns |= quality_columns(surfels)
     if 'intensity' in surfels.channels:
         columns['intensity'] = surfels.channels['intensity'].astype(np.float32)
     if 'red' in surfels.channels:
         channels = (surfels.channels[name] for name in ('red', 'green', 'blue'))
         columns['rgb'] = packed_rgb(*channels)
-    return columns
+    return columns | covariance_columns(surfels)
+
+
+def quality_columns(surfels: Surfels) -> Columns:
+    """Return the columns of QUALITY for messages and files: float32, and uint32 for num_scans."""
+    values = {name: getattr(surfels, name) for name in QUALITY}
+    return {
+        name: column.astype(np.uint32 if name == 'num_scans' else np.float32)
+        for name, column in values.items()
+    }
+
+
+def covariance_columns(surfels: Surfels) -> Columns:
+    """Return cov_xx, cov_xy, ... cov_zz for messages and files, float32; {} without them."""
+    if surfels.covariance is None:
+        return {}
+    return dict(zip(COVARIANCE, surfels.covariance.T.astype(np.float32), strict=True))
 
 
 def packed_rgb(

@@ -4,8 +4,8 @@
 Exact moments as fields of a cloud, and MapMirror: a client's exact copy of the map of a node.
 
 A PointField has no 64-bit integer. So each integer is a field of two uint32, the low half
-first: its bytes in little-endian order. The number of points is ``num_points``, the voxel three
-int32; the sums of the map's channels follow under their names.
+first: its bytes in little-endian order. The numbers of points and scans are ``num_points`` and
+``num_scans``, the voxel three int32; the sums of the map's channels follow under their names.
 
 ``~/changed`` holds the present moments of all voxels that a scan changed, not the difference, so a
 message applied twice, or after a newer full map, does no harm. ``~/normals`` regularly holds the
@@ -27,7 +27,7 @@ from surfel_mapper.errors import CloudFormatError, MapError
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import check_possible, pack_keys, ScanMoments, within_reach
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import surfel_columns, Surfels
+from surfel_mapper.mapping.surfels import COVARIANCE, surfel_columns, Surfels
 from surfel_mapper.messages.pointcloud2 import (
     append_fields,
     CloudBytes,
@@ -120,6 +120,7 @@ def surfels_in(msg: Any) -> Surfels:
         radius=columns.get('radius', nan).astype(np.float64),
         num_scans=columns.get('num_scans', np.zeros(len(count))).astype(np.int64),
         size=columns.get('size', nan).astype(np.float64),
+        covariance=stacked(COVARIANCE) if columns.keys() >= {*COVARIANCE} else None,
         channels=means_in(columns),
     )
 
@@ -178,6 +179,7 @@ def moments_in(columns: Columns, voxel_size_m: float, channels: tuple[str, ...])
         view=np.ascontiguousarray(view),
         channel_names=channels,
         channels=np.ascontiguousarray(channel_sums),
+        num_scans=columns['num_scans'].astype(np.int64) if 'num_scans' in columns else None,
     )
 
 

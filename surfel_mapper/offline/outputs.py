@@ -424,7 +424,7 @@ def write_map(path: Path, name: str, mapper: Mapper, *, window: bool = False) ->
     from surfel_mapper.files import parquet, pcd, ply
     from surfel_mapper.pipeline.saved_state import save_mapper
 
-    surfels = mapper.map.surfels(mapper.config.map.min_points)
+    surfels = mapper.map.surfels(mapper.config.map.min_points, covariance=True)
     if name == 'ply':
         ply.write_surfels(path, surfels, mapper.map.origin_m)
     elif name == 'pcd':

@@ -28,6 +28,7 @@ from visualization_msgs.msg import MarkerArray
 from surfel_mapper.config import Config
 from surfel_mapper.filters.columns import as_fields
 from surfel_mapper.mapping.ages import Ages
+from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import surfel_columns, Surfels
 from surfel_mapper.messages.map_cloud import moment_cloud, voxel_columns
 from surfel_mapper.messages.markers import marker_array
@@ -244,6 +245,9 @@ class Outputs:
         self, surfels: Surfels, removed: npt.NDArray[np.int32] = NO_VOXELS
     ) -> PointCloud2:
         """Return surfels as a cloud; with ``publish.moments`` also moments and removed voxels."""
+        if self._mapper.config.publish.covariance:
+            rows = self._mapper.map.find(pack_keys(surfels.voxel_index))
+            surfels = self._mapper.map.surfels_of(rows, covariance=True)
         if self._mapper.config.publish.moments:
             moments = self._mapper.map.moments(surfels.voxel_index)
             content = moment_cloud(surfels, moments, removed)

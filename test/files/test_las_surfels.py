@@ -39,7 +39,9 @@ def test_surfels_come_back_with_their_normals_and_channels(tmp_path, suffix):
     np.testing.assert_allclose(places, surfels.position + UTM, rtol=0, atol=0.6e-4)
     normal = np.stack([found['nx'], found['ny'], found['nz']], axis=1)
     np.testing.assert_array_equal(normal, surfels.normal.astype(np.float32))
-    np.testing.assert_array_equal(found['num_points'], surfels.num_points)
+    for name in ('num_points', 'num_scans', 'thickness', 'normal_sigma', 'radius', 'size'):
+        expected = getattr(surfels, name).astype(found[name].dtype)
+        np.testing.assert_array_equal(found[name], expected)
     np.testing.assert_allclose(found.intensity, surfels.channels['intensity'], atol=0.5)
     np.testing.assert_allclose(found.red / 257.0, surfels.channels['red'], atol=0.01)
 

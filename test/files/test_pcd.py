@@ -14,6 +14,7 @@ from surfel_mapper.files.pcd import (
     write_points,
     write_surfels,
 )
+from surfel_mapper.mapping.surfels import QUALITY
 
 
 @pytest.fixture(scope='module')
@@ -46,9 +47,13 @@ def test_surfels_are_read_back_equal_by_pypcd4(pypcd4, tmp_path):
         'curvature',
         'planarity',
         'num_points',
+        *QUALITY,
         'intensity',
         'rgb',
     )
+    for name in QUALITY:
+        expected = getattr(surfels, name).astype(cloud.pc_data[name].dtype)
+        np.testing.assert_array_equal(cloud.pc_data[name], expected)
     for axis, name in enumerate('xyz'):
         np.testing.assert_array_equal(cloud.pc_data[name], surfels.position[:, axis].astype('f4'))
         normal = surfels.normal[:, axis].astype('f4')

@@ -16,7 +16,9 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 from test.messages.examples import make_surfels
 
-NAMES = ['x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity', 'curvature', 'num_points']
+QUALITY = ('thickness', 'normal_sigma', 'radius', 'num_scans', 'size')
+COVARIANCE = ('cov_xx', 'cov_xy', 'cov_xz', 'cov_yy', 'cov_yz', 'cov_zz')
+NAMES = [*'xyz', 'nx', 'ny', 'nz', 'planarity', 'curvature', 'num_points', *QUALITY, *COVARIANCE]
 
 
 def assert_equals_surfels(columns, surfels):
@@ -24,9 +26,12 @@ def assert_equals_surfels(columns, surfels):
     np.testing.assert_array_equal(places, surfels.position.astype(places.dtype))
     normal = np.stack([columns[n] for n in ('nx', 'ny', 'nz')], 1)
     np.testing.assert_array_equal(normal, surfels.normal.astype(np.float32))
-    for name in ('planarity', 'curvature'):
+    for name in ('planarity', 'curvature', 'thickness', 'normal_sigma', 'radius', 'size'):
         np.testing.assert_array_equal(columns[name], getattr(surfels, name).astype(np.float32))
-    np.testing.assert_array_equal(columns['num_points'], surfels.num_points)
+    for name in ('num_points', 'num_scans'):
+        np.testing.assert_array_equal(columns[name], getattr(surfels, name))
+    for name, values in zip(COVARIANCE, surfels.covariance.T, strict=True):
+        np.testing.assert_array_equal(columns[name], values.astype(np.float32))
 
 
 def test_a_file_is_a_text_header_and_a_little_endian_table(tmp_path):
@@ -37,15 +42,21 @@ def test_a_file_is_a_text_header_and_a_little_endian_table(tmp_path):
         b'element vertex 1\nproperty float x\nproperty float y\nproperty float z\n'
         b'property float nx\nproperty float ny\nproperty float nz\n'
         b'property float planarity\nproperty float curvature\nproperty uint num_points\n'
+        b'property float thickness\nproperty float normal_sigma\nproperty float radius\n'
+        b'property uint num_scans\nproperty float size\n'
+        b'property float cov_xx\nproperty float cov_xy\nproperty float cov_xz\n'
+        b'property float cov_yy\nproperty float cov_yz\nproperty float cov_zz\n'
         b'end_header\n'
     )
     row = struct.pack(
-        '<8fI',
+        '<8fI3fI7f',
         *surfels.position[0],
         *surfels.normal[0],
         surfels.planarity[0],
         surfels.curvature[0],
         surfels.num_points[0],
+        *(getattr(surfels, name)[0] for name in QUALITY),
+        *surfels.covariance[0],
     )
     assert (tmp_path / 'map.ply').read_bytes() == header + row
 

@@ -25,4 +25,5 @@ def make_surfels(number, centre=(0.0, 0.0, 0.0)):
         radius=rng.uniform(0.0, 0.5, number),
         num_scans=rng.integers(1, num_points, endpoint=True),
         size=np.full(number, 0.5),
+        covariance=rng.uniform(-0.02, 0.02, (number, 6)),
     )

@@ -19,6 +19,8 @@ from surfel_mapper.messages.pointcloud2 import from_columns
 PAGE = Path(__file__).parents[2] / 'docs' / 'subscribing.md'
 TYPES = {7: 'float32', 6: 'uint32'}
 
+FLOATS = ('thickness', 'normal_sigma', 'radius', 'size')
+
 
 def message(cloud):
     """Return a cloud as a message of a library without ROS."""
@@ -42,11 +44,13 @@ def test_surfels_of_a_message_are_those_of_the_map_rounded_to_float32():
 
     found = Surfels.from_message(message(from_columns(surfel_columns(surfels))))
 
-    for name in ('position', 'normal', 'planarity', 'curvature'):
+    for name in ('position', 'normal', 'planarity', 'curvature', *FLOATS):
         expected = getattr(surfels, name).astype(np.float32)
         np.testing.assert_array_equal(getattr(found, name), expected)
         assert getattr(found, name).dtype == np.float64
     np.testing.assert_array_equal(found.num_points, surfels.num_points)
+    np.testing.assert_array_equal(found.num_scans, surfels.num_scans)
+    assert found.covariance is None
     np.testing.assert_allclose(
         found.channels['intensity'], surfels.channels['intensity'], rtol=1e-7
     )
@@ -66,6 +70,33 @@ def test_a_message_with_moments_has_the_voxels_and_leaves_out_empty_ones():
     assert len(found) == len(surfels)
     expected = {tuple(row) for row in surfels.voxel_index.tolist()}
     assert {tuple(row) for row in found.voxel_index.tolist()} == expected
+
+
+@pytest.mark.parametrize('has_moments', [False, True])
+def test_covariances_come_with_a_message_that_has_them(has_moments):
+    surfel_map = some_map()
+    surfels = surfel_map.surfels(covariance=True)
+    surfels = surfels.select(np.lexsort(surfels.voxel_index.T[::-1]))
+    cloud = from_columns(surfel_columns(surfels))
+    if has_moments:
+        cloud = moment_cloud(surfels, surfel_map.moments(), np.array([[9, 9, 9]], np.int32))
+
+    found = Surfels.from_message(message(cloud))
+
+    np.testing.assert_array_equal(found.covariance, surfels.covariance.astype(np.float32))
+
+
+def test_a_message_of_an_earlier_version_has_no_quality():
+    surfels = some_map().surfels()
+    columns = surfel_columns(surfels)
+    for name in (*FLOATS, 'num_scans'):
+        del columns[name]
+
+    found = Surfels.from_message(message(from_columns(columns)))
+
+    assert np.isnan([getattr(found, name) for name in FLOATS]).all()
+    assert not found.num_scans.any()
+    np.testing.assert_array_equal(found.num_points, surfels.num_points)
 
 
 def test_an_empty_map_gives_no_surfels():

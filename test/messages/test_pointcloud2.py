@@ -23,7 +23,7 @@ import pytest
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import surfel_columns
+from surfel_mapper.mapping.surfels import QUALITY, surfel_columns
 from surfel_mapper.messages.pointcloud2 import (
     append_fields,
     Field,
@@ -322,21 +322,23 @@ def test_columns_of_different_lengths_are_refused(columns):
         from_columns(columns)
 
 
-def test_surfels_become_the_nine_columns_of_normals():
-    surfels = make_surfels(2)
+def test_surfels_become_the_columns_of_normals():
+    surfels = replace(make_surfels(2), covariance=None)
     cloud = from_columns(surfel_columns(surfels))
     assert ' '.join(f.name for f in cloud.fields) == (
-        'x y z normal_x normal_y normal_z curvature planarity num_points'
+        'x y z normal_x normal_y normal_z curvature planarity num_points '
+        'thickness normal_sigma radius num_scans size'
     )
-    assert [f.datatype for f in cloud.fields] == [7] * 8 + [6]
+    assert [f.datatype for f in cloud.fields] == [7] * 8 + [6, 7, 7, 7, 6, 7]
     assert cloud.data.tobytes() == b''.join(
         struct.pack(
-            '<8fI',
+            '<8fI3fIf',
             *surfels.position[i],
             *surfels.normal[i],
             surfels.curvature[i],
             surfels.planarity[i],
             surfels.num_points[i],
+            *(getattr(surfels, name)[i] for name in QUALITY),
         )
         for i in range(2)
     )

@@ -87,6 +87,8 @@ class Node:
 
 def assert_equal(mirror, node):
     assert mirror.map.digest() == node.mapper.map.digest()
+    num_scans = [m.moments().num_scans for m in (mirror.map, node.mapper.map)]
+    np.testing.assert_array_equal(*num_scans)
 
 
 @pytest.mark.parametrize('channels', [(), ('intensity',), ('rgb',), ('intensity', 'rgb')])

@@ -13,7 +13,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2
 
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import surfel_columns
+from surfel_mapper.mapping.surfels import QUALITY, surfel_columns
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.ros.messages import cloud_message, time_message
 from test.ros.live import room
@@ -37,6 +37,7 @@ def test_surfels_survive_serialization():
         'curvature': surfels.curvature,
         'planarity': surfels.planarity,
         'num_points': surfels.num_points,
+        **{name: getattr(surfels, name) for name in QUALITY},
     }
     assert list(scan.columns) == list(expected)
     for name, values in expected.items():

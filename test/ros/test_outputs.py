@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
-from surfel_mapper import MapMirror
+from surfel_mapper import MapMirror, Surfels
 from surfel_mapper.filters import Chain
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.scan_normals import ADDED
@@ -168,8 +168,8 @@ def holds_all(received, surfels):
     )
 
 
-def test_surfels_have_mean_intensity_if_configured(start, peer):
-    start_node(start, peer, **{'map.intensity': 'true'})
+def test_surfels_have_mean_intensity_and_covariance_if_configured(start, peer):
+    start_node(start, peer, **{'map.intensity': 'true', 'publish.covariance': 'true'})
     normals = peer.collect(PointCloud2, f'{BASE}/normals', LATCHED)
     send(peer, [(with_intensity(points), pose) for points, pose in drive(1)])
     peer.spin_until(lambda: normals and normals[-1].width)
@@ -177,6 +177,11 @@ def test_surfels_have_mean_intensity_if_configured(start, peer):
     assert 'intensity' in scan.columns
     # the intensity of a point is its y, and the sensor is not turned
     np.testing.assert_allclose(scan.columns['intensity'], scan.points[:, 1], atol=0.01)
+    surfels = Surfels.from_message(normals[-1])
+    xx, xy, xz, yy, yz, zz = surfels.covariance.T
+    flat = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+    radius = np.sqrt(2.0 * np.linalg.eigvalsh(flat)[:, 1:].sum(axis=1))
+    np.testing.assert_allclose(radius, surfels.radius, rtol=1e-3, atol=1e-4)
 
 
 def test_filtered_is_the_scan_after_the_chain_with_the_columns_added(start, peer, tmp_path):

@@ -79,7 +79,7 @@ def derive_surfels(rows, stamps, chosen, voxel_size, bits, outputs):
     """
     keys, moments = np.empty(CHUNK, np.int64), np.empty((MOMENTS, CHUNK))
     mean, scatter = np.empty((3, CHUNK)), np.empty((6, CHUNK))
-    values, normals, shape = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((5, CHUNK))
+    values, normals, shape = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((2, CHUNK))
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     unit = voxel_size / (1 << bits)
     vectors = outputs[0].ravel(), outputs[1].ravel(), outputs[4].ravel()
@@ -106,9 +106,11 @@ def derive_surfels(rows, stamps, chosen, voxel_size, bits, outputs):
             shape[0, i], shape[1, i] = 2.0 * (e1 - e0) * inverse, e0 * inverse
             scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
             values[0, i], values[1, i], values[2, i] = e0 * scale, e1 * scale, e2 * scale
-        for i in range(num):
+        thickness, normal_sigma, radius = outputs[7], outputs[8], outputs[9]
+        for i in range(U(num)):
             quality = quality_of(values[0, i], values[1, i], values[2, i], moments[N, i])
-            shape[2, i], shape[3, i], shape[4, i] = quality
+            row = U(start) + i
+            thickness[row], normal_sigma[row], radius[row] = quality
         for i in range(num):
             nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
             side = side_of(nx, ny, nz, moments[V, i], moments[V + 1, i], moments[V + 2, i])
@@ -134,8 +136,9 @@ def quality_of(e0, e1, e2, n):
     variance = e0 * (n - 1.0) / freedom if freedom > 0.0 else math.nan
     noise_sq = variance if variance > NOISE_SQ else NOISE_SQ
     first, second = e1 - noise_sq, e2 - noise_sq
-    spread = e1 / (first * first) + e2 / (second * second)
-    sigma = math.sqrt(noise_sq * spread / (n - 1.0))
+    first_sq, second_sq = first * first, second * second
+    spread = noise_sq * (e1 * second_sq + e2 * first_sq)
+    sigma = math.sqrt(spread / ((n - 1.0) * (first_sq * second_sq)))
     sigma = sigma if (first > 0.0) & (sigma < RIGHT_ANGLE) else RIGHT_ANGLE
     sigma = sigma if (freedom > 0.0) & (e2 > 0.0) else math.nan
     return math.sqrt(variance), sigma, math.sqrt(2.0 * (e1 + e2))
@@ -207,10 +210,9 @@ def write_surfels(
 
     mean             (3, CHUNK) float64, lattice units about the centre of the voxel
     normals, values  (3, CHUNK) float64, as in the outputs
-    shape            (5, CHUNK) float64, planarity, curvature, thickness, normal_sigma, radius
+    shape            (2, CHUNK) float64, planarity and curvature
     """
     position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs[:7]
-    thickness, normal_sigma, radius = outputs[7:10]
     cell = 1.0 / (1 << bits)
     half = (1 << (bits - 1)) + 0.5  # a lattice coordinate stands for the middle of its cell
     first = U(start)
@@ -220,7 +222,6 @@ def write_surfels(
         num_points[row] = np.int64(moments[N, i])
         voxel_index[row, 0], voxel_index[row, 1], voxel_index[row, 2] = x, y, z
         planarity[row], curvature[row] = shape[0, i], shape[1, i]
-        thickness[row], normal_sigma[row], radius[row] = shape[2, i], shape[3, i], shape[4, i]
         normal[row, 0], normal[row, 1], normal[row, 2] = (
             normals[0, i],
             normals[1, i],
