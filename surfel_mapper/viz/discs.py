@@ -18,25 +18,38 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.surfels import QUALITY, Surfels
 
 Array = npt.NDArray[np.float64]
 
-COLOURINGS = ('normal', 'height', 'planarity', 'intensity', 'rgb', 'age', 'label')
+COLUMNS = ('planarity', 'curvature', 'num_points', *QUALITY)
+"""Columns of Surfels that discs have as values."""
+
+COLOURINGS = ('normal', 'height', *COLUMNS, 'intensity', 'rgb', 'age', 'label')
 """Colours of discs: shaded by normal and light, or of a value."""
 
 RGB = ('red', 'green', 'blue')
 
+UNITS = {
+    'height': 'm',
+    'age': 's',
+    'thickness': 'm',
+    'normal_sigma': 'rad',
+    'radius': 'm',
+    'size': 'm',
+}
+"""Units of values; those of the others are none or unknown."""
+
 LIGHT = np.array([-0.40, -0.55, 0.73])
 """Direction to the light, about of unit length: from above, the south and the west."""
 
-AMBIENT, TINT = 0.30, 0.45
+AMBIENT, TINT = 0.45, 0.45
 """Share of the light that comes from all sides, and of the colour that depends on the normal."""
 
-SPREAD = 1.45
+SPREAD = 1.25
 """
-Diameter of a disc relative to the side of the square with the same variance: just enough that the
-discs of neighbouring voxels full of points leave no gaps.
+Radius of a drawn disc relative to ``Surfels.radius``: just enough that the discs of neighbouring
+voxels full of points leave no gaps.
 """
 
 BEYOND = 1.0
@@ -92,16 +105,14 @@ class DrawnDiscs:
         """Return the discs of surfels that have a normal, with further values (K,) of each."""
         is_known = np.isfinite(surfels.planarity)
         all_values = {
-            'planarity': surfels.planarity,
-            'curvature': surfels.curvature,
-            'num_points': surfels.num_points,
+            **{name: getattr(surfels, name) for name in COLUMNS},
             **surfels.channels,
             **(values or {}),
         }
         return cls(
             surfels.position[is_known],
             surfels.normal[is_known],
-            0.5 * SPREAD * sides_m(surfels)[is_known],
+            SPREAD * surfels.radius[is_known],
             {name: value[is_known] for name, value in all_values.items()},
         )
 
@@ -177,6 +188,11 @@ class Colouring:
         low, high = np.percentile(values, [BEYOND, 100.0 - BEYOND])
         return cls(kind, float(low), float(max(high, low + 1e-9)))
 
+    @property
+    def has_scale(self) -> bool:
+        """Whether the colours are those of a scale of values."""
+        return self.kind not in ('normal', 'rgb', 'label')
+
     def of(self, discs: DrawnDiscs) -> npt.NDArray[np.uint8]:
         """Return the colours of discs, (K, 3)."""
         if self.kind == 'normal':
@@ -190,6 +206,12 @@ class Colouring:
             return np.asarray(PALETTE[label % len(PALETTE)], np.uint8)
         values = (value_of(discs, self.kind) - self.low) / (self.high - self.low)
         return as_bytes(ramp(values))
+
+
+def label_of(kind: str) -> str:
+    """Return the name of a value with its unit."""
+    name = kind.replace('_', ' ')
+    return f'{name} ({UNITS[kind]})' if kind in UNITS else name
 
 
 def has_value(discs: DrawnDiscs, kind: str) -> bool:
@@ -206,7 +228,7 @@ def shaded(normal: Array) -> Array:
     """Return the colours (K, 3), 0 to 1, of surfaces with these normals in the light."""
     base = (1.0 - TINT) * 0.88 + TINT * (0.5 + 0.5 * normal)
     lit = 0.5 + 0.5 * normal @ LIGHT  # also surfels that face away are not black
-    return np.asarray(np.clip(base * (AMBIENT + (1.0 - AMBIENT) * lit)[:, None], 0.0, 1.0))
+    return np.asarray(np.clip(base * (AMBIENT + (1.0 - AMBIENT) * lit)[..., None], 0.0, 1.0))
 
 
 def ramp(values: Array) -> Array:
@@ -220,10 +242,3 @@ def ramp(values: Array) -> Array:
 def as_bytes(colours: Array) -> npt.NDArray[np.uint8]:
     """Return colours in 0 to 1 as bytes."""
     return np.rint(255.0 * np.clip(colours, 0.0, 1.0)).astype(np.uint8)
-
-
-def sides_m(surfels: Surfels) -> Array:
-    """Return the side of the square with the variance of each surfel in its plane, (K,) m."""
-    # along either side of a square the variance is a twelfth of the side squared
-    sides: Array = np.sqrt(6.0 * surfels.eigenvalues[:, 1:].sum(axis=1))
-    return sides

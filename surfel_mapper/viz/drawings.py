@@ -4,7 +4,7 @@
 The drawings of layers: meshes for the page of a report, a picture of points, a section of HTML.
 
 Layers describe shapes and tables as arrays (layers/drawings.py); only this folder draws them. A
-picture is seen without perspective and painted from far to near.
+picture is seen without perspective.
 """
 
 from __future__ import annotations
@@ -28,11 +28,16 @@ from surfel_mapper.layers.drawings import (
 from surfel_mapper.models.shapes import CORNERS, FACES
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 from surfel_mapper.viz.charts import as_html
+from surfel_mapper.viz.discs import as_bytes, DrawnDiscs
 from surfel_mapper.viz.mesh import MAX_TRIANGLES
+from surfel_mapper.viz.rendering import fitted, rendered
 
 Array = npt.NDArray[np.float64]
 
-HEIGHT_INCH, PANEL_INCH, DPI = 6.0, 6.5, 120
+HEIGHT_INCH, PANEL_INCH, TITLE_INCH, DPI = 6.0, 6.5, 0.4, 120
+
+POINT_PX = 1.2
+"""Radius of a point."""
 
 
 def draw_points(path: str | Path, picture: PointsPicture) -> None:
@@ -55,19 +60,26 @@ def draw_points(path: str | Path, picture: PointsPicture) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    num = len(picture.panels)
     R = view_axes(picture.panels[0].points, picture.viewpoint)
-    figure = Figure(figsize=(PANEL_INCH * num, HEIGHT_INCH), dpi=DPI, layout='constrained')
+    at = np.concatenate([panel.points @ R[:2].T for panel in picture.panels])
+    low, high = (at.min(axis=0), at.max(axis=0)) if len(at) else (-np.ones(2), np.ones(2))
+    panel_px = round(PANEL_INCH * DPI), round((HEIGHT_INCH - TITLE_INCH) * DPI)
+    camera = fitted(R, low, np.maximum(high, low + 1e-3), *panel_px)
+    radius_m = POINT_PX / camera.px_per_m
+    size = PANEL_INCH * len(picture.panels), HEIGHT_INCH
+    figure = Figure(figsize=size, dpi=DPI)
     FigureCanvasAgg(figure)
-    axes = figure.subplots(1, num, sharex=True, sharey=True, squeeze=False)[0]
-    for ax, panel in zip(axes, picture.panels, strict=True):
-        depth = panel.points @ R[2]
-        colors = depth_colors(depth) if panel.colors is None else panel.colors
-        order = np.argsort(-depth)
-        projected = panel.points[order] @ R[:2].T
-        ax.scatter(projected[:, 0], projected[:, 1], s=1.5, c=colors[order], linewidths=0)
+    for number, panel in enumerate(picture.panels):
+        colors = panel.colors
+        if colors is None:
+            colors = depth_colors(-panel.points @ R[2])
+        normal = np.broadcast_to(R[2], panel.points.shape)
+        discs = DrawnDiscs(panel.points, normal, np.full(len(panel.points), radius_m))
+        image, _ = rendered(camera, discs, as_bytes(colors[:, :3]))
+        across = 1.0 / len(picture.panels)
+        ax = figure.add_axes((number * across, 0.0, across, 1.0 - TITLE_INCH / HEIGHT_INCH))
+        ax.imshow(image, interpolation='nearest', aspect='auto')
         ax.set_title(panel.title)
-        ax.set_aspect('equal')
         ax.set_axis_off()
     with replace_file(path) as file:
         figure.savefig(file, format='png')
@@ -141,7 +153,7 @@ def depth_colors(depth: Array) -> Array:
 
 def view_axes(cloud: Array, viewpoint: Array) -> Array:
     """
-    Return the axes (3, 3) of a picture as rows: to the right, up, away from the viewer.
+    Return the axes (3, 3) of a picture as rows: to the right, up, towards the viewer.
 
     Up is z, as of a map; for a camera that looks along z it is -y.
     """
@@ -151,7 +163,7 @@ def view_axes(cloud: Array, viewpoint: Array) -> Array:
     up = np.array([0.0, -1.0, 0.0]) if abs(ahead[2]) > 0.8 else np.array([0.0, 0.0, 1.0])
     right = np.cross(ahead, up)
     right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(right, ahead), ahead])
+    return np.stack([right, np.cross(right, ahead), -ahead])
 
 
 def section_html(section: Section, picture: str | Path | None = None) -> str:

@@ -21,9 +21,8 @@ import numpy.typing as npt
 
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.discs import sides_m, SPREAD
+from surfel_mapper.viz.discs import SPREAD
 from surfel_mapper.viz.mesh import MAX_TRIANGLES, mesh_data
-from surfel_mapper.viz.picture import limits
 
 Array = npt.NDArray[np.float64]
 
@@ -117,8 +116,10 @@ def small_png(picture: str | Path) -> bytes:
 
 def within_sight(surfels: Surfels) -> Surfels:
     """Return the surfels without outliers so far away that all others would be tiny."""
-    low, high = limits(surfels)
-    spare = 0.5 * (high - low)
+    if not len(surfels):
+        return surfels
+    low, high = np.percentile(surfels.position, [0.5, 99.5], axis=0)
+    spare = 0.6 * (high - low) + 1.0
     inside = (surfels.position >= low - spare) & (surfels.position <= high + spare)
     return surfels.select(np.asarray(inside.all(axis=1)))
 
@@ -139,7 +140,7 @@ def view_data(
         xyz = np.concatenate(positions)
         low, high = xyz.min(axis=0), xyz.max(axis=0)
     size = np.maximum(high - low, 1e-3)
-    radius = 0.5 * SPREAD * sides_m(surfels)
+    radius = SPREAD * surfels.radius
     largest = float(radius.max(initial=1e-3))
     decimals = max(2 - int(np.floor(np.log10(size[2]))), 0)
     packed = np.zeros(len(surfels), SURFEL)

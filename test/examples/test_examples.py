@@ -16,7 +16,6 @@ import os
 from pathlib import Path
 import re
 import runpy
-import shutil
 import subprocess
 import sys
 
@@ -200,20 +199,7 @@ def test_a_dask_run_comes_to_the_digest_of_a_single_process(street, tmp_path):
     assert f'digest {digest_of(street / "mapped")}' in printed
 
 
-@extras.needs('playwright')
-@pytest.mark.skipif(
-    not any(map(shutil.which, ('chromium', 'google-chrome'))), reason='needs Chromium'
-)
-def test_the_picture_of_a_street_has_road_and_walls_in_colours_of_their_own(tmp_path, run):
-    text = run('street_picture.py', 'street.png', '2', folder=tmp_path)
-    assert int(re.search(r': ([\d,]+) surfels', text)[1].replace(',', '')) > 1000
-    rgb = np.asarray(Image.open(tmp_path / 'street.png').convert('RGB'), np.int64)
-    red, green, blue = rgb.reshape(-1, 3).T
-    assert (blue > red + 30).sum() > 2000  # level
-    assert (red > green + 30).sum() > 500  # walls along the street
-
-
-@pytest.mark.parametrize('name', ['drive_animation', 'filter_picture', 'street_picture'])
+@pytest.mark.parametrize('name', ['drive_animation', 'filter_picture'])
 def test_examples_that_draw_explain_their_arguments(name, tmp_path, run):
     text = run(f'{name}.py', '--help', folder=tmp_path)
     assert text.startswith(f'usage: {name}.py [-h] path')

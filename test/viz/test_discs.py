@@ -9,7 +9,7 @@ import pytest
 
 from surfel_mapper import SurfelMap
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.viz.discs import Colouring, COLOURINGS, CORNERS, DrawnDiscs, PALETTE
+from surfel_mapper.viz.discs import Colouring, COLOURINGS, COLUMNS, CORNERS, DrawnDiscs, PALETTE
 
 VIRIDIS_ENDS = [[68, 1, 84], [253, 231, 37]]
 """First and last colour of the map, as matplotlib documents them (#440154, #fde725)."""
@@ -44,7 +44,7 @@ def test_surfels_without_a_normal_have_no_disc():
     found = DrawnDiscs.of(surfel_map.surfels(), {'age': np.array([1.0, 2.0])})
 
     assert len(found) == 1
-    assert set(found.values) == {'planarity', 'curvature', 'num_points', 'age'}
+    assert set(found.values) == {*COLUMNS, 'age'}
     assert found.values['num_points'].tolist() == [20]
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of a map shows what faces the viewer, to scale, shaded or by planarity."""
+"""map.png shows a map obliquely and from above, with a key, and states the surfels left out."""
 
 import dataclasses
 
@@ -8,9 +8,17 @@ import numpy as np
 from PIL import Image
 import pytest
 
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import ConfigError, FileFormatError
 from surfel_mapper.mapping.surfels import concatenated, Surfels
-from surfel_mapper.viz.picture import draw_map, Frame, limits, views, X, Y, Z
+from surfel_mapper.viz.discs import Colouring, DrawnDiscs, shaded
+from surfel_mapper.viz.picture import (
+    draw_map,
+    ground_lines,
+    left_out,
+    MapScene,
+    round_length,
+    square_m,
+)
 
 YELLOW, PURPLE = np.array([[0.993, 0.906, 0.144], [0.267, 0.005, 0.329]])
 """Both ends of viridis, the colours of planarity 1 and 0."""
@@ -32,7 +40,7 @@ def sheet(height_m, up, planarity, size_m=(20.0, 10.0), centre=(0.0, 0.0)):
         voxel_index=np.floor(position / 0.5).astype(np.int32),
         thickness=np.zeros(num),
         normal_sigma=np.full(num, 0.01),
-        radius=np.full(num, 0.25 / 3.0**0.5),
+        radius=np.full(num, 0.5 / 3.0**0.5),
         num_scans=np.ones(num, np.int64),
         size=np.full(num, 0.5),
     )
@@ -47,90 +55,148 @@ def num_pixels(image, colour):
     return int((np.abs(image - colour).max(axis=2) < 0.02).sum())
 
 
+def scene_of(*sheets, trajectory=None):
+    return MapScene.of(DrawnDiscs.of(concatenated(sheets)), trajectory)
+
+
 def test_a_ceiling_does_not_hide_the_floor(tmp_path):
     image = drawn(tmp_path, concatenated([sheet(0.0, 1.0, 1.0), sheet(5.0, -1.0, 0.0)]))
 
     assert num_pixels(image, YELLOW) > 10 * num_pixels(image, PURPLE)
 
 
-def test_planes_are_of_one_colour_whatever_their_planarity(tmp_path):
+def test_a_lamp_below_the_ceiling_is_cut_away_with_it():
+    lamp = sheet(4.95, 1.0, 1.0, size_m=(1.0, 1.0))
+    scene = scene_of(sheet(0.0, 1.0, 1.0), sheet(5.0, -1.0, 1.0), lamp)
+
+    assert scene.hidden == 800 + 4
+    assert scene.discs.position[:, 2].max() == 0.0
+    text = left_out(scene, scene.oblique(), scene.plan(800))
+    assert text.startswith('1,604 surfels; ')
+    assert 'ceiling is cut away at 4.9 m above the ground with 804' in text
+
+
+def test_level_ground_is_of_one_colour_whatever_its_planarity(tmp_path):
     sheets = sheet(0.0, 1.0, 1.0)
     stripes = np.arange(len(sheets)) % 2.0
     striped = dataclasses.replace(sheets, planarity=stripes)
 
     image = drawn(tmp_path, striped, colouring='normal')
     assert np.array_equal(image, drawn(tmp_path, sheets, colouring='normal'))
-    # white by 0.88, 45 % of the colour of the normal (0.5, 0.5, 1); light at 0.73 from above
-    expected = (0.55 * 0.88 + 0.45 * np.array([0.5, 0.5, 1.0])) * (0.3 + 0.7 * (0.5 + 0.5 * 0.73))
+    expected = np.rint(255.0 * shaded(np.array([0.0, 0.0, 1.0]))) / 255.0
     assert num_pixels(image, expected) > 100_000
     assert num_pixels(drawn(tmp_path, striped), expected) == 0
+
+
+def test_light_is_that_of_the_level_frame(tmp_path):
+    """The ground of a camera, y down, has the colour of ground."""
+    R = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    level = sheet(0.0, 1.0, 1.0)
+    camera = dataclasses.replace(level, position=level.position @ R.T, normal=level.normal @ R.T)
+    expected = np.rint(255.0 * shaded(np.array([0.0, 0.0, 1.0]))) / 255.0
+
+    assert num_pixels(drawn(tmp_path, camera, colouring='normal'), expected) > 100_000
 
 
 def test_a_roof_hides_the_ground(tmp_path):
     image = drawn(tmp_path, concatenated([sheet(0.0, 1.0, 1.0), sheet(5.0, 1.0, 0.0)]))
 
-    assert num_pixels(image, PURPLE) > 10 * num_pixels(image, YELLOW)
+    assert num_pixels(image, PURPLE) > 3 * num_pixels(image, YELLOW)
 
 
-def test_a_plane_has_no_gaps_and_its_true_proportions(tmp_path):
-    image = drawn(tmp_path, sheet(0.0, 1.0, 1.0))
-    yellow = np.abs(image - YELLOW).max(axis=2) < 0.02
-    yellow[:, int(0.9 * image.shape[1]) :] = False  # the colour bar
-    rows, columns = np.flatnonzero(yellow.sum(axis=1) > 100), np.flatnonzero(yellow.any(axis=0))
-    top = yellow[rows[0] : rows[-1] + 1]
-    top = top[: np.argmin(top.sum(axis=1) > 100)]  # without the sheet seen from the side
+def test_the_plan_has_the_longer_side_upwards_and_is_no_mirror_image():
+    for size_m in ((40.0, 10.0), (10.0, 40.0)):
+        scene = scene_of(sheet(0.0, 1.0, 1.0, size_m=size_m))
+        camera = scene.plan(800)
+        longer = np.eye(3)[int(size_m[1] > size_m[0])]
+        np.testing.assert_allclose(camera.R_view_map[1], longer, atol=1e-12)
+        assert np.linalg.det(camera.R_view_map) == pytest.approx(1.0)
+        assert camera.contains(scene.discs.position).all()
+        assert camera.height > 1.8 * camera.width
 
-    assert top[:, columns[0] : columns[-1] + 1].mean() > 0.95
-    assert np.ptp(columns) / len(top) == pytest.approx(2.0, rel=0.05)
+
+def test_the_plan_has_the_coordinates_of_the_fixed_frame(tmp_path):
+    """The same picture, of larger numbers, far from zero."""
+    floor = sheet(0.0, 1.0, 1.0)
+    near, far = (
+        drawn(tmp_path, floor, origin_m=origin) for origin in (np.zeros(3), [5e5, 5.4e6, 300.0])
+    )
+    assert far.shape[1] > near.shape[1]  # room for seven digits
+    oblique = slice(None), slice(0, 1200)
+    np.testing.assert_array_equal(near[oblique][:500], far[oblique][:500])
 
 
-def test_a_few_far_surfels_do_not_shrink_the_rest(tmp_path):
+def test_most_of_a_picture_is_the_map_although_a_few_surfels_are_far(tmp_path):
     near = sheet(0.0, 1.0, 1.0)
     far = sheet(0.0, 1.0, 1.0, size_m=(0.5, 0.5), centre=(5000.0, 300.0))
 
-    alone, both = (limits(part) for part in (near, concatenated([near, far])))
+    scene = scene_of(near, far)
+    oblique, plan = scene.oblique(), scene.plan(700)
 
-    np.testing.assert_allclose(both, alone, atol=0.5)
-
-
-def test_the_longer_way_lies_across_and_both_views_stand_the_right_way_round():
-    for extent, across in (([50.0, 20.0, 9.0], X), ([20.0, 50.0, 9.0], Y)):
-        above, side = views(np.array(extent))
-        assert above.right == side.right == across
-        assert (above.near, side.up) == (Z, Z)
-        for view in (above, side):
-            axes = np.zeros((3, 3))
-            for row, (axis, sign) in enumerate(
-                zip((view.right, view.up, view.near), view.signs, strict=True)
-            ):
-                axes[row, axis] = sign
-            assert np.linalg.det(axes) == 1.0  # no mirror image
+    outside = scene.left_out(oblique)
+    assert scene.left_out(plan) == 1 <= outside < 0.05 * len(near)
+    assert f'are {outside} on the left, 1 on the right' in left_out(scene, oblique, plan)
+    image = drawn(tmp_path, concatenated([near, far]))
+    assert num_pixels(image, YELLOW) > 0.25 * image[..., 0].size
 
 
-def test_pixels_lie_where_the_axes_say_whichever_way_they_run():
-    low, high = np.array([-3.0, 10.0, 0.0]), np.array([5.0, 50.0, 2.0])
-    above, side = (Frame.of(view, (low, high), 10.0) for view in views(high - low))
-
-    assert (above.width, above.height) == (400, 80)
-    assert above.bounds == ((10.0, 50.0), (5.0, -3.0))  # y to the right, x down
-    assert side.bounds == ((10.0, 50.0), (0.0, 2.0))
-    np.testing.assert_allclose(above.placed(low[None]), [[-0.5, -0.5]])
-    np.testing.assert_allclose(above.placed(high[None]), [[399.5, 79.5]])
-    np.testing.assert_allclose(side.placed(low[None]), [[-0.5, 19.5]])
-    image = above.gridded()
-    for value, column in ((20.0, 100), (40.0, 300)):
-        assert value in above.ticks()[0]
-        assert (image[:, column] < 255.0).all()
+def test_a_trajectory_beyond_the_map_is_in_view_or_the_note_says_so():
+    floor = sheet(0.0, 1.0, 1.0)
+    for end_m, is_whole in ((8.0, True), (12.0, True), (500.0, False)):
+        way = np.column_stack([np.linspace(0.0, end_m, 9), np.zeros(9), np.ones(9)])
+        scene = scene_of(floor, trajectory=way)
+        oblique, plan = scene.oblique(), scene.plan(700)
+        assert plan.contains(way).all() == is_whole
+        assert ('part of the trajectory' in left_out(scene, oblique, plan)) == (not is_whole)
 
 
-def test_the_trajectory_is_drawn(tmp_path):
+def test_the_trajectory_is_drawn_with_its_start_and_end(tmp_path):
     path = np.column_stack([np.linspace(-8.0, 8.0, 50), np.zeros(50), np.full(50, 1.0)])
 
     images = [drawn(tmp_path, sheet(0.0, 1.0, 1.0), trajectory=t) for t in (None, path)]
 
-    without, with_path = (((i[..., 0] > 0.7) & (i[..., 1] < 0.4)).sum() for i in images)
-    assert without == 0
-    assert with_path > 500
+    red, green = (
+        [(np.abs(i - np.array(colour) / 255.0).max(axis=2) < 0.02).sum() for i in images]
+        for colour in ((214, 39, 40), (44, 160, 44))
+    )
+    assert red[0] == green[0] == 0
+    assert red[1] > 2000
+    assert green[1] > 200
+
+
+def test_squares_of_the_ground_lie_on_it_and_behind_all_that_stands_on_it():
+    scene = scene_of(sheet(0.0, 1.0, 1.0), sheet(3.0, 1.0, 1.0, size_m=(4.0, 4.0)))
+    camera = scene.oblique()
+    x, y = np.meshgrid(square_m(camera) * np.arange(-2.0, 2.1, 0.5), [0.25, 1.75])
+    corners = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    at = (camera.projected(corners) - camera.limits[0]) * camera.px_per_m
+    rows, columns = camera.height - 1 - at[:, 1].astype(int), at[:, 0].astype(int)
+
+    on_floor = -corners @ camera.R_view_map[2]
+    for in_front_m, is_seen in ((0.0, True), (1.0, False)):
+        depth = np.full((camera.height, camera.width), np.inf, np.float32)
+        depth[rows, columns] = on_floor - in_front_m
+        strength = ground_lines(scene, camera, depth)[rows, columns]
+        on_line = np.isclose(corners[:, 0] / square_m(camera) % 1.0, 0.0)
+        assert ((strength > 0.1) == (on_line & is_seen)).all()
+
+
+@pytest.mark.parametrize('colouring', ['height', 'num_scans'])
+def test_every_column_colours_the_map(tmp_path, colouring):
+    rng = np.random.default_rng(1)
+    surfels = sheet(0.0, 1.0, 1.0)
+    surfels = dataclasses.replace(
+        surfels,
+        thickness=rng.uniform(0.0, 0.1, len(surfels)),
+        num_scans=rng.integers(1, 9, len(surfels)),
+    )
+    assert np.ptp(drawn(tmp_path, surfels, colouring=colouring), axis=2).max() > 0.2
+    assert Colouring.over(colouring, [DrawnDiscs.of(surfels)]).has_scale
+
+
+def test_an_unknown_colouring_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match='colouring'):
+        drawn(tmp_path, sheet(0.0, 1.0, 1.0), colouring='mood')
 
 
 def test_surfels_without_a_normal_are_left_out(tmp_path):
@@ -142,10 +208,17 @@ def test_surfels_without_a_normal_are_left_out(tmp_path):
     assert num_pixels(image, YELLOW) > 10_000
 
 
-def test_a_map_without_surfels_gives_empty_axes(tmp_path):
-    nothing = sheet(0.0, 1.0, 1.0).select(np.zeros(0, np.int64))
+@pytest.mark.parametrize('num', [0, 1])
+def test_a_map_of_few_surfels_is_a_picture(tmp_path, num):
+    few = sheet(0.0, 1.0, 1.0).select(np.arange(num))
 
-    assert drawn(tmp_path, nothing).min() < 0.5
+    assert drawn(tmp_path, few, trajectory=np.zeros((num, 3))).min() < 0.5
+
+
+def test_round_lengths_are_at_most_the_given_one():
+    lengths = [0.013, 0.1, 0.3, 1.0, 4.9, 5.0, 77.0, 1999.0]
+    expected = [0.01, 0.1, 0.2, 1.0, 2.0, 5.0, 50.0, 1000.0]
+    assert [round_length(length) for length in lengths] == pytest.approx(expected)
 
 
 def test_the_same_map_gives_the_same_file(tmp_path):

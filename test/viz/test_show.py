@@ -257,5 +257,5 @@ def test_a_colour_that_nothing_has_is_refused(tmp_path, capsys):
         str(tmp_path / 'a.rrd'),
     ]
     assert main(arguments) == 1
-    expected = 'nothing shown has it; its values: curvature, level, num_points, planarity'
+    expected = 'nothing shown has it; its values: curvature, level, normal_sigma'
     assert f"colouring 'rgb': {expected}" in capsys.readouterr().err
