@@ -232,6 +232,18 @@ class VoxelTable:
         """Rows (R, 12) and their stamps (R, 2), of which surfels are derived."""
         return self.rows.array, self._stamps.array
 
+    @property
+    def rows_used(self) -> int:
+        """Number of rows ever used."""
+        return self._hash.rows_used
+
+    @property
+    def channel_sums(self) -> npt.NDArray[np.int64]:
+        """The channel sums of all rows, (R, C)."""
+        if not self._channels:
+            return np.empty((len(self.rows.array), 0), np.int64)
+        return self._channels.array
+
     def changed_after(self, version: int, min_points: int) -> npt.NDArray[np.int32]:
         """
         Return the rows of at least min_points points that were changed after a version.
@@ -457,6 +469,17 @@ class MomentMap:
     def nbytes(self) -> int:
         """Size of voxels and hash table in use, bytes."""
         return self._table.nbytes
+
+    @property
+    def rows_used(self) -> int:
+        """Number of rows ever used."""
+        return self._table.rows_used
+
+    @property
+    def slabs(self) -> Arrays:
+        """Rows (R, 12), stamps (R, 2) and channel sums (R, C); valid until the map changes."""
+        rows, stamps = self._table.slabs
+        return rows, stamps, self._table.channel_sums
 
     def insert(self, moments: ScanMoments) -> None:
         """

@@ -26,6 +26,7 @@ from surfel_mapper import map_formats
 from surfel_mapper.arguments import as_array, as_numbers, as_path, as_whole
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels import layout
+from surfel_mapper.mapping.adaptive import AdaptiveCut, LEVELS, MAX_THICKNESS_M
 from surfel_mapper.mapping.channels import means
 from surfel_mapper.mapping.coarsening import coarse_moments
 from surfel_mapper.mapping.moment_map import MAX_LEVEL, MomentMap
@@ -284,6 +285,52 @@ class SurfelMap(MomentMap):
         if changed is None:
             changed = self._table.changed_after(since, least)
         return self._derive(changed, covariance)
+
+    def adaptive(self, min_points: int = 1, **settings: Any) -> Surfels:
+        """
+        Return surfels of the size that fits: of the largest cell whose points lie on one plane.
+
+        Every point is in one surfel: of a cell, or of its voxel. ``size`` tells which, and
+        ``voxel_index`` is floor(point / size).
+
+        Parameters
+        ----------
+        min_points : int
+            Cells and voxels with fewer points are skipped.
+        **settings
+            Those of ``adaptive_cut``.
+
+        """
+        return self.adaptive_cut(min_points, **settings).refresh().surfels
+
+    def adaptive_cut(
+        self,
+        min_points: int = 1,
+        *,
+        levels: int = LEVELS,
+        max_thickness_m: float = MAX_THICKNESS_M,
+    ) -> AdaptiveCut:
+        """
+        Return the adaptive surfels as an object that follows this map and has a digest.
+
+        Parameters
+        ----------
+        min_points : int
+            Cells and voxels with fewer points are skipped.
+        levels : int
+            The largest cells have 2^levels voxels an axis; 1 to 6.
+        max_thickness_m : float
+            Maximum ``thickness`` of a cell, m.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a setting is of another type or out of range.
+
+        """
+        return AdaptiveCut(
+            self, min_points=min_points, levels=levels, max_thickness_m=max_thickness_m
+        )
 
     def index(self, min_points: int = 1) -> SurfelIndex:
         """Return a snapshot of the surfels of at least min_points points for spatial queries."""
