@@ -32,7 +32,7 @@ from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels.layout import MAX_MAP_COUNT
 from surfel_mapper.mapping.channels import channel_names
-from surfel_mapper.mapping.moments import check_possible, ScanMoments
+from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 
@@ -196,34 +196,6 @@ def check_held(whole: ScanMoments, kept: ScanMoments) -> None:
     if not is_held.all():
         voxel = kept.voxel_index[np.argmin(is_held)].tolist()
         raise NotInMapError(f'voxel {voxel} does not hold the points of its window')
-
-
-def load_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap, list[WindowedScan]]:
-    """
-    Return the moments of a map in a file, an empty map of its kind, and the scans of its window.
-
-    For viewers: without a table of voxels, 5 million surfels are read in a tenth of the time that
-    load_map takes. The digest is not compared; the hash of the content is.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be read, is damaged, of another kind or version.
-
-    """
-    arrays, attributes = load_state(path)
-    if attributes.get('kind') != KIND:
-        raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
-    with refusing(path, FileFormatError), map_errors(path):
-        empty = SurfelMap(
-            attributes['voxel_size_m'],
-            columns=tuple(attributes['columns']),
-            level=attributes['level'],
-            origin_m=attributes.get('origin_m', NO_ORIGIN),
-        )
-        moments = _moments(arrays, 'map', empty)
-        check_possible(moments)
-        return moments, empty, _scans(arrays, attributes, empty)
 
 
 def window_stamps_ns(path: str | Path) -> list[int]:

@@ -13,22 +13,20 @@ columns by name. Reading and writing are one module because they share the names
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-import itertools
+from collections.abc import Mapping, Sequence
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, open_regular, stated_limit
-from surfel_mapper.errors import DependencyError, FileFormatError, MapError
+from surfel_mapper.budget import open_regular
+from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.map_state import checked_moments, NO_ORIGIN
 from surfel_mapper.mapping.channels import channel_names
-from surfel_mapper.mapping.moments import check_possible, digest_of, pack_keys, ScanMoments
+from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import (
     COVARIANCE,
@@ -36,24 +34,11 @@ from surfel_mapper.mapping.surfels import (
     QUALITY,
     quality_columns,
 )
-from surfel_mapper.threads import share, usable_cores
 
 KIND, VERSION = 'surfel_mapper surfels', 1
 
 METADATA = b'surfel_mapper'
 """Key of the attributes, as JSON, in the metadata of the schema."""
-
-ROW_BYTES = 3 * 8
-"""Memory for a number: in the table of Arrow, as a column and in the moments."""
-
-FOOTER_LIMITS = {'thrift_string_size_limit': 16 << 20, 'thrift_container_size_limit': 1 << 20}
-"""Limits of the texts and lists in the footer of a file."""
-
-ROWS_READ = 1 << 14
-"""Rows unpacked and put into the arrays of moments at a time: 2 MB, which stay in the cache."""
-
-BYTES_READ = 1 << 18
-"""Bytes of a column that are read at a time; by default a whole column of a group, 5 MB."""
 
 INDEX = ('i', 'j', 'k')
 SUMS = ('sum_x', 'sum_y', 'sum_z')
@@ -116,66 +101,10 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
         If pyarrow is not installed.
 
     """
-    moments, surfel_map, digest = _read(path, voxel_size_m)
-    insert(surfel_map, moments, path)
-    actual = surfel_map.digest()
-    if actual != digest:
-        raise FileFormatError(f'{path}: damaged: digest {actual}, expected {digest}')
-    return surfel_map
-
-
-def read_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap]:
-    """
-    Return the moments of the map in a Parquet file, and an empty map of its kind.
-
-    For viewers: read_map takes several times as long, to fill a table of voxels.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be read, is damaged, or of another kind or version.
-    DependencyError
-        If pyarrow is not installed.
-
-    """
-    moments, empty, digest = _read(path, None)
-    if (moments.key[1:] < moments.key[:-1]).any():
-        moments = moments.select(np.argsort(moments.key))
-    actual = ''
-
-    def hash_rows() -> None:
-        nonlocal actual
-        actual = digest_of(
-            empty.voxel_size_m,
-            empty.level,
-            len(moments),
-            empty.columns,
-            lambda name: [getattr(moments, name)],
-        )
-
-    checks: list[Callable[[], None]] = [hash_rows, lambda: check_possible(moments)]
-
-    def check(chunk: slice) -> None:
-        for task in checks[chunk]:
-            task()
-
-    try:
-        share(check, len(checks), usable_cores())
-    except MapError as error:
-        raise FileFormatError(f'{path}: damaged: {error}') from error
-    if actual != digest:
-        raise FileFormatError(f'{path}: damaged: digest {actual}, expected {digest}')
-    return moments, empty
-
-
-def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, SurfelMap, Any]:
-    """Return the moments in a file, an empty map of its kind, and the digest that it states."""
-    arrow, parquet = import_pyarrow()
-    stated_limit()  # a wrong one is no damage of the file
+    _, parquet = import_pyarrow()
     try:
         with open_regular(path) as opened:
-            file = arrow.OSFile(f'/dev/fd/{opened.fileno()}')  # the file that was checked
-            content = parquet.ParquetFile(file, **FOOTER_LIMITS)
+            content = parquet.ParquetFile(opened)
             attributes = read_attributes(path, content.schema_arrow.metadata or {})
             surfel_map = map_of(attributes, voxel_size_m, path)
             in_file = content.schema_arrow.names
@@ -183,83 +112,20 @@ def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, Su
             unknown = {*in_file} - {*names, *DERIVED, *QUALITY, *COVARIANCE}
             if unknown:
                 raise ValueError(f'unknown columns {sorted(unknown)}')
-            check_size(content, names, path, os.fstat(opened.fileno()).st_size)
-            columns = read_rows(file, content.metadata, surfel_map, names)
-            moments = checked_moments(columns, surfel_map, 'rows')
+            columns = moment_columns(content.read(columns=[*names]), surfel_map)
+            surfel_map.insert(checked_moments(columns, surfel_map, 'rows'))
     except FileFormatError:
         raise
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
     except Exception as error:  # of pyarrow, and of attributes of any size and type
         raise FileFormatError(f'{path}: damaged, or not what write_map wrote: {error}') from error
-    return moments, surfel_map, attributes.get('digest')
-
-
-def read_rows(file: Any, footer: Any, surfel_map: SurfelMap, names: tuple[str, ...]) -> Columns:
-    """
-    Return the arrays of the moments in a file, whose groups of rows are read by threads.
-
-    A group is read by one thread: with pyarrow's own threads in addition, 6.6 million rows took
-    2.4 s on two cores instead of 1.2. The groups share one OSFile, which reads at an offset. A
-    PythonFile seeks while another thread reads: one in a thousand openings by several threads took
-    a whole file for a damaged one.
-    """
-    _, parquet = import_pyarrow()
-    sizes = [footer.row_group(group).num_rows for group in range(footer.num_row_groups)]
-    ends = list(itertools.accumulate(sizes))
-    arrays = moment_arrays(footer.num_rows, surfel_map)
-    if sum(sizes) != footer.num_rows or min(sizes, default=0) < 0:
-        raise ValueError(f'{sum(sizes)} rows, {footer.num_rows} in the footer')
-
-    def read(groups: slice) -> None:
-        content = parquet.ParquetFile(
-            file, metadata=footer, buffer_size=BYTES_READ, **FOOTER_LIMITS
+    actual = surfel_map.digest()
+    if actual != attributes.get('digest'):
+        raise FileFormatError(
+            f'{path}: damaged: digest {actual}, expected {attributes.get("digest")}'
         )
-        for group in range(groups.start, groups.stop):
-            filled = ends[group] - sizes[group]
-            for batch in content.iter_batches(
-                ROWS_READ, row_groups=[group], columns=list(names), use_threads=False
-            ):
-                columns = {name: int64_column(batch, name) for name in names}
-                rows = slice(filled, filled + len(columns['i']))
-                fill_rows(arrays, rows, columns, surfel_map)
-                filled = rows.stop
-            if filled != ends[group]:
-                raise ValueError(f'{filled} rows to group {group}, expected {ends[group]}')
-
-    share(read, len(sizes), usable_cores())
-    return arrays
-
-
-def check_size(content: Any, names: tuple[str, ...], path: str | Path, file_size: int) -> None:
-    """
-    Raise FileFormatError if columns have a wrong type or are too large for their file.
-
-    Tested before a row is read: a footer of some bytes can state billions of rows.
-
-    Parameters
-    ----------
-    content : ParquetFile
-        The file.
-    names : tuple of str
-        Columns to be read.
-    path : str or Path
-        Named in errors.
-    file_size : int
-        Size of the file, bytes.
-
-    """
-    schema, footer = content.schema_arrow, content.metadata
-    for name in names:
-        types = [str(schema.field(i).type) for i in schema.get_all_field_indices(name)]
-        if types not in (['int64'], ['int32']):
-            raise FileFormatError(f'{path}: column {name}: {types or "missing"}, expected int64')
-    groups = [footer.row_group(group) for group in range(footer.num_row_groups)]
-    num_rows = sum(group.num_rows for group in groups)
-    num_bytes = sum(group.total_byte_size for group in groups)
-    budget = Budget(path, file_size, FileFormatError)
-    budget.take(max(num_rows, 0) * len(names) * ROW_BYTES, f'{num_rows} rows')
-    budget.take(max(num_bytes, 0), 'unpacked pages')
+    return surfel_map
 
 
 def attributes_of(surfel_map: SurfelMap) -> dict[str, Any]:
@@ -375,36 +241,25 @@ def int64_column(table: Any, name: str) -> npt.NDArray[np.int64]:
     return np.asarray(column, np.int64)
 
 
-def insert(surfel_map: SurfelMap, moments: ScanMoments, path: str | Path) -> None:
-    """Insert the moments of a file into a map."""
-    try:
-        surfel_map.insert(moments)
-    except MapError as error:
-        raise FileFormatError(f'{path}: damaged: {error}') from error
+def moment_columns(table: Any, surfel_map: SurfelMap) -> Columns:
+    """Return the moments in a table by their names in ScanMoments."""
 
+    def stacked(names: tuple[str, ...]) -> npt.NDArray[np.int64]:
+        columns = [int64_column(table, name) for name in names]
+        return np.ascontiguousarray(
+            np.array(columns, np.int64).reshape(len(names), table.num_rows).T
+        )
 
-def moment_arrays(num_rows: int, surfel_map: SurfelMap) -> Columns:
-    """Return arrays for the moments of a map, by their names in ScanMoments, to be filled."""
-    names = channel_columns(surfel_map)
-    widths = {'total': 3, 'product': 6, 'view': 3, 'channels': len(names)}
-    arrays: Columns = {
-        name: np.empty((num_rows, width), np.int64) for name, width in widths.items()
+    has_scans = SCANS in table.column_names
+    return {
+        'key': pack_keys(stacked(INDEX)),
+        'count': int64_column(table, 'num_points'),
+        SCANS: int64_column(table, SCANS) if has_scans else np.ones(table.num_rows, np.int64),
+        'total': stacked(SUMS),
+        'product': stacked(PRODUCTS),
+        'view': stacked(VIEWS),
+        'channels': stacked(channel_columns(surfel_map)),
     }
-    for name in ('key', 'count', SCANS):
-        arrays[name] = np.ones(num_rows, np.int64)
-    return arrays
-
-
-def fill_rows(arrays: Columns, rows: slice, columns: Columns, surfel_map: SurfelMap) -> None:
-    """Write columns of a file into some rows of the arrays of moments."""
-    arrays['key'][rows] = pack_keys(np.stack([columns[name] for name in INDEX], axis=1))
-    arrays['count'][rows] = columns['num_points']
-    if SCANS in columns:
-        arrays[SCANS][rows] = columns[SCANS]
-    tables = {'total': SUMS, 'product': PRODUCTS, 'view': VIEWS}
-    for target, names in {**tables, 'channels': channel_columns(surfel_map)}.items():
-        for number, name in enumerate(names):
-            arrays[target][rows, number] = columns[name]
 
 
 def import_pyarrow() -> tuple[Any, Any]:

@@ -10,7 +10,7 @@ the length of the window nor the size of the map.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 import hashlib
 import struct
@@ -266,28 +266,6 @@ def shifted_moments(moments: ScanMoments, voxels: npt.NDArray[np.int64]) -> Scan
             f'expected {-INDEX_OFFSET} to {INDEX_OFFSET - 1}; use larger voxels'
         )
     return replace(moments, key=pack_keys(index))
-
-
-def joined_moments(shards: Sequence[ScanMoments]) -> ScanMoments:
-    """
-    Return the moments of all shards of a map, which share no voxel.
-
-    Raises
-    ------
-    MapError
-        If a voxel occurs twice.
-
-    """
-    names = (*HASHED_ARRAYS, 'channels', 'scans')
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(shard, name) for shard in shards]) for name in names
-    }
-    key = np.sort(arrays['key'])
-    twice = np.flatnonzero(key[1:] == key[:-1])
-    if len(twice):
-        index = unpack_keys(key[twice[:1]])[0].tolist()
-        raise MapError(f'{len(twice)} voxels occur twice, expected once each: {index}, ...')
-    return replace(shards[0], num_scans=arrays.pop('scans'), **arrays)
 
 
 def check_arrays(moments: ScanMoments) -> None:

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import FileFormatError, MapError
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import map_state, parquet, ply
 from surfel_mapper.files.arrays import is_cloud
 from surfel_mapper.files.latest_map import DRAWABLE, map_in
-from surfel_mapper.files.parquet_tiles import tiles_in
+from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.files.scan_files import looks_like_points, read_scan
 from surfel_mapper.files.scan_files import SUFFIXES as CLOUDS
 from surfel_mapper.files.text_points import SUFFIXES as TABLES
@@ -30,7 +30,7 @@ from surfel_mapper.files.trajectory import read_trajectory, Trajectory
 from surfel_mapper.files.trajectory import SUFFIXES as TRAJECTORIES
 from surfel_mapper.files.triangles import read_triangles
 from surfel_mapper.files.triangles import SUFFIXES as TRIANGLES
-from surfel_mapper.mapping.moments import joined_moments, ScanMoments, unpack_keys
+from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.discs import DrawnDiscs, RGB
@@ -143,11 +143,11 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
     if is_table or is_cloud(path) or (suffix == '.obj' and looks_like_points(path)):
         yield cloud(path, name)
     elif suffix == '.npz':
-        moments, empty, scans = map_state.load_moments(path)
-        yield ExactMap(name, moments, empty.origin_m, scans)
+        surfel_map, scans = map_state.load_map(path)
+        yield ExactMap(name, surfel_map.moments(), surfel_map.origin_m, scans)
     elif suffix == '.parquet':
-        moments, empty = parquet.read_moments(path)
-        yield ExactMap(name, moments, empty.origin_m)
+        surfel_map = parquet.read_map(path)
+        yield ExactMap(name, surfel_map.moments(), surfel_map.origin_m)
     elif suffix in TRIANGLES:
         yield ShownMesh(name, read_triangles(path))
     elif suffix in TRAJECTORIES:
@@ -168,7 +168,8 @@ def in_directory(path: Path, name: str) -> Iterator[Content]:
     prefix = f'{name}/' if name else ''
     map_path = map_in(path, DRAWABLE)
     if map_path is not None and map_path.is_dir():
-        yield tiles(map_path, f'{prefix}surfels')
+        surfel_map = read_tiles(map_path)
+        yield ExactMap(f'{prefix}surfels', surfel_map.moments(), surfel_map.origin_m)
     elif map_path is not None:
         yield from contents(map_path, f'{prefix}surfels')
     for file_name in BESIDE:
@@ -176,24 +177,6 @@ def in_directory(path: Path, name: str) -> Iterator[Content]:
             yield from contents(path / file_name, f'{prefix}{Path(file_name).stem}')
     for apart in sorted(path.glob('apart_*.npz')):
         yield from contents(apart, f'{prefix}{apart.stem}')
-
-
-def tiles(directory: Path, name: str) -> ExactMap:
-    """Return the map in a dataset of tiles."""
-    kinds, shards = set(), []
-    for path in tiles_in(directory).values():
-        moments, empty = parquet.read_moments(path)
-        kinds.add((empty.voxel_size_m, empty.level, empty.columns, *empty.origin_m.tolist()))
-        shards.append(moments)
-    if len(kinds) > 1:
-        raise FileFormatError(
-            f'{directory}: tiles of several maps: voxel size, level, columns and origin '
-            f'{" and ".join(map(str, sorted(kinds)))}'
-        )
-    try:
-        return ExactMap(name, joined_moments(shards), empty.origin_m)
-    except MapError as error:
-        raise FileFormatError(f'{directory}: {error}') from error
 
 
 def cloud(path: Path, name: str) -> Cloud:

@@ -9,7 +9,7 @@ import pytest
 
 from surfel_mapper.config import WindowConfig
 from surfel_mapper.errors import FileFormatError, NotInMapError
-from surfel_mapper.files.map_state import check_held, load_map, load_moments, save_map
+from surfel_mapper.files.map_state import check_held, load_map, save_map
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
@@ -89,22 +89,8 @@ def test_frames_that_are_not_those_of_the_scans_are_refused(tmp_path, frame_ids)
     save_map(tmp_path / 'map.npz', *driven())
     arrays, attributes = load_state(tmp_path / 'map.npz')
     save_state(tmp_path / 'map.npz', arrays, {**attributes, 'frame_ids': frame_ids})
-    for load in (load_map, load_moments):
-        with pytest.raises(FileFormatError, match=r'damaged: .*frames'):
-            load(tmp_path / 'map.npz')
-
-
-def test_moments_are_read_without_their_map(tmp_path):
-    surfel_map, window = driven()
-    surfel_map.origin_m = (512.0, 0.0, 8.0)
-    save_map(tmp_path / 'map.npz', surfel_map, window)
-
-    moments, empty, scans = load_moments(tmp_path / 'map.npz')
-
-    assert (empty.num_voxels, empty.origin_m.tolist()) == (0, [512.0, 0.0, 8.0])
-    empty.insert(moments)
-    assert empty.digest() == surfel_map.digest()
-    assert [scan.stamp_ns for scan in scans] == [scan.stamp_ns for scan in window]
+    with pytest.raises(FileFormatError, match=r'damaged: .*frames'):
+        load_map(tmp_path / 'map.npz')
 
 
 def test_an_empty_map_comes_back(tmp_path):
