@@ -10,7 +10,6 @@ such an array, perhaps with one of colours and of other columns, or arrays x, y 
 from __future__ import annotations
 
 from collections.abc import Mapping
-import os
 from pathlib import Path
 from typing import Any
 import zipfile
@@ -18,7 +17,7 @@ import zipfile
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, open_regular
+from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.point_columns import Columns, named_columns, NORMALS, RGB
 from surfel_mapper.files.state import MANIFEST
@@ -57,15 +56,10 @@ def read_points(path: str | Path) -> Columns:
 
     """
     with refusing(path, FileFormatError), open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
         if Path(path).suffix.lower() == '.npy':
             return columns_of(path, np.load(file, allow_pickle=False))
         if is_map(Path(path)):
             raise FileFormatError(f'{path}: a map, expected points; merge and extract take it')
-        with zipfile.ZipFile(file) as archive:
-            unpacked = sum(info.file_size for info in archive.infolist())
-        Budget(path, size, FileFormatError).take(unpacked, 'its arrays')
-        file.seek(0)
         with np.load(file, allow_pickle=False) as archive:
             return columns_of_arrays(path, {name: archive[name] for name in archive.files})
 

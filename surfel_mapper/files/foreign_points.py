@@ -3,8 +3,7 @@
 """
 Points in formats that libraries read: E57, VTK, OBJ, and the feather files of Argoverse 2.
 
-E57 has several scans, each with its pose: ``read_points`` returns all in the frame of the file.
-Decoders allocate by numbers in the file, so these are compared with its size first.
+E57 has several scans, each with its pose: ``read_e57`` returns all in the frame of the file.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from collections.abc import Callable
 from importlib import import_module
 import os
 from pathlib import Path
-import re
 from typing import Any
 
 import numpy as np
@@ -29,17 +27,8 @@ E57_COLUMNS = {
     **{f'color{name.capitalize()}': name for name in RGB},
 }
 
-VTK_NUMBERS = re.compile(
-    rb'(?:^(?:POINTS|VERTICES|CELLS|LINES|POLYGONS|POINT_DATA|CELL_DATA|OFFSETS)\s+|'
-    rb'NumberOf\w+=")(\d+)',
-    re.MULTILINE,
-)
-"""Numbers of rows in legacy and XML files of VTK."""
-
-HEAD_BYTES = 1 << 16
-
-MOST_PACKED = 1000
-"""Rows a byte of a packed file; zlib packs at most as much."""
+TAIL_BYTES = 1 << 16
+"""End of an OBJ file in which faces are looked for, bytes."""
 
 
 def library(path: str | Path, name: str, extra: str) -> Any:
@@ -78,7 +67,7 @@ def read_e57(path: str | Path, number: int | None = None) -> Columns:
     def read() -> Columns:
         with pye57.E57(str(path)) as file:
             numbers = range(file.scan_count) if number is None else [number]
-            scans = [e57_scan(path, file, at) for at in numbers]
+            scans = [e57_scan(file, at) for at in numbers]
         if not scans:
             raise FileFormatError(f'{path}: no scans in it')
         names = [name for name in scans[0] if all(name in scan for scan in scans)]
@@ -87,11 +76,8 @@ def read_e57(path: str | Path, number: int | None = None) -> Columns:
     return decoded(path, read)
 
 
-def e57_scan(path: Path, file: Any, number: int) -> Columns:
+def e57_scan(file: Any, number: int) -> Columns:
     """Return the columns of a scan in an open E57, in the frame of the file."""
-    count, size = file.get_header(number).point_count, path.stat().st_size
-    if count > MOST_PACKED * size:
-        raise FileFormatError(f'{path}: states {count} points in {size} bytes; damaged?')
     columns = file.read_scan(number, intensity=True, colors=True, ignore_missing_fields=True)
     return {E57_COLUMNS[name]: columns[name] for name in E57_COLUMNS if name in columns}
 
@@ -124,7 +110,6 @@ def read_vtk(path: str | Path) -> Columns:
     library(path, 'vtkmodules.vtkCommonDataModel', 'clouds')
 
     def read() -> Columns:
-        check_vtk(path)
         names = {'.vtk': 'vtkGenericDataObjectReader', '.vtp': 'vtkXMLPolyDataReader'}
         reader = getattr(module, names.get(path.suffix.lower(), 'vtkXMLUnstructuredGridReader'))()
         reader.SetFileName(str(path))
@@ -156,22 +141,11 @@ def vtk_columns(name: str, values: npt.NDArray[Any]) -> Columns:
     return {f'{name}_{at}': column for at, column in enumerate(values.T)}
 
 
-def check_vtk(path: Path) -> None:
-    """Raise FileFormatError if a file states more rows than it can have: VTK allocates them."""
-    with open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        content = file.read(size if path.suffix.lower() == '.vtk' else HEAD_BYTES)
-    most = size if path.suffix.lower() == '.vtk' else MOST_PACKED * size
-    largest = max(map(int, VTK_NUMBERS.findall(content)), default=0)
-    if largest > most:
-        raise FileFormatError(f'{path}: states {largest} rows in {size} bytes; damaged?')
-
-
 def has_faces(path: Path) -> bool:
     """Return whether an OBJ file ends with faces, which follow the vertices."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        file.seek(max(size - HEAD_BYTES, 0))
+        file.seek(max(size - TAIL_BYTES, 0))
         return path.suffix.lower() == '.obj' and b'\nf ' in file.read()
 
 

@@ -3,9 +3,7 @@
 """
 LAS and LAZ files of points and surfels, by laspy.
 
-That is an extra: the formats have 30 kinds of records. lazrs, its decoder of LAZ, ends the process
-if it cannot get memory, so all sizes by which lazrs allocates are compared with the file first;
-and it decodes by one thread, which allocates by fewer. Coordinates are scaled integers, often of a
+That is an extra: the formats have 30 kinds of records. Coordinates are scaled integers, often of a
 map projection, so they are returned as float64.
 """
 
@@ -13,17 +11,14 @@ from __future__ import annotations
 
 import io
 import logging
-import math
-import os
 from pathlib import Path
-import struct
-from typing import Any, BinaryIO, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import ConfigError, DependencyError, FileFormatError
+from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.point_columns import Columns, RGB
 from surfel_mapper.mapping.surfels import quality_columns
@@ -53,21 +48,6 @@ RESOLUTION_M = 1e-4
 MAX_STEPS = 2**31 - 1
 """Limit of a coordinate in a file, in units."""
 
-HEADER_BYTES = 375
-"""Size of the header of version 1.4; that of 1.2 has 227."""
-
-RECORD_BYTES, EXTENDED_RECORD_BYTES = 54, 60
-"""Sizes of the heads of variable length records, before and behind the points."""
-
-POINT_FORMAT_AT, PACKED = 104, 0xC0
-"""Place of the format of points in the header, and its bits of LAZ."""
-
-LASZIP_RECORD = (b'laszip encoded', 22204)
-"""Name and number of the record that says how points are packed."""
-
-LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
-"""Layers of the items of a point by their type; type 14, further bytes, has one for each byte."""
-
 
 def read_points(path: str | Path) -> Columns:
     """
@@ -90,14 +70,16 @@ def read_points(path: str | Path) -> Columns:
     """
     laspy = import_laspy(path)
     try:
-        check_header(path)
-        las = laspy.read(str(path), laz_backend=laspy.LazBackend.Lazrs)
-    except (FileFormatError, ConfigError, KeyboardInterrupt, SystemExit):
-        raise
+        backend = laspy.LazBackend.Lazrs
+        with open_regular(path) as file, laspy.open(file, laz_backend=backend) as reader:
+            stated = reader.header.point_count
+            las = reader.read()
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except BaseException as error:  # of decoders; a panic of Rust is no Exception
+    except Exception as error:  # of decoders
         raise FileFormatError(f'{path}: no LAS or LAZ file: {error}') from error
+    if len(las) < stated:
+        raise FileFormatError(f'{path}: {len(las)} points, expected {stated}; truncated?')
     is_kept = np.asarray(las.withheld) == 0
     if not is_kept.all():
         logger.info('%s: %d points are withheld and left out', path, len(las) - is_kept.sum())
@@ -233,132 +215,3 @@ def import_laspy(path: str | Path) -> Any:
             "it with `pip install 'surfel_mapper[las]'`"
         ) from error
     return laspy
-
-
-def check_header(path: str | Path) -> None:
-    """
-    Raise FileFormatError if the counts in the header do not fit the size of the file.
-
-    laspy loops over as many records as the header states, and reads the points that are there.
-    Source: the specification of LAS 1.4 of the ASPRS, table 3.
-    """
-    with open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        header = file.read(HEADER_BYTES)
-        if len(header) >= POINT_FORMAT_AT and header[POINT_FORMAT_AT] & PACKED:
-            room = check_packed(path, file, header, size)
-    header = header.ljust(HEADER_BYTES, b'\0')
-    if header[24] != 1:  # laspy looks at the second number alone, which selects the counts
-        raise FileFormatError(f'{path}: version {header[24]}.{header[25]}, expected 1.0 to 1.4')
-    start, num_records, point_format, point_size, count = struct.unpack_from('<IIBHI', header, 96)
-    num_extended = 0
-    if header[24:26] >= b'\x01\x04':
-        num_extended, count = struct.unpack_from('<IQ', header, 243)
-    if num_records * RECORD_BYTES + num_extended * EXTENDED_RECORD_BYTES > size:
-        raise FileFormatError(
-            f'{path}: {num_records} and {num_extended} records of variable length in a file of '
-            f'{size} bytes; damaged?'
-        )
-    check_units(path, header)
-    header_size = struct.unpack_from('<H', header, 94)[0]
-    if not header_size + num_records * RECORD_BYTES <= start <= size:
-        raise FileFormatError(
-            f'{path}: points from byte {start} of {size} on, behind a header of {header_size} '
-            f'bytes and {num_records} records; truncated, or damaged?'
-        )
-    is_packed = point_format & PACKED
-    if is_packed and (count > room or (room and not count)):
-        raise FileFormatError(f'{path}: {count} points in chunks of {room}; damaged?')
-    waveforms = struct.unpack_from('<Q', header, 227)[0] if header[24:26] >= b'\x01\x03' else 0
-    stored = (size - start) // max(point_size, 1)
-    if not is_packed and (count > stored or (count < stored and not num_extended | waveforms)):
-        raise FileFormatError(
-            f'{path}: {size} bytes, expected {start + count * point_size} for {count} points of '
-            f'{point_size} bytes; truncated, or is its header damaged?'
-        )
-
-
-def check_units(path: str | Path, header: bytes) -> None:
-    """Raise FileFormatError unless the units and offsets of coordinates are usable numbers."""
-    numbers = struct.unpack_from('<6d', header, 131)
-    if not all(map(math.isfinite, numbers)) or not all(numbers[:3]):
-        raise FileFormatError(
-            f'{path}: units {numbers[:3]} and offsets {numbers[3:]} of coordinates, expected '
-            'finite numbers, and units that are not 0'
-        )
-
-
-def check_packed(path: str | Path, file: BinaryIO, header: bytes, size: int) -> int:
-    """
-    Return the number of points that the chunks of a LAZ file have room for.
-
-    The decoder allocates by the size of a point, the number of chunks, and the sizes of chunks
-    and of the layers in them; it would read more points than stated from chunks of any size. Each
-    chunk begins with a point as it is. Source: the specification of LAZ 1.4, compressed data.
-
-    Raises
-    ------
-    FileFormatError
-        If one of them does not fit the file.
-
-    """
-    import lazrs
-
-    start, point_size = struct.unpack_from('<I', header, 96)[0], header[105] + (header[106] << 8)
-    record = laszip_record(file, header, min(start, size))
-    items = [struct.unpack_from('<HHH', record, at) for at in range(34, len(record) - 5, 6)]
-    stated = sum(item_size for _, item_size, _ in items)
-    if len(items) != struct.unpack_from('<H', record.ljust(34, b'\0'), 32)[0] or (
-        stated != point_size
-    ):
-        raise FileFormatError(
-            f'{path}: items of {stated} bytes in points of {point_size}; damaged?'
-        )
-    table_at = read_number(file, start, '<q')
-    table_at = read_number(file, size - 8, '<q') if table_at == -1 else table_at
-    is_inside = start < table_at <= size - 8
-    num_chunks = read_number(file, table_at + 4, '<I') if is_inside else 0
-    if not is_inside or (num_chunks - 1) * point_size > size:
-        raise FileFormatError(
-            f'{path}: {num_chunks} chunks of points at byte {table_at} of {size}; damaged?'
-        )
-    file.seek(start)
-    chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record)) if num_chunks else []
-    num_layers = sum(
-        item_size if kind == 14 else LAYERS.get(kind, 0) for kind, item_size, _ in items
-    )
-    at, head = start + 8, point_size + 4 * (1 + num_layers)
-    for number, (_, chunk_size) in enumerate(chunks):
-        file.seek(at + point_size + 4)
-        layers = np.frombuffer(file.read(4 * num_layers).ljust(4 * num_layers, b'\0'), '<u4')
-        if at + chunk_size > size or (
-            num_layers and head + int(layers.sum(dtype=np.int64)) != chunk_size
-        ):
-            raise FileFormatError(
-                f'{path}: chunk {number} of the points has another size than its layers, or ends '
-                'beyond the file; damaged?'
-            )
-        at += chunk_size
-    return sum(num_points for num_points, _ in chunks)
-
-
-def laszip_record(file: BinaryIO, header: bytes, end: int) -> bytes:
-    """Return the record of LAZ among those of variable length, or none."""
-    at, num_records = struct.unpack_from('<H4xI', header, 94)
-    for _ in range(num_records):
-        if at + RECORD_BYTES > end:
-            break
-        file.seek(at)
-        name, number, length = struct.unpack_from('<2x16sHH', file.read(RECORD_BYTES))
-        if (name.rstrip(b'\0'), number) == LASZIP_RECORD:
-            return file.read(length)
-        at += RECORD_BYTES + length
-    return b''
-
-
-def read_number(file: BinaryIO, at: int, code: str) -> int:
-    """Return a number at a place of a file; bytes behind its end are 0."""
-    length = struct.calcsize(code)
-    file.seek(max(at, 0))
-    number: int = struct.unpack(code, file.read(length).ljust(length, b'\0'))[0]
-    return number

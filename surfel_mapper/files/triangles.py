@@ -8,13 +8,12 @@ glTF has y upwards, so its triangles are turned on the way in and out.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from surfel_mapper.budget import Budget, open_regular
+from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 
@@ -29,9 +28,6 @@ Y_UP = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 """Turns a frame with z upwards to one with y upwards."""
-
-COPIES = 3
-"""Size of the arrays of a mesh, in sizes of its file."""
 
 
 def read_triangles(path: Path) -> Mesh:
@@ -48,13 +44,15 @@ def read_triangles(path: Path) -> Mesh:
     """
     from surfel_mapper.tsdf.mesh import Mesh
 
-    check_size(path)
     trimesh = import_trimesh()
     try:
-        scene = trimesh.load_scene(path, process=False)
+        with open_regular(path):  # a pipe would block
+            scene = trimesh.load_scene(path, process=False)
         mesh = scene.to_mesh() if scene.geometry else trimesh.Trimesh()
     except MemoryError:
         raise
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
     except Exception as error:  # those of many decoders
         raise FileFormatError(f'{path}: no {path.suffix[1:]} file: {error}') from error
     if not len(mesh.faces):
@@ -66,16 +64,6 @@ def read_triangles(path: Path) -> Mesh:
         triangles=np.asarray(mesh.faces, np.int32),
         colors=vertex_colors(mesh.visual),
     )
-
-
-def check_size(path: Path) -> None:
-    """Raise FileFormatError if a file is not a regular one, or too large for the memory."""
-    try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            Budget(path, size, FileFormatError).take(COPIES * size, 'its triangles')
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
 
 
 def vertex_colors(visual: Any) -> Any:

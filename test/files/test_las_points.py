@@ -116,3 +116,13 @@ def test_an_unknown_unit_is_named(tmp_path, caplog):
 
     np.testing.assert_allclose(points, PLACES, rtol=0, atol=1e-9)
     assert 'metres are assumed' in caplog.text
+
+
+@pytest.mark.parametrize('suffix', ['.las', '.laz'])
+@pytest.mark.parametrize('lacking', [1, 30, 150])
+def test_files_that_are_cut_off_are_refused(tmp_path, suffix, lacking):
+    path = written(tmp_path / f'a{suffix}')  # 30 bytes a point if not packed
+    path.write_bytes(path.read_bytes()[:-lacking])
+
+    with pytest.raises(FileFormatError, match=r'truncated|no LAS or LAZ file'):
+        read_scan(path)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Saved states come back equal, or are refused: damage at any byte, other versions, zip bombs."""
+"""Saved states come back equal, or are refused: damage at any byte, other versions."""
 
 import hashlib
 import io

@@ -231,20 +231,6 @@ def trajectory() -> list[bytes]:
     ]
 
 
-def las() -> list[bytes]:
-    """Return LAS and LAZ files of points with times and colours."""
-    import laspy
-
-    found = []
-    for point_format, packed in ((3, False), (3, True), (6, True)):
-        made = laspy.LasData(laspy.LasHeader(point_format=point_format, version='1.4'))
-        made.x = made.y = made.z = made.gps_time = np.arange(float(NUM_POINTS))
-        file = io.BytesIO()
-        made.write(file, do_compress=packed)
-        found.append(file.getvalue())
-    return found
-
-
 def shown() -> list[bytes]:
     """Return triangles as OBJ, STL and glTF, after a byte for the kind."""
     obj = b'v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1 3//1\n'

@@ -39,7 +39,6 @@ HARNESSES = {
     'kitti_times': Harness(files.kitti_times, corpus.kitti_times, 200),
     'settings': Harness(files.settings, corpus.settings, 150),
     'chain': Harness(files.chain, corpus.chain, 150),
-    'las': Harness(point_files.las, corpus.las, 75),
     'shown': Harness(point_files.shown, corpus.shown, 150),
     'packets': Harness(point_files.packets, corpus.noise, 100),
     'map_url': Harness(files.map_url, corpus.map_url, 500),

@@ -10,17 +10,10 @@ import tempfile
 
 import numpy as np
 
-from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.viz.contents import contents
 from test.fuzz.files import folder, refused
 from test.fuzz.mutations import mutations
 from test.fuzz.source import Source
-
-
-def las(data: bytes) -> None:
-    """Read a LAS or LAZ file."""
-    refused(read_scan, 'input.las', data)
-
 
 SHOWN = ('.obj', '.stl', '.glb')
 

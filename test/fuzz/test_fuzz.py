@@ -22,7 +22,6 @@ NEEDED = {
     'parquet': 'pyarrow',
     'pcd': 'lzf',
     'mcap': 'mcap',
-    'las': 'laspy',
     'packets': 'ouster.sdk',
     'map_url': 'rclpy',
 }

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 import io
-import struct
 import time
 from types import SimpleNamespace
 
@@ -23,7 +22,6 @@ from surfel_mapper.errors import (
     PoseError,
     refusing,
 )
-from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.messages.cdr import MAX_FRAME_NAME
 from surfel_mapper.messages.compressed_image import unpacked
@@ -38,44 +36,6 @@ def test_any_exception_of_a_parser_becomes_an_error_of_its_reader(error):
         raise error
     assert caught.value.__cause__ is error
     assert '\n' not in str(caught.value)
-
-
-@pytest.fixture
-def laz(tmp_path):
-    """Return the path of a LAZ file of 100 points, and its content."""
-    laspy = pytest.importorskip('laspy')
-    data = laspy.LasData(laspy.LasHeader(point_format=3, version='1.4'))
-    data.x = data.y = data.z = np.arange(100.0)
-    path = tmp_path / 'a.laz'
-    data.write(str(path))
-    return path, bytearray(path.read_bytes())
-
-
-@pytest.mark.parametrize(
-    ('at', 'code', 'number', 'problem'),
-    [
-        (131, '<d', 0.0, 'units'),
-        (139, '<d', np.nan, 'units'),
-        (155, '<d', np.inf, 'offsets'),
-        (247, '<Q', 0, '0 points'),
-        (96, '<I', 300, r'points from byte 300|items of 0 bytes in points'),
-        (96, '<I', 2**31, r'points from byte 2147483648|at byte 0 of|in points of'),
-    ],
-    ids=['unit', 'nan', 'offset', 'count', 'begin', 'end'],
-)
-@pytest.mark.parametrize('suffix', ['.las', '.laz'])
-def test_numbers_in_the_header_of_las_that_cannot_be_are_refused(
-    laz, tmp_path, suffix, at, code, number, problem
-):
-    """Points of nan, points all in one place, or no points, were taken for the content."""
-    laspy = pytest.importorskip('laspy')
-    path = tmp_path / f'b{suffix}'
-    laspy.read(str(laz[0])).write(str(path))
-    content = bytearray(path.read_bytes())
-    struct.pack_into(code, content, at, number)
-    path.write_bytes(content)
-    with pytest.raises(FileFormatError, match=problem):
-        read_scan(path)
 
 
 def test_a_jpeg_of_a_thousand_scans_is_refused_before_decoding():
