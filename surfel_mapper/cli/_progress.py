@@ -15,12 +15,12 @@ import sys
 import threading
 import time
 from types import FrameType
-from typing import Any
-
-from surfel_mapper.ros.main_thread import RETRY_S, swallows
 
 EVERY_S = 10.0
 """Time between plain lines, s."""
+
+REPEAT_S = 1.0
+"""A SIGTERM that follows another within this time is the same, s."""
 
 
 @contextmanager
@@ -108,31 +108,28 @@ def stopped_by_interrupt() -> Iterator[Callable[[], bool]]:
 @contextmanager
 def interrupted_by_sigterm(*, ends_process: bool = False) -> Iterator[None]:
     """
-    Raise KeyboardInterrupt at the first SIGTERM in a block, so that temporary files are removed.
+    Raise KeyboardInterrupt at SIGTERM in a block, so that temporary files are removed.
 
-    Later ones are ignored: `timeout` sends it to the process and to its group, and the second must
-    not interrupt the removal. If the first ends the process, later ones are ignored after the
-    block too: they would replace the exit code. Outside of the main thread nothing changes.
+    Parameters
+    ----------
+    ends_process : bool
+        The process ends after the block: SIGTERM is not handled as before again.
+
     """
-    handlers: dict[int, Any] = {}
+    due_s = 0.0
 
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        if not swallows(frame):
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        nonlocal due_s
+        if time.monotonic() >= due_s:  # `timeout` sends SIGTERM twice
+            due_s = time.monotonic() + REPEAT_S
             raise KeyboardInterrupt
-        handlers.setdefault(signal.SIGALRM, signal.signal(signal.SIGALRM, interrupt))
-        signal.setitimer(signal.ITIMER_REAL, RETRY_S)
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    handlers[signal.SIGTERM] = signal.signal(signal.SIGTERM, interrupt)
+    earlier = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
     finally:
-        if ends_process and signal.getsignal(signal.SIGTERM) is signal.SIG_IGN:
-            del handlers[signal.SIGTERM]
-        if signal.SIGALRM in handlers:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        if not (ends_process and due_s):
+            signal.signal(signal.SIGTERM, earlier)

@@ -52,9 +52,6 @@ VERBS = (
     'compile',
 )
 
-WITH_SIGNALS = ('node', 'view')
-"""Verbs that handle SIGTERM themselves."""
-
 FILE_VERBS = ('replay', 'info', 'filter', 'extract', 'resample', 'merge', 'evaluate')
 """Verbs whose memory is limited; those of ROS and browsers reserve address space at will."""
 
@@ -85,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if argv is None:
             limit_memory(args)
         ends_early = interrupted_by_sigterm(ends_process=argv is None)
-        with nullcontext() if args.verb in WITH_SIGNALS else ends_early:
+        with nullcontext() if args.verb == 'node' else ends_early:  # it handles SIGTERM itself
             code = int(args.run(args))
         sys.stdout.flush()
         return code

@@ -101,15 +101,7 @@ def page_port(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show everything; Ctrl-C and SIGTERM end a page, and leave no server behind."""
-    from surfel_mapper.ros.main_thread import Signals
-
-    with Signals():
-        return shown(args)
-
-
-def shown(args: argparse.Namespace) -> int:
-    """Show a live node, a recording, or the contents of files; return 0."""
+    """Show a live node, a recording, or the contents of files, until Ctrl-C or SIGTERM."""
     from surfel_mapper.files.atomic import check_free
     from surfel_mapper.viz.contents import is_shown
 

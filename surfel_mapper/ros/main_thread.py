@@ -4,8 +4,8 @@
 The main thread of the node: signals that end it, and the tasks that other threads hand to it.
 
 A signal raises KeyboardInterrupt in the main thread, wherever that is. Python prints and swallows
-exceptions raised in a ``__del__`` or in a function called back from C, both of which compiling
-does often; there the interrupt is postponed by a moment.
+exceptions raised in a ``__del__`` or in a function called back from C. After such a signal the
+transition under way is finished, and ``check`` ends the node.
 
 Transitions of the life cycle run in the main thread, because only there a signal can interrupt
 them: compiling kernels takes half a minute the first time.
@@ -25,15 +25,8 @@ from typing import Any, NamedTuple
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
-RETRY_S = 0.01
-"""An interrupt that would be swallowed is tried again after this time."""
-
 MAX_WAIT_S = 0.2
 """A signal that arrives just before a wait does not end it; this bounds the delay."""
-
-
-UNINTERRUPTED = ('__del__', '_adjust_thread_count')
-"""Functions that an interrupt does not enter: finalizers, and a pool's start of a thread."""
 
 
 class Signals:
@@ -45,24 +38,21 @@ class Signals:
 
     def __enter__(self) -> Signals:
         """Install the signal handlers."""
-        numbers = (*NUMBERS, signal.SIGALRM)
-        self._handlers = {number: signal.signal(number, self._interrupt) for number in numbers}
+        self._handlers = {number: signal.signal(number, self._interrupt) for number in NUMBERS}
         return self
 
     def __exit__(self, *_: object) -> None:
         """Restore the previous handlers; after an interrupt, signals stay ignored."""
-        signal.setitimer(signal.ITIMER_REAL, 0)
         if not self._received:
             for number, handler in self._handlers.items():
                 signal.signal(number, handler)
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt if a signal was received, even if its interrupt is pending."""
+        """Raise KeyboardInterrupt if a signal was received."""
         if self._received:
-            signal.setitimer(signal.ITIMER_REAL, 0)
             raise KeyboardInterrupt
 
-    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+    def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         """
         Interrupt the main thread, and ignore all further signals.
 
@@ -72,25 +62,7 @@ class Signals:
         self._received = True
         for ignored in NUMBERS:
             signal.signal(ignored, signal.SIG_IGN)
-        if swallows(frame):
-            signal.setitimer(signal.ITIMER_REAL, RETRY_S)
-        else:
-            raise KeyboardInterrupt
-
-
-def swallows(frame: FrameType | None) -> bool:
-    """
-    Whether an exception raised in a frame is lost or does harm.
-
-    It is lost in a finalizer or a callback of LLVM. In a pool that starts a thread it leaves one
-    that the pool does not know, for which the process would wait forever at its end.
-    """
-    while frame is not None:
-        code = frame.f_code
-        if code.co_name in UNINTERRUPTED or '/llvmlite/' in code.co_filename:
-            return True
-        frame = frame.f_back
-    return False
+        raise KeyboardInterrupt
 
 
 class Task(NamedTuple):

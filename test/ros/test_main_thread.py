@@ -13,12 +13,11 @@ import pytest
 from surfel_mapper.ros.main_thread import NUMBERS, Signals, TaskQueue
 
 TIMEOUT_S = 120
-HANDLED = (*NUMBERS, signal.SIGALRM)
 
 
 @pytest.fixture(autouse=True)
 def handlers():
-    before = {number: signal.getsignal(number) for number in HANDLED}
+    before = {number: signal.getsignal(number) for number in NUMBERS}
     yield before
     for number, handler in before.items():
         signal.signal(number, handler)
