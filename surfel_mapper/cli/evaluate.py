@@ -16,6 +16,7 @@ from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import add_bin_columns, positive_float, positive_int
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._recordings import recorded_map
 from surfel_mapper.cli._verbosity import add_verbosity
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import finite_or_none
@@ -40,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'map',
         type=Path,
         metavar='MAP',
-        help='output of a replay or merge, or a file of it; .tum, .txt, .csv: a trajectory',
+        help='output of a replay or merge, or a file of it; a bag or a folder of scans, mapped as '
+        'by `replay`; .tum, .txt, .csv: a trajectory',
     )
     add(
         '--truth',
@@ -81,6 +83,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help='move the map onto the truth first, if frames differ (trajectories always move)',
     )
+    add(
+        '--voxel-size',
+        type=positive_float,
+        metavar='M',
+        help='edge of the voxels of recordings, mapped first, m (0.5; depth images 0.08)',
+    )
     add_bin_columns(parser)
     add('--json', action='store_true', help='print as JSON')
     add_verbosity(parser)
@@ -107,11 +115,10 @@ def maps(args: argparse.Namespace) -> dict[str, Any]:
         looks_needed,
         moved_discs,
     )
-    from surfel_mapper.evaluation.map_files import load_discs
     from surfel_mapper.evaluation.mesh_truth import load_mesh
     from surfel_mapper.evaluation.truth import is_world, load_truth
 
-    surfels = load_discs(args.map, args.min_points, args.bin_columns)
+    surfels = discs_of(args, args.map)
     truth: Truth
     digests: dict[str, Any] = {}
     if is_world(args.truth):
@@ -119,7 +126,7 @@ def maps(args: argparse.Namespace) -> dict[str, Any]:
     elif (mesh := load_mesh(args.truth)) is not None:
         truth = mesh
     else:
-        reference = load_discs(args.truth, args.min_points, args.bin_columns)
+        reference = discs_of(args, args.truth)
         truth = CloudTruth(reference)
         digests = compared_digests(surfels, reference)
     size_m = surfels.voxel_size_m or DEFAULT_M
@@ -135,6 +142,17 @@ def maps(args: argparse.Namespace) -> dict[str, Any]:
         **digests,
         **({} if motion is None else {'aligned': motion.summary()}),
     }
+
+
+def discs_of(args: argparse.Namespace, path: Path) -> Discs:
+    """Return the surfels of a map, of a recording that is mapped first, or points."""
+    from surfel_mapper.evaluation.map_files import load_discs, of_map
+    from surfel_mapper.files.latest_map import DRAWABLE
+
+    surfel_map = recorded_map(args, path, DRAWABLE, args.voxel_size)
+    if surfel_map is not None:
+        return of_map(surfel_map, args.min_points)
+    return load_discs(path, args.min_points, args.bin_columns)
 
 
 def compared_digests(surfels: Discs, reference: Discs) -> dict[str, Any]:

@@ -24,11 +24,13 @@ import numpy.typing as npt
 from surfel_mapper.cli._arguments import add_bin_columns, add_formats, add_overwrite, real
 from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._recordings import recorded_map
 from surfel_mapper.cli._settings import add_settings, configured_stage
 from surfel_mapper.cli._verbosity import add_verbosity
 from surfel_mapper.compilation import stage
 
 if TYPE_CHECKING:
+    from surfel_mapper.mapping.surfel_map import SurfelMap
     from surfel_mapper.models.multi_model import MultiModel
 
 SUMMARY = 'Find planes, curved surfaces and Gaussians in a cloud or a map.'
@@ -60,8 +62,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'cloud',
         type=Path,
-        metavar='CLOUD|MAP',
-        help='points in a file, as of `replay`; or a map: .npz, .parquet, output of a replay',
+        metavar='CLOUD|MAP|BAG',
+        help='points in a file, as of `replay`; a map: .npz, .parquet, output of a replay; or a '
+        'bag or a folder of scans, mapped as by `replay`',
     )
     parser.add_argument(
         '-o', '--output', type=Path, required=True, metavar='DIR', help='directory to write to'
@@ -135,42 +138,64 @@ def read(
 ) -> tuple[npt.NDArray[Any], float, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return points (N, 3), default voxel size, viewpoint (3,) and origin (3,) of the map, m."""
     from surfel_mapper.config import ModelsConfig
-    from surfel_mapper.errors import FileFormatError
-    from surfel_mapper.files.arrays import is_cloud
     from surfel_mapper.files.pcd import read_viewpoint
-    from surfel_mapper.files.scan_files import scan_reader, SUFFIXES
-    from surfel_mapper.mapping.surfel_map import SurfelMap
     from surfel_mapper.models.fitting import above, surfel_points
 
-    args.cloud = exact_map(args.cloud)
-    suffix = args.cloud.suffix.lower()
-    if not args.cloud.exists():
-        raise FileFormatError(f'{args.cloud}: no such file')
-    if not args.cloud.is_dir() and suffix not in (*MAPS, *SUFFIXES):
-        raise FileFormatError(
-            f'{args.cloud}: expected a cloud ending in {", ".join(SUFFIXES)}, or a map ending in '
-            f'{", ".join(MAPS)}'
-        )
+    surfel_map = map_of(args)
     origin_m: npt.NDArray[np.float64] = np.zeros(3)
-    if args.cloud.is_dir() or (suffix in MAPS and not is_cloud(args.cloud)):
-        surfel_map = SurfelMap.load(args.cloud)
+    if surfel_map is not None:
         surfels, origin_m = surfel_map.surfels(covariance=True), surfel_map.origin_m
+        # the order of rows depends on the history of the map, and sums in the last bits on it
+        surfels = surfels.select(np.lexsort(surfels.voxel_index.T))
         points: npt.NDArray[Any] = surfel_points(surfels, surfel_map.voxel_size_m)
         voxel_size_m, viewpoint = 0.5 * surfel_map.voxel_size_m, above(surfels)
     else:
-        points, columns = scan_reader([args.cloud], args.bin_columns)(args.cloud)
-        if {'planarity', 'curvature', 'num_points'} <= set(columns):
-            raise FileFormatError(
-                f'{args.cloud}: surfels of a map, not points of a cloud; expected its map.npz or '
-                'the output directory of the replay'
-            )
-        points = np.ascontiguousarray(points)
+        points = cloud_of(args)
         voxel_size_m, viewpoint = ModelsConfig().voxel_size_m, np.zeros(3)
-        if suffix == '.pcd':
+        if args.cloud.suffix.lower() == '.pcd':
             viewpoint = np.array(read_viewpoint(args.cloud)[:3])
     if args.viewpoint is not None:
         viewpoint = np.array(args.viewpoint) - origin_m
     return points, voxel_size_m, viewpoint, origin_m
+
+
+def map_of(args: argparse.Namespace) -> SurfelMap | None:
+    """Return the map in a file or a directory, or that of a recording; None for a cloud."""
+    from surfel_mapper.errors import FileFormatError
+    from surfel_mapper.files.arrays import is_cloud
+    from surfel_mapper.files.latest_map import EXACT
+    from surfel_mapper.files.scan_files import SUFFIXES
+    from surfel_mapper.mapping.surfel_map import SurfelMap
+
+    size_m = dict(args.settings).get('models.voxel_size_m')
+    surfel_map = recorded_map(args, args.cloud, EXACT, 2.0 * size_m if size_m else None)
+    if surfel_map is not None:
+        return surfel_map
+    path, suffix = exact_map(args.cloud), args.cloud.suffix.lower()
+    if not path.exists():
+        raise FileFormatError(f'{path}: no such file')
+    if path.is_dir() or path != args.cloud or (suffix in MAPS and not is_cloud(path)):
+        return SurfelMap.load(path)
+    if suffix not in SUFFIXES:
+        raise FileFormatError(
+            f'{path}: expected a cloud ending in {", ".join(SUFFIXES)}, a map ending in '
+            f'{", ".join(MAPS)}, or a bag'
+        )
+    return None
+
+
+def cloud_of(args: argparse.Namespace) -> npt.NDArray[Any]:
+    """Return the points (N, 3) in a file."""
+    from surfel_mapper.errors import FileFormatError
+    from surfel_mapper.files.scan_files import scan_reader
+
+    points, columns = scan_reader([args.cloud], args.bin_columns)(args.cloud)
+    if {'planarity', 'curvature', 'num_points'} <= set(columns):
+        raise FileFormatError(
+            f'{args.cloud}: surfels of a map, not points of a cloud; expected its map.npz or '
+            'the output directory of the replay'
+        )
+    return np.ascontiguousarray(points)
 
 
 def exact_map(path: Path) -> Path:
@@ -181,7 +206,8 @@ def exact_map(path: Path) -> Path:
     map_path = map_in(path, EXACT) if path.is_dir() else path
     if map_path is None:
         raise FileFormatError(
-            f'{path}: no map.npz, map.parquet or map/tile_i=*/tile_j=*/ in this directory'
+            f'{path}: no map.npz, map.parquet or map/tile_i=*/tile_j=*/ in this directory, nor a '
+            'bag or scans'
         )
     return map_path
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 import logging
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.arguments import as_path, check_kind
@@ -27,6 +28,7 @@ from surfel_mapper.offline.summary import causes_text
 
 if TYPE_CHECKING:
     from surfel_mapper.config import Config
+    from surfel_mapper.mapping.surfel_map import SurfelMap
     from surfel_mapper.offline.normals_bag import NormalsBag
     from surfel_mapper.offline.outputs import ScanTrajectory
     from surfel_mapper.offline.recording import Recording
@@ -215,6 +217,67 @@ def replay(
     written = write_files(directory, options.formats, mapper, trajectory, summary, history)
     _log.info('wrote %s', ', '.join(map(str, written)))
     return ReplayResult(mapper, trajectory, summary, written)
+
+
+def map_recording(
+    path: str | Path,
+    *,
+    voxel_size_m: float | None = None,
+    bin_columns: int | None = None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> SurfelMap:
+    """
+    Return the map of all scans of a recording, as ``replay`` makes it by default; write nothing.
+
+    Parameters
+    ----------
+    path : str or Path
+        A bag, or a folder of scans.
+    voxel_size_m : float, optional
+        Edge of the voxels, m; without, 0.5, of depth images DEPTH_VOXEL_M.
+    bin_columns : int, optional
+        Number of columns of .bin files; without, that which fits their values.
+    progress : callable
+        Called with the numbers of scans received and expected after every mapped scan.
+
+    Raises
+    ------
+    BagError
+        If the recording cannot be read, lacks topics or poses, or none of its scans was mapped.
+
+    """
+    from surfel_mapper.offline.recording import open_recording
+    from surfel_mapper.offline.request import Request
+    from surfel_mapper.offline.summary import uncertain_text
+
+    options = ReplayOptions()
+    request = Request(path=Path(path), bin_columns=bin_columns)
+    with (
+        TemporaryDirectory(prefix='surfel_mapper-') as scratch,
+        open_recording(request, configured(None, options)) as recording,
+    ):
+        config = recording.config
+        if voxel_size_m is None and config.input.kind == 'depth':
+            voxel_size_m = DEPTH_VOXEL_M
+        if voxel_size_m is not None:
+            config = config.replace({'map.voxel_size_m': voxel_size_m})
+        mapper = started_mapper(with_loops(config, options, Path(scratch)))
+        mapper.derives = False
+        mapped(recording, mapper, (), progress, lambda: False)
+        refuse_empty(recording, mapper, was_stopped=False)
+        align(mapper, options)
+        figures = {**recording.describe(), **mapper.summary()}
+        _log.info(
+            '%s: %d scans mapped, voxels of %g m, poses from %s',
+            *(path, mapper.counters.mapped, mapper.map.voxel_size_m, figures['poses_from']),
+        )
+        if uncertain := uncertain_text(figures):
+            _log.warning('%s: %s', path, uncertain)
+        return mapper.map
+
+
+DEPTH_VOXEL_M = 0.08
+"""Edge of the voxels of a map of depth images, m: twice that for models of one image."""
 
 
 def configured(config: Config | str | Path | None, options: ReplayOptions) -> Config:

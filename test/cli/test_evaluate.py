@@ -184,3 +184,18 @@ def test_poses_without_times_are_compared_by_their_numbers(tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result['num_poses'] == 4
     assert result['absolute']['translation_m']['max'] < 1e-9
+
+
+def test_a_bag_is_mapped_as_by_replay_and_compared(street, capsys):
+    bag, output = street
+    same = evaluated(capsys, bag, '--truth', output)
+    assert same['equal'] is True
+    assert same['position_m']['max'] == 0.0
+    finer = evaluated(capsys, bag, '--truth', bag, '--voxel-size', '0.25')
+    assert finer['surfels'] > same['surfels']
+
+
+def test_a_directory_without_map_and_scans_is_refused(tmp_path, street, capsys):
+    bag, _ = street
+    assert main(['evaluate', str(tmp_path), '--truth', str(bag)]) == 1
+    assert f'{tmp_path}: no map in this directory' in capsys.readouterr().err

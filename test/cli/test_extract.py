@@ -14,8 +14,10 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.models import read
 from test import extras
 from test.models.scenes import room, sheet, VIEW
+from test.offline.test_depth_folders import tum
 
 FILES = ('models.smm', 'models.json', 'models.png')
 
@@ -139,3 +141,39 @@ def test_points_of_every_format_become_models(tmp_path):
     for name, options in (('a.npz', []), ('a.XYZ', []), ('a.bin', ['--bin-columns', '3'])):
         normals = normals_of(tmp_path / name, tmp_path / f'out_{name}', *options)
         np.testing.assert_allclose(normals, -1.0, atol=1e-3)
+
+
+def test_a_bag_is_mapped_as_by_replay_first(tmp_path, capsys, caplog):
+    size = ['--beams', '16', '--columns', '512', '--scans', '5', '-q']
+    bag, mapped, models = (str(tmp_path / name) for name in ('bag', 'mapped', 'models'))
+    assert main(['simulate', 'street', '-o', bag, *size]) == 0
+    assert main(['replay', bag, '-o', mapped, '-q']) == 0
+    capsys.readouterr()
+    assert main(['extract', bag, '-o', models, '--json', '-v']) == 0
+    of_bag = json.loads(capsys.readouterr().out)
+    assert '5 scans mapped, voxels of 0.5 m' in caplog.text
+    assert main(['extract', mapped, '-o', models, '--json', '--overwrite']) == 0
+    assert of_bag == json.loads(capsys.readouterr().out)
+    assert of_bag['planes'] > 2
+    arguments = ['-o', models, '--overwrite', '--voxel-size', '0.1', '--json', '-v']
+    assert main(['extract', bag, *arguments]) == 0
+    assert 'voxels of 0.2 m' in caplog.text
+    assert json.loads(capsys.readouterr().out)['points'] > of_bag['points']
+
+
+def test_depth_images_are_mapped_in_voxels_for_a_room(tmp_path, capsys, caplog):
+    tum(tmp_path / 'frames')
+    out = str(tmp_path / 'out')
+    assert main(['extract', str(tmp_path / 'frames'), '-o', out, '--json', '-v']) == 0
+    assert '3 scans mapped, voxels of 0.08 m' in caplog.text
+    assert json.loads(capsys.readouterr().out)['planes'] == 1
+    (plane,) = read(tmp_path / 'out' / 'models.smm').planes
+    assert abs(plane.normal[2]) > 0.9999
+    assert plane.mean[2] == pytest.approx(3.0, abs=0.002)  # the wall of the images
+
+
+def test_a_directory_of_neither_map_nor_scans_is_refused(tmp_path, capsys):
+    (tmp_path / 'in').mkdir()
+    (tmp_path / 'in' / 'notes.md').write_text('nothing')
+    assert main(['extract', str(tmp_path / 'in'), '-o', str(tmp_path / 'out')]) == 1
+    assert 'in this directory, nor a bag or scans' in capsys.readouterr().err
