@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 import logging
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,6 @@ from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.atomic import check_free, make_directory
 from surfel_mapper.files.scan_files import (
     Points,
-    read_scan,
     scan_files,
     scan_reader,
     SUFFIXES,
@@ -37,9 +37,15 @@ from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.columns import as_fields
 from surfel_mapper.geometry import Transform
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
+from surfel_mapper.offline import ouster_pcap
+from surfel_mapper.offline.datasets import find_dataset
+from surfel_mapper.offline.depth_folders import DepthFolder, find_depth_folder
+from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.scan import Scan
 
 log = logging.getLogger(__name__)
+
+Read = Callable[[], Points]
 
 Show = Callable[[int, int], None]
 """Progress: scans done and expected."""
@@ -90,7 +96,7 @@ def filter_clouds(
     chain : Chain
         The filters.
     inputs : sequence of path
-        Files of clouds (.ply, .pcd, .bin), folders of them, and bags.
+        Files of clouds, folders of them and of data sets, captures (.pcap), and bags.
     output : path
         For one file: a .ply or .pcd. For one bag: the directory of the bag to write. Else, or for
         a folder: a directory, in which every file and bag has the name of its input.
@@ -116,7 +122,7 @@ def filter_clouds(
     work = _Work(chain, topics, T_base_sensor, show)
     pairs = list(outputs_of([Path(path) for path in inputs], Path(output)))
     sources: dict[Path, Path] = {}
-    for source, target in pairs:
+    for source, target, _ in pairs:
         if target in sources:
             raise FileFormatError(
                 f'{sources[target]}, {source}: expected an output for each, both would be '
@@ -124,15 +130,16 @@ def filter_clouds(
             )
         sources[target] = source
     check_free(Path(output), overwrite)
-    work.read = scan_reader([source for source, _ in pairs if not is_bag(source)], bin_columns)
+    files = [source for source, _, read in pairs if read is None and not is_bag(source)]
+    read_file = scan_reader(files, bin_columns)
     chain.warm_up()
-    for source, target in pairs:
+    for source, target, read in pairs:
         log.info('%s is filtered into %s', source, target)
         make_directory(target.parent)
-        if is_bag(source):
+        if read is None and is_bag(source):
             work.filter_bag(source, target, overwrite)
         else:
-            work.filter_file(source, target, len(pairs))
+            work.filter_file(source, target, len(pairs), read or partial(read_file, source))
         work.done.outputs.append(target)
     work.done.filters = work.counters.summary()['filters']
     return work.done
@@ -145,19 +152,23 @@ def is_bag(path: Path) -> bool:
     return (path / METADATA).exists() or any(is_storage(file) for file in path.iterdir())
 
 
-def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
-    """Yield every file and bag to read, and the path to write for it."""
-    if len(inputs) == 1 and is_bag(inputs[0]):
-        yield inputs[0], output
+def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path, Read | None]]:
+    """Yield every file and bag to read, the path to write for it, and the reader of others."""
+    first = inputs[0]
+    if len(inputs) == 1 and is_bag(first):
+        yield first, output, None
         return
-    if len(inputs) == 1 and inputs[0].is_file():
+    if len(inputs) == 1 and first.is_file() and first.suffix.lower() != ouster_pcap.SUFFIX:
         if output.suffix.lower() not in WRITERS:
             raise FileFormatError(f'{output}: expected a file ending in {" or ".join(WRITERS)}')
-        yield inputs[0], output
+        yield first, output, None
         return
     for source in inputs:
         if is_bag(source):
-            yield source, output / (source.name if source.is_dir() else source.stem)
+            yield source, output / (source.name if source.is_dir() else source.stem), None
+            continue
+        if scans := scans_of_dataset(source):
+            yield from ((source, output / f'{name}.ply', read) for name, read in scans.items())
             continue
         files = scan_files(source) if source.is_dir() else [source]
         if not files:
@@ -166,7 +177,25 @@ def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
             )
         for file in files:
             suffix = file.suffix if file.suffix.lower() in WRITERS else '.ply'
-            yield file, output / f'{file.stem}{suffix}'
+            yield file, output / f'{file.stem}{suffix}', None
+
+
+def scans_of_dataset(path: Path) -> dict[str, Read]:
+    """Return the reader of each scan of a data set or a capture by its name; none for others."""
+    if path.suffix.lower() == ouster_pcap.SUFFIX:
+        capture = OusterPcap(path)
+        names = [f'{path.stem}_{number:06}' for number in range(len(capture.files))]
+        return {name: partial(capture.scan, number) for number, name in enumerate(names)}
+    dataset = find_dataset(path) or find_depth_folder(path)
+    if dataset is None:
+        return {}
+    scan = partial(points_of, dataset) if isinstance(dataset, DepthFolder) else dataset.scan
+    return {file.stem: partial(scan, number) for number, file in enumerate(dataset.files)}
+
+
+def points_of(folder: DepthFolder, number: int) -> Points:
+    """Return the points of a depth image, without columns."""
+    return folder.depth_scan(number, folder.stamps_ns[number], '').points, {}
 
 
 def definitions_of(reader: BagReader) -> dict[str, tuple[str, str] | None]:
@@ -198,13 +227,12 @@ class _Work:
         self.topics = tuple(topics)
         self.pose = pose
         self.show = show
-        self.read: Callable[[Path], Points] = read_scan
         self.counters = Counters()
         self.done = FilteredClouds()
 
-    def filter_file(self, source: Path, target: Path, expected: int) -> None:
+    def filter_file(self, source: Path, target: Path, expected: int, read: Read) -> None:
         """Filter the cloud of a file; its number is its stamp, which random filters use."""
-        points, columns = self.read(source)
+        points, columns = read()
         number = self.done.scans
         scan = Scan(points=points, stamp_ns=number, frame_id='sensor', columns=columns)
         try:

@@ -25,6 +25,7 @@ from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.offline.filtering import filter_clouds
 from test.bags.recorded import CLOUD, drive, ROS1, ROS2, write_ros1
+from test.offline.test_depth_folders import SIZE, tum, WALL_M
 
 CHAIN = '- range_limit: {min_m: 1}\n- surface_normal: {num_neighbours: 5}\n'
 
@@ -302,3 +303,32 @@ def test_the_verb_reports_every_filter(tmp_path, capsys):
     content = json.loads(capsys.readouterr().out)
     assert content['filters']['1 body_box']['points_in'] == 200
     assert content['outputs'] == [str(tmp_path / 'out.ply')]
+
+
+def test_folders_of_data_sets_and_depth_images_give_a_file_for_each_scan(tmp_path, capsys):
+    tum(tmp_path / 'frames')
+    chain = Chain.from_list(['remove_nan'])
+    done = filter_clouds(chain, [tmp_path / 'frames'], tmp_path / 'out')
+    names = sorted(path.name for path in (tmp_path / 'frames' / 'depth').iterdir())
+    assert [path.name for path in done.outputs] == [name[:-4] + '.ply' for name in names]
+    points, _ = read_scan(done.outputs[0])
+    assert len(points) == SIZE[0] * SIZE[1] - 2  # two pixels have no depth
+    assert np.asarray(points)[:, 2] == pytest.approx(WALL_M)
+
+
+def test_a_folder_of_kitti_gives_a_file_for_each_scan(tmp_path):
+    velodyne = tmp_path / 'sequences' / '00' / 'velodyne'
+    velodyne.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    scans = [rng.uniform(-5.0, 5.0, (50 + k, 4)).astype(np.float32) for k in range(2)]
+    for number, scan in enumerate(scans):
+        scan.tofile(velodyne / f'{number:06}.bin')
+    np.savetxt(velodyne.parent / 'times.txt', [0.0, 0.1])
+    (velodyne.parent / 'calib.txt').write_text('Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n')
+    chain = Chain.from_list(['remove_nan'])
+    done = filter_clouds(chain, [velodyne.parent], tmp_path / 'out')
+    assert [path.name for path in done.outputs] == ['000000.ply', '000001.ply']
+    points, columns = read_scan(done.outputs[1])
+    np.testing.assert_array_equal(points, scans[1][:, :3])
+    (fourth,) = columns.values()
+    np.testing.assert_array_equal(fourth, scans[1][:, 3])
