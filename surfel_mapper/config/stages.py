@@ -293,6 +293,11 @@ class InputConfig(Stage):
         low=-1e10,
         high=1e10,
     )
+    time_offsets_s: tuple[float, ...] = setting(
+        (),
+        'Added as well, one for each of input.topics, if sensors have clocks of their own; empty: '
+        'none.',
+    )
     max_waiting_clouds: int = setting(
         20,
         'At most this many clouds wait to be mapped; the oldest is dropped.',
@@ -301,14 +306,32 @@ class InputConfig(Stage):
     )
 
     def check(self, stage: str) -> None:
-        """Refuse an empty range and topics that are empty or repeated."""
+        """Refuse an empty range, topics that are empty or repeated, and offsets of no topic."""
         if '' in self.topics or len(set(self.topics)) < len(self.topics):
             raise ConfigError(f'{stage}.topics: {self.topics}, expected names that differ')
+        if len(self.time_offsets_s) not in (0, len(self.topics)):
+            raise ConfigError(
+                f'{stage}.time_offsets_s: {list(self.time_offsets_s)}, expected one for each of '
+                f'{stage}.topics {list(self.topics)}, or none'
+            )
         if 0.0 < self.max_range_m <= self.min_range_m:
             raise ConfigError(
                 f'{stage}.max_range_m: {self.max_range_m}, expected more than '
                 f'{stage}.min_range_m ({self.min_range_m}), or 0 for no limit'
             )
+
+    def offset_s(self, topic: str) -> float:
+        """Return the seconds that are added to the stamps of clouds of a topic."""
+        return self.time_offset_s + self.own_offset_s(topic)
+
+    def own_offset_s(self, topic: str) -> float:
+        """Return the seconds of ``time_offsets_s`` for a topic, by its full name."""
+        own = [
+            (len(name), seconds)
+            for name, seconds in zip(self.topics, self.time_offsets_s, strict=False)
+            if f'/{topic}'.endswith(f'/{name.lstrip("/")}')
+        ]
+        return max(own)[1] if own else 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,7 +25,7 @@ from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.messages.cdr import stamp_ns
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import raw_poses, StampedPose
-from surfel_mapper.offline.clocks import clock_offsets, ClockOffset
+from surfel_mapper.offline.clocks import clock_offsets
 from surfel_mapper.offline.pose_choice import (
     choose_for_bag,
     first_scans,
@@ -43,6 +43,7 @@ from surfel_mapper.offline.pose_sources import (
 )
 from surfel_mapper.offline.request import Request, Span, span_of, WHOLE
 from surfel_mapper.offline.survey import depth_topics
+from surfel_mapper.poses import ClockOffset
 
 if TYPE_CHECKING:  # they load the compiler, which `info` does not need
     from surfel_mapper.offline.image_feeds import Decode, DepthFeed, SceneFeed
@@ -85,7 +86,9 @@ class BagRecording:
         self.topics = chosen_topics(reader, request, config)
         check_mounts(request, self.topics, config)
         offsets_ns = {
-            topic: round(1e9 * (config.input.time_offset_s + request.time_offsets.get(topic, 0.0)))
+            topic: round(
+                1e9 * (config.input.offset_s(topic) + request.time_offsets.get(topic, 0.0))
+            )
             for topic in self.topics
         }
         sample = cache(partial(sampled, reader, offsets_ns))
@@ -413,7 +416,7 @@ def add_cloud(
         scan = scan.moved_in_time(message.record_ns - scan.stamp_ns)
     scan = scan.moved_in_time(poses.offsets_ns.get(message.topic, 0))
     if poses.path is not None:
-        offset_ns = round(1e9 * mapper.config.input.time_offset_s)
+        offset_ns = round(1e9 * mapper.config.input.offset_s(message.topic))
         poses.path.add_for(mapper, scan.stamp_ns + offset_ns, number)
     mapper.add_scan(scan, message.topic)
 

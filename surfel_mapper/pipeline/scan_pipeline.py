@@ -178,7 +178,7 @@ class ScanPipeline:
         elif self.map.columns and (missing := self._missing_columns(scan)):
             reason = f'its points have no {" and no ".join(missing)}'
             self.drops.scan(scan, 'missing_column', reason)
-        elif self.config.deskew.enabled or self.config.input.time_offset_s:
+        elif self.config.deskew.enabled or self.config.input.offset_s(scan.topic):
             self._add_timed(scan)
         else:
             self.arrived.append(scan)
@@ -206,7 +206,7 @@ class ScanPipeline:
 
     def _add_timed(self, scan: Scan) -> None:
         """Take a scan by the clock of the poses, with the times that deskewing needs."""
-        deskew, offset_s = self.config.deskew, self.config.input.time_offset_s
+        deskew, offset_s = self.config.deskew, self.config.input.offset_s(scan.topic)
         if deskew.enabled:
             try:
                 times = point_times(scan, deskew.field, deskew.unit, deskew.reference)

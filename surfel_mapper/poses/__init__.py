@@ -3,6 +3,7 @@
 """The tree of coordinate frames over time, and the choice of the source of poses."""
 
 from surfel_mapper.poses.buffer import MAX_EDGES, MAX_TRANSFORMS, TransformBuffer
+from surfel_mapper.poses.clock_offset import ClockOffset, offset_s
 from surfel_mapper.poses.mount_changes import MountChanges
 from surfel_mapper.poses.source_choice import (
     AUTO,
@@ -17,11 +18,13 @@ __all__ = [
     'AUTO',
     'MAX_EDGES',
     'MAX_TRANSFORMS',
+    'ClockOffset',
     'MountChanges',
     'PoseCandidate',
     'SourceChoice',
     'TransformBuffer',
     'choose_source',
     'has_chain',
+    'offset_s',
     'without_chain',
 ]

@@ -177,6 +177,7 @@ class Totals:
             loss=session.inputs.loss() if self.lost > last.lost or not self.received else '',
             alternatives=session.inputs.alternatives,
             poses=session.inputs.poses.warning,
+            clocks=session.inputs.clocks.problem,
             checkpoints=session.checkpoints.problem,
             mounts=session.inputs.poses.mount_changes(session.mapper.mount_changes),
         )

@@ -66,6 +66,8 @@ class Interval:
         Why checkpoints fail, and the age of the last good one; empty if none failed.
     mounts : str
         The sensors that have moved on the robot, and the remedy; empty if none.
+    clocks : str
+        The offsets between the clocks of clouds and poses; empty if none.
 
     """
 
@@ -85,6 +87,7 @@ class Interval:
     poses: str = ''
     checkpoints: str = ''
     mounts: str = ''
+    clocks: str = ''
 
 
 def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
@@ -98,6 +101,8 @@ def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[in
         yield ERROR, interval.checkpoints
     if interval.mounts:
         yield WARN, interval.mounts
+    if interval.clocks:
+        yield WARN, interval.clocks
     if interval.paused:
         yield WARN, 'paused: clouds are dropped until ~/pause is called with false'
     for name, error in interval.layers_off.items():

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 import time
 from typing import Any
@@ -23,7 +24,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError, ConfigError
-from surfel_mapper.messages.cdr import frame_name
+from surfel_mapper.messages.cdr import frame_name, Stamp, stamp_ns
 from surfel_mapper.messages.compressed_image import is_packed
 from surfel_mapper.messages.images import (
     camera_info_topic,
@@ -32,11 +33,13 @@ from surfel_mapper.messages.images import (
     DepthImages,
     SceneImages,
 )
-from surfel_mapper.messages.pointcloud2 import parse_cloud, to_scan
+from surfel_mapper.messages.pointcloud2 import parse_cloud, RawCloud, to_scan
 from surfel_mapper.poses import SourceChoice
 from surfel_mapper.ros.base_node import BaseNode
+from surfel_mapper.ros.clock_watch import ClockWatch
 from surfel_mapper.ros.context import PROFILE
 from surfel_mapper.ros.mapping_thread import MappingThread
+from surfel_mapper.ros.messages import time_message
 from surfel_mapper.ros.pose_inputs import PoseInputs
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
 from surfel_mapper.ros.topic_search import TopicSearch
@@ -80,6 +83,8 @@ class Inputs:
     ----------
     poses : PoseInputs
         The subscriptions to poses.
+    clocks : ClockWatch
+        Compares the clocks of clouds and poses.
     cloud_topics : list of str
         The full names of the topics of clouds, or of depth images.
     lost : dict of str to int
@@ -104,7 +109,12 @@ class Inputs:
         on_choice: Callable[[SourceChoice], object] = lambda choice: None,
     ) -> None:
         subscriptions = SubscriptionExecutor(node, on_failure)
-        self.poses = PoseInputs(node, config, thread, subscriptions, on_choice)
+        self.clocks = ClockWatch(
+            config.input,
+            node.get_logger().warning,
+            lambda: node.get_clock().now().nanoseconds,
+        )
+        self.poses = PoseInputs(node, config, thread, subscriptions, self.clocks, on_choice)
         self.cloud_topics = cloud_topics(node, config)
         self._image_topics = {
             kind: resolved(node, f'layers.tsdf.{kind}_topic', name)
@@ -270,9 +280,20 @@ class Inputs:
     def _on_cloud(self, topic: str, raw: bytes) -> None:
         self._note_received(topic, len(raw))
         try:
-            self._put_cloud(parse_cloud(raw, topic=topic), topic)
+            self._put_cloud(self._stamped(parse_cloud(raw, topic=topic), topic), topic)
         except CloudFormatError as error:
             self._thread.refuse_cloud(topic, str(error))
+
+    def _stamped(self, msg: Any, topic: str) -> Any:
+        """Return a cloud or image with the time of its arrival if its stamp is 0, not set."""
+        if stamp_ns(msg.header):
+            return msg
+        arrival_ns = self.clocks.arrival_ns(topic)
+        if isinstance(msg, RawCloud):
+            stamp = Stamp(*divmod(arrival_ns, 10**9))
+            return replace(msg, header=msg.header._replace(stamp=stamp))
+        msg.header.stamp = time_message(arrival_ns)
+        return msg
 
     def _note_received(self, topic: str, num_bytes: int) -> None:
         """Record the time and the size of a message."""
@@ -281,7 +302,7 @@ class Inputs:
 
     def _on_image(self, topic: str, msg: Image | CompressedImage) -> None:
         self._note_received(topic, len(msg.data))
-        self._put_images(topic, self._images.add_image(topic, msg))
+        self._put_images(topic, self._images.add_image(topic, self._stamped(msg, topic)))
 
     def _on_camera_info(self, topic: str, msg: CameraInfo) -> None:
         try:
@@ -297,6 +318,7 @@ class Inputs:
         self, msg: Any, topic: str, decode: Callable[[Any, str], Scan] = to_scan
     ) -> None:
         """Queue a cloud or depth image; its frame takes part in the choice of the poses."""
+        self.clocks.note_cloud(topic, stamp_ns(msg.header))
         self._thread.put_cloud(msg, topic, decode)
         if self.poses.is_choosing:
             with suppress(CloudFormatError):  # counted when it is decoded

@@ -35,6 +35,7 @@ from surfel_mapper.poses import (
     without_chain,
 )
 from surfel_mapper.ros.base_node import BaseNode
+from surfel_mapper.ros.clock_watch import ClockWatch
 from surfel_mapper.ros.mapping_thread import MappingThread, MAX_POSES
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
 from surfel_mapper.ros.topic_search import TopicSearch
@@ -72,6 +73,8 @@ class PoseInputs:
         Takes the poses.
     subscriptions : SubscriptionExecutor
         Takes the messages.
+    clocks : ClockWatch
+        Gets the stamps of poses, and gives times to those without.
     on_choice : callable
         Called with the source that auto takes, once its poses are in the queue of the thread.
 
@@ -93,6 +96,7 @@ class PoseInputs:
         config: Config,
         thread: MappingThread,
         subscriptions: SubscriptionExecutor,
+        clocks: ClockWatch,
         on_choice: Callable[[SourceChoice], object],
     ) -> None:
         if config.pose.source == TF:
@@ -102,6 +106,7 @@ class PoseInputs:
         self._config = config
         self._thread = thread
         self._subscriptions = subscriptions
+        self._clocks = clocks
         self._on_choice = on_choice
         self._odometry = TopicSearch(node, 'odom', Odometry)
         self._pose = TopicSearch(node, 'pose', PoseStamped)
@@ -286,16 +291,18 @@ class PoseInputs:
         qos = STATIC_TRANSFORMS if topic == STATIC_TOPIC else POSES
         if self.is_choosing and topic != STATIC_TOPIC:
             self._waiting.setdefault(topic, deque(maxlen=MAX_POSES))
-        on_pose = partial(self._on_pose, kind, topic)
+        on_pose = partial(self._on_pose, kind, topic, self._node.resolve_topic_name(topic))
         self._subscriptions.subscribe(message, topic, on_pose, qos, eager=True, raw=True)
 
-    def _on_pose(self, kind: str, topic: str, raw: bytes) -> None:
+    def _on_pose(self, kind: str, topic: str, full_name: str, raw: bytes) -> None:
         try:
-            poses = raw_poses(kind, raw, self._config.frames.base, topic)
+            poses = raw_poses(kind, raw, self._config.frames.base, full_name)
         except PoseError as error:
             self._thread.refuse_pose(str(error))
             return
         is_static = topic == STATIC_TOPIC
+        if not is_static:
+            poses = self._stamped(poses, full_name)
         if not self.is_choosing:
             self._thread.put_poses(poses, static=is_static)
         elif is_static:
@@ -304,6 +311,15 @@ class PoseInputs:
                 self._static.popitem()
         else:
             self._waiting[topic].extend(poses)
+
+    def _stamped(self, poses: list[StampedPose], topic: str) -> list[StampedPose]:
+        """Return poses with the time of their arrival if their stamp is 0; note the others."""
+        if not self.is_choosing:
+            self._clocks.note_poses(topic, [pose.stamp_ns for pose in poses if pose.stamp_ns])
+        if all(pose.stamp_ns for pose in poses):
+            return poses
+        now_ns = self._clocks.arrival_ns(topic)
+        return [pose if pose.stamp_ns else pose._replace(stamp_ns=now_ns) for pose in poses]
 
 
 def transform_message() -> Any:

@@ -9,8 +9,9 @@ import pytest
 
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.cli.main import main
-from surfel_mapper.offline.clocks import clock_offsets, ClockOffset, offset_s
+from surfel_mapper.offline.clocks import clock_offsets
 from surfel_mapper.offline.survey import survey
+from surfel_mapper.poses import ClockOffset, offset_s
 from test import extras
 from test.bags.recorded import CLOUD, drive, NUM_SCANS, TF, write_rosbag2
 

@@ -162,6 +162,22 @@ def test_topics_with_one_frame_and_equal_stamps_are_both_mapped():
     assert dropped(mapper) == {'stamp_repeated': 2}
 
 
+def test_offsets_of_topics_are_added_to_the_stamps_of_their_scans():
+    mapper = mapper_with(
+        input__topics=['points', '/rear/points'],
+        input__time_offset_s=1.0,
+        input__time_offsets_s=[-38.0, 3.0],
+    )
+    add_pose(mapper, 4.0, x=0.0)
+    add_pose(mapper, 4.4, x=4.0)
+
+    for stamp_s, topic in ((41.1, '/front/points'), (0.2, '/rear/points')):
+        mapper.add_scan(scan_at(stamp_s), topic)
+    stamps_ns = [update.stamp_ns for update in mapper.insert_ready()]
+
+    assert stamps_ns == [4_100_000_000, 4_200_000_000]
+
+
 def test_an_offset_of_the_clock_is_added_to_the_stamps_of_scans():
     mapper = mapper_with(input__time_offset_s=-37.0)
     add_pose(mapper, 4.0, x=0.0)

@@ -16,6 +16,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 
@@ -218,6 +219,7 @@ def inputs_of(config, publishers=()):
         resolve_topic_name=lambda name: f'/{name}',
         get_publishers_info_by_topic=lambda topic: publishers,
         get_logger=lambda: SimpleNamespace(warning=lambda *_, **__: None),
+        get_clock=Clock,
     )
     thread = SimpleNamespace(put_cloud=lambda *_: None, refuse_cloud=lambda *_: None)
     return Inputs(node, config, thread, on_failure=None)

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import time
+
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 import pytest
@@ -13,6 +15,7 @@ from surfel_mapper import Config
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.request import Request
 from surfel_mapper.ros import pose_inputs
+from surfel_mapper.ros.clock_watch import ClockWatch
 from surfel_mapper.ros.pose_inputs import PoseInputs
 from surfel_mapper.ros.topic_search import TopicSearch
 from test.bags import recorded
@@ -194,7 +197,9 @@ def reading(guarded_peer, monkeypatch):
             guarded_peer.node.create_publisher(kinds[kind], topic, 1)
         subscriptions, poses, choices = Subscriptions(), Poses(), []
         config = Config.from_mapping({'pose.registration_after_s': 0.0, **(settings or {})})
-        inputs = PoseInputs(guarded_peer.node, config, poses, subscriptions, choices.append)
+        node, on_choice = guarded_peer.node, choices.append
+        clocks = ClockWatch(config.input, lambda text: None, time.time_ns)
+        inputs = PoseInputs(node, config, poses, subscriptions, clocks, on_choice)
         inputs.subscribe()
         inputs.check()
         for topic, kind, _, message in entries:
