@@ -342,7 +342,7 @@ def test_invalid_clouds_are_refused(points, viewpoint):
 
 
 @pytest.mark.parametrize(
-    'settings', [{'profile': 'quick'}, {'voxel_size_m': 0.0}, {'min_density_radius': 3.0}]
+    'settings', [{'profile': 'quick'}, {'voxel_size_m': 0.0}, {'min_density_radius': 3.1}]
 )
 def test_settings_out_of_bounds_are_refused(settings):
     with pytest.raises(ConfigError, match=next(iter(settings))):
