@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-import re
 
 from surfel_mapper.errors import BagError
+from surfel_mapper.messages.converters import converter
 
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 IMAGE = 'sensor_msgs/msg/Image'
@@ -26,20 +26,6 @@ TF = 'tf2_msgs/msg/TFMessage'
 
 SAME_AS = {'tf/msg/tfMessage': TF}
 """Names of types in early ROS 1, and the type with the same content."""
-
-CONVERTERS = {
-    r'livox\w*/msg/CustomMsg$': 'livox_ros_driver2 publishes PointCloud2 with xfer_format 0',
-    r'velodyne_msgs/msg/VelodyneScan$': 'velodyne_transform_node of velodyne_pointcloud',
-    r'ouster\w*/msg/PacketMsg$': '`ros2 launch ouster_ros replay.launch.xml`',
-    r'(hesai|pandar)\w*/msg/': 'hesai_ros_driver, with packets of ROS as its source',
-    r'nebula_msgs/msg/': 'nebula_ros with launch_hw false',
-    r'rslidar\w*/msg/': 'rslidar_sdk with msg_source 2',
-    r'CompressedPointCloud2$': '`ros2 run point_cloud_transport republish`',
-    r'LaserScan$': 'laserscan_to_pointcloud_node of pointcloud_to_laserscan',
-    r'sensor_msgs/msg/PointCloud$': 'point_cloud_converter of pcl_ros',
-    r' as \w+$': 'the packages mcap-protobuf-support and mcap-ros2-support of Python',
-}
-"""Programs that make PointCloud2 of messages, by a regular expression of the type."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,9 +130,4 @@ class Topics(list[Topic]):
 def converters(topics: Collection[Topic]) -> list[str]:
     """Return the program that makes PointCloud2 of each type for which there is one."""
     types = dict.fromkeys(topic.type for topic in topics)
-    return [
-        f'{type_}: {program}'
-        for type_ in types
-        for pattern, program in CONVERTERS.items()
-        if re.search(pattern, type_)
-    ]
+    return [f'{type_}: {program}' for type_ in types if (program := converter(type_))]

@@ -160,7 +160,9 @@ class Totals:
         self.num_publishers, unheard = publishers(node, topic)
         silent_s = max(self.time_s - received_s, 0.0)
         is_silent = silent_s > SILENT_S and min(self.num_publishers, last.num_publishers) > 0
-        if is_silent and not unheard and (unheard := of_another_user(node)):
+        if is_silent and not unheard:
+            unheard = of_another_user(node)
+        if unheard and not self.received:
             node.get_logger().warning(f'{topic}: {unheard}', throttle_duration_sec=60.0)
         return Interval(
             topic=topic,

@@ -132,7 +132,7 @@ class Inputs:
         self._search: TopicSearch | None = None
         if config.input.kind == 'cloud' and not config.input.topics:
             self._search = TopicSearch(node, DEFAULT_TOPICS['cloud'], PointCloud2)
-        self._warned_of: list[str] = []
+        self._warned_of = ''
         self._start_s = self._checked_s = time.monotonic()
 
     def subscribe(self) -> None:
@@ -210,7 +210,8 @@ class Inputs:
     def alternatives(self) -> str:
         """The topics of clouds that could be read instead of the default one; empty if none."""
         search = self._search
-        return search.missing if search is not None and search.alternatives else ''
+        has_any = search is not None and (search.alternatives or search.convertible)
+        return search.missing if search is not None and has_any else ''
 
     def _on_turn(self) -> None:
         """Look for poses and clouds until there are some; called by the subscriptions."""
@@ -220,7 +221,7 @@ class Inputs:
         self.poses.check()
         if self._search is not None:
             self._find_clouds(self._search)
-        if self._search is None and not self.poses.is_choosing:
+        if self._search is None and not self.poses.is_looking:
             self._subscriptions.on_turn = None
 
     def _find_clouds(self, search: TopicSearch) -> None:
@@ -237,8 +238,8 @@ class Inputs:
             )
             self._read_instead(search.topic, search.only_alternative)
             self._search = None
-        elif search.alternatives and search.alternatives != self._warned_of:
-            self._warned_of = search.alternatives
+        elif self.alternatives and self.alternatives != self._warned_of:
+            self._warned_of = self.alternatives
             self._node.get_logger().warning(f'no clouds: {search.missing}')
 
     def _read_instead(self, topic: str, alternative: str) -> None:

@@ -18,7 +18,7 @@ from functools import partial
 import time
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -109,7 +109,8 @@ class PoseInputs:
         self._clocks = clocks
         self._on_choice = on_choice
         self._odometry = TopicSearch(node, 'odom', Odometry)
-        self._pose = TopicSearch(node, 'pose', PoseStamped)
+        self._pose = TopicSearch(node, 'pose', PoseStamped, PoseWithCovarianceStamped)
+        self._pose_message = PoseStamped
         self._waiting: dict[str, deque[StampedPose]] = {}  # by topic, until the choice
         self._static: dict[str, StampedPose] = {}  # by child
         self._missing = ''
@@ -137,6 +138,12 @@ class PoseInputs:
     def is_choosing(self) -> bool:
         """Whether auto has not chosen yet."""
         return self._config.pose.source == AUTO and self.choice is None
+
+    @property
+    def is_looking(self) -> bool:
+        """Whether auto has not chosen yet, or poses have no publisher yet."""
+        waits = self._config.pose.source == POSE and not self._pose.has_publisher
+        return self.is_choosing or waits
 
     @property
     def source(self) -> str:
@@ -175,10 +182,16 @@ class PoseInputs:
             self._frame_id, self._first_cloud_s = frame_id, time.monotonic()
 
     def check(self) -> None:
-        """Choose a source, if it is time and one is there."""
-        if not self.is_choosing:
+        """Choose a source, if it is time and one is there; read poses with the type they have."""
+        if not self.is_looking:
             return
         self._pose.look()
+        if self._pose.message is not self._pose_message:
+            self._pose_message = self._pose.message
+            self._subscriptions.unsubscribe(self._pose.topic)
+            self._subscribe(POSE, self._pose.topic)
+        if not self.is_choosing:
+            return
         self._odometry.look()
         alternative = self._odometry.only_alternative
         if alternative and alternative not in self._waiting:
@@ -287,7 +300,8 @@ class PoseInputs:
 
     def _subscribe(self, kind: str, topic: str) -> None:
         """Subscribe to poses or transforms."""
-        message = {ODOMETRY: Odometry, POSE: PoseStamped}.get(kind) or transform_message()
+        known = {ODOMETRY: Odometry, POSE: self._pose_message}
+        message = known.get(kind) or transform_message()
         qos = STATIC_TRANSFORMS if topic == STATIC_TOPIC else POSES
         if self.is_choosing and topic != STATIC_TOPIC:
             self._waiting.setdefault(topic, deque(maxlen=MAX_POSES))

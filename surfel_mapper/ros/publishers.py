@@ -20,6 +20,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from surfel_mapper.messages.converters import converter
+
 SHARED_MEMORY = Path('/dev/shm')
 
 PORT = re.compile('fastrtps_port([0-9]+)')
@@ -35,10 +37,14 @@ UNHEARD = {
 """Policy offered by a publisher that a subscription with the second one does not hear."""
 
 
+def type_name(message: Any) -> str:
+    """Return the name of the type of a message class."""
+    return f'{message.__module__.partition(".")[0]}/msg/{message.__name__}'
+
+
 def publishers_of(node: Node, topic: str, message: Any) -> list[TopicEndpointInfo]:
     """Return the publishers of a topic that send messages of a class."""
-    package = message.__module__.partition('.')[0]
-    kind = f'{package}/msg/{message.__name__}'
+    kind = type_name(message)
     endpoints = node.get_publishers_info_by_topic(topic)
     return [publisher for publisher in endpoints if publisher.topic_type == kind]
 
@@ -52,12 +58,17 @@ def of_other_types(node: Node, topic: str, message: Any) -> str:
     """Return the publishers of a topic that send messages of another class; empty if none."""
     expected = publishers_of(node, topic, message)
     texts = {
-        f'{full_name(publisher)} publishes {publisher.topic_type} there'
+        f'{full_name(publisher)} publishes {with_converter(publisher.topic_type)} there'
         for publisher in node.get_publishers_info_by_topic(topic)
         if publisher not in expected
     }
-    kind = f'{message.__module__.partition(".")[0]}/msg/{message.__name__}'
-    return f'{", ".join(sorted(texts))}, expected {kind}' if texts else ''
+    return f'{", ".join(sorted(texts))}, expected {type_name(message)}' if texts else ''
+
+
+def with_converter(kind: str) -> str:
+    """Return the name of a type, and the program that makes PointCloud2 of it, if there is one."""
+    program = converter(kind)
+    return f'{kind} (to convert: {program})' if program else kind
 
 
 def other_users(domain_id: int, user_id: int) -> str:

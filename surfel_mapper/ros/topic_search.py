@@ -12,8 +12,10 @@ from __future__ import annotations
 from typing import Any
 
 from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
 
-from surfel_mapper.ros.publishers import publishers_of
+from surfel_mapper.messages.converters import converter
+from surfel_mapper.ros.publishers import publishers_of, with_converter
 
 MARK = 'clear_polygon'
 """Private topic that every mapping node subscribes to, by which they are recognised."""
@@ -29,32 +31,43 @@ class TopicSearch:
         The node that reads it.
     name : str
         Its name before remapping, such as points.
-    message : type
-        Class of its messages.
+    messages : type
+        Classes of its messages, the usual one first.
 
     Attributes
     ----------
     topic : str
         Its full name.
+    message : type
+        The class that it was published with when ``look`` was called last; else the first.
     has_publisher : bool
         Whether it had a publisher when ``look`` was called last.
     alternatives : list of str
         Topics of its type with a publisher, as ``look`` saw them; none if it has one itself.
+    convertible : list of str
+        Topics of other types that a program makes PointCloud2 of, with type and program.
 
     """
 
-    def __init__(self, node: Node, name: str, message: Any) -> None:
+    def __init__(self, node: Node, name: str, *messages: Any) -> None:
         self._node = node
         self._name = name
-        self._message = message
+        self._messages = messages
+        self.message = messages[0]
         self.topic = str(node.resolve_topic_name(name))
         self.has_publisher = False
         self.alternatives: list[str] = []
+        self.convertible: list[str] = []
 
     def look(self) -> None:
         """Look at the graph."""
-        self.has_publisher = bool(publishers_of(self._node, self.topic, self._message))
+        published = [
+            message for message in self._messages if publishers_of(self._node, self.topic, message)
+        ]
+        self.message = (*published, self._messages[0])[0]
+        self.has_publisher = bool(published)
         self.alternatives = [] if self.has_publisher else self._published_elsewhere()
+        self.convertible = [] if self.has_publisher else self._convertible()
 
     @property
     def only_alternative(self) -> str:
@@ -79,7 +92,10 @@ class TopicSearch:
         if self.has_publisher:
             return ''
         arguments = ' or '.join(map(self.argument, self.alternatives))
-        return f'no publisher of {self.topic}{f"; choose with {arguments}" if arguments else ""}'
+        choice = f'choose with {arguments}' if arguments else ''
+        return '; '.join(
+            filter(None, [f'no publisher of {self.topic}', choice, *self.convertible])
+        )
 
     def argument(self, topic: str) -> str:
         """Return the argument of the node that reads another topic."""
@@ -91,9 +107,23 @@ class TopicSearch:
         marks = {topic for topic, _ in graph if topic.endswith(f'/{MARK}')}
         return sorted(topic for topic, _ in graph if self._is_input(topic, marks))
 
+    def _convertible(self) -> list[str]:
+        """Return the topics of which a program makes clouds, if clouds are looked for."""
+        if PointCloud2 not in self._messages:
+            return []
+        graph = self._node.get_topic_names_and_types()
+        texts = (
+            (topic, with_converter(kind))
+            for topic, kinds in graph
+            for kind in kinds
+            if converter(kind)
+        )
+        return [f'{topic} has {text}' for topic, text in sorted(texts)]
+
     def _is_input(self, topic: str, marks: set[str]) -> bool:
         """Return whether a topic has a publisher of the type that is no mapping node."""
         return any(
             f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}/{MARK}' not in marks
-            for publisher in publishers_of(self._node, topic, self._message)
+            for message in self._messages
+            for publisher in publishers_of(self._node, topic, message)
         )

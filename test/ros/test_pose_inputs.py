@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import pytest
 from sensor_msgs.msg import PointCloud2
@@ -24,6 +24,7 @@ from test.ros.live import Peer
 
 DEFAULTS = ['--ros-args', '-p', 'publish.diagnostics_rate_hz:=20.0']
 PATIENT = [*DEFAULTS, '-p', 'pose.registration_after_s:=3600.0']  # on a loaded machine too
+COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 MOUNT = ['-p', 'frames.base_to_sensor:=[0.1, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]']
 
 
@@ -92,6 +93,30 @@ def test_pose_messages_are_taken_without_odometry(start, peer):
 
     assert values['pose_source'] == 'pose', node.output
     assert 'not from odometry: no publisher of /odom' in values['pose_reason']
+
+
+@pytest.mark.parametrize('source', ['auto', 'pose'])
+def test_pose_messages_with_covariance_are_taken(start, peer, source):
+    node = start('node', *PATIENT, *MOUNT, '-p', f'pose.source:={source}')
+    kinds = {'/pose': PoseWithCovarianceStamped}
+    publishers(peer, '/pose', '/points', kinds=kinds)
+    peer.wait_until_read('/points')
+    peer.spin_until(lambda: types_read(peer, '/pose') == {COVARIANCE}, what=lambda: node.output)
+    peer.wait_until_read('/pose')
+    messages = [
+        (cloud, PoseWithCovarianceStamped(header=odom.header, pose=odom.pose))
+        for cloud, odom in drive(3)
+    ]
+    send(peer, messages, odom='/pose')
+
+    _, values = peer.diagnosis({'scans.mapped': 3, 'waiting': 0})
+
+    assert values['pose_source'] == 'pose'
+
+
+def types_read(peer, topic):
+    """Return the types of the subscriptions to a topic."""
+    return {info.topic_type for info in peer.node.get_subscriptions_info_by_topic(topic)}
 
 
 def test_odometry_that_comes_after_the_clouds_is_taken(start, peer):

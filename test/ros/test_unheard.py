@@ -8,12 +8,13 @@ import os
 import pwd
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import LaserScan, PointCloud2
 from std_msgs.msg import String
 
 from surfel_mapper.cli._ros import check_middleware
@@ -50,11 +51,38 @@ def test_a_publisher_of_another_type_is_named_with_its_type(peer):
     assert of_other_types(peer.node, '/points', String) == ''
 
 
-def test_the_diagnostics_name_the_type_that_is_published(start, peer):
+def test_log_and_diagnostics_name_the_type_that_is_published(start, peer):
     node = start('node', *ARGUMENTS)
-    peer.node.create_publisher(String, '/points', 10)
-    expected = 'publishes std_msgs/msg/String there, expected sensor_msgs/msg/PointCloud2'
+    peer.node.create_publisher(LaserScan, '/points', 10)
+    expected = (
+        'publishes sensor_msgs/msg/LaserScan (to convert: laserscan_to_pointcloud_node of '
+        'pointcloud_to_laserscan) there, expected sensor_msgs/msg/PointCloud2'
+    )
     peer.spin_until(lambda: expected in peer.diagnosis()[0].message)
+    node.wait_for_output(expected)
+    node.check()
+
+
+@pytest.mark.parametrize('driver', ['livox_ros_driver', 'livox_ros_driver2'])
+def test_the_message_of_livox_is_named_with_the_option_of_its_driver(driver):
+    kind = f'{driver}/msg/CustomMsg'
+    endpoint = SimpleNamespace(node_namespace='/', node_name='livox', topic_type=kind)
+    node = SimpleNamespace(get_publishers_info_by_topic=lambda topic: [endpoint])
+    assert of_other_types(node, '/livox/lidar', PointCloud2) == (
+        f'/livox publishes {kind} (to convert: livox_ros_driver2 publishes PointCloud2 with '
+        'xfer_format 0) there, expected sensor_msgs/msg/PointCloud2'
+    )
+
+
+def test_topics_of_which_a_program_makes_clouds_are_named(start, peer):
+    node = start('node', *ARGUMENTS)
+    peer.node.create_publisher(LaserScan, '/scan', 10)
+    expected = (
+        'no publisher of /points; /scan has sensor_msgs/msg/LaserScan (to convert: '
+        'laserscan_to_pointcloud_node of pointcloud_to_laserscan)'
+    )
+    peer.spin_until(lambda: expected in peer.diagnosis()[0].message)
+    node.wait_for_output(f'no clouds: {expected}')
     node.check()
 
 
