@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count, takewhile
 import logging
 from typing import Any
 
 import numpy as np
 
-from surfel_mapper.cluster.shards import map_shard, Shard, ShardResult
+from surfel_mapper.cluster.shards import continues, map_shard, Shard, ShardResult
 from surfel_mapper.cluster.workers import never, Workers
 from surfel_mapper.errors import MapError
 from surfel_mapper.pipeline import Mapper, ScanOutcome
@@ -117,20 +118,24 @@ def map_bags(
         on_done(result.recorded_s)
         bag, index = indices[number]
         unfinished[bag][index] = result
-        results = leading(unfinished[bag])
-        if len(results) == len(bags[bag]):
+        if len(unfinished[bag]) == len(bags[bag]) and continues(
+            results := leading(unfinished[bag])
+        ):
             total.add(results)
             del unfinished[bag]
     again = [bag for bag, results in unfinished.items() if len(results) == len(bags[bag])]
     for bag in again:
-        log.warning('%s: its shards do not fit; it is mapped as one', bags[bag][0].request.path)
-    wholes = [replace(bags[bag][0], start_ns=None, stop_ns=None) for bag in again]
+        log.warning(
+            '%s: its scans are out of order; it is mapped as one', bags[bag][0].request.path
+        )
+    wholes = [replace(bags[bag][0], span=None) for bag in again]
     for number, result in workers.run(map_shard, wholes, stopped):
         total.add([result])
         total.repeated += 1
         del unfinished[again[number]]
     for partial in unfinished.values():
-        total.add(leading(partial))
+        results = leading(partial)
+        total.add(results if continues(results) else results[:1])
     total.interrupted = bool(unfinished)
     if not total.stamps_ns:
         raise MapError('no scan was mapped')
@@ -139,15 +144,8 @@ def map_bags(
 
 
 def leading(results: Mapping[int, ShardResult]) -> list[ShardResult]:
-    """Return the shards from the start of a bag that continue each other, by their numbers."""
-    if len(results) > 1 and any(result.resets for result in results.values()):
-        return []  # time was set back, which clears the map of all shards before
-    run: list[ShardResult] = []
-    while (result := results.get(len(run))) is not None:
-        if run and run[-1].end_outlook != result.start_outlook:
-            break
-        run.append(result)
-    return run
+    """Return the shards from the start of a bag up to the first that is not done."""
+    return [results[number] for number in takewhile(results.__contains__, count())]
 
 
 def added(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:

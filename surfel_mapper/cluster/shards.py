@@ -3,16 +3,15 @@
 """
 Map: shards, which are bags cut by record time, each mapped on its own as a part of the whole.
 
-A worker starts to read some time before its shard (the lead), so that poses and stamps are known
-when the shard begins. The state that decides about later scans is hashed at both ends
-(ShardMapper.outlook): if the end of one shard and the start of the next agree, both make the map
-of a single process.
+A shard is a part of a recording as ``replay --start --duration`` maps it, with the poses of 5 s
+before and after it. Moments are integers, so the sum of the shards is the map of a single process
+unless scans of one sensor are out of order at a border. ``continues`` notices that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 import math
 import time
 from typing import Any
@@ -20,28 +19,33 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.bags.reader import BagMessage
 from surfel_mapper.config import Config
-from surfel_mapper.errors import BagError, ConfigError
+from surfel_mapper.errors import ConfigError
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.memory import keep_freed_memory
-from surfel_mapper.offline.bag_recording import add_cloud, add_poses, add_static, BagRecording
+from surfel_mapper.offline.bag_recording import BagRecording, feed
 from surfel_mapper.offline.outputs import ScanTrajectory
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import all_scans
-from surfel_mapper.offline.request import Request
-from surfel_mapper.pipeline import ScanOutcome
-from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s
-from surfel_mapper.pipeline.update import Update
+from surfel_mapper.offline.request import MARGIN_NS, Request, Span
+from surfel_mapper.pipeline import Mapper, ScanOutcome
 
 SHORTEST_S, LONGEST_S = 5.0, 60.0
-"""Bounds of the length of a shard, s: its lead is read twice, its map is held in memory."""
+"""Bounds of the length of a shard, s: its margins are read twice, its map is held in memory."""
 
 SLACK = 0.02
 """Share by which shards may be longer, to avoid one more short shard."""
 
-LEAD_S = 1.0
-"""Time before the oldest pose that a worker may need, s."""
+IN_ORDER: dict[str, Any] = {
+    'window.gate_distance_m': 0.0,
+    'window.gate_angle_deg': 0.0,
+    'align.every_scans': 0,
+    'dynamic.clear': False,
+}
+"""Settings with which a scan does not depend on all before it."""
+
+WAITS = ('pose.max_wait_s', 'pose.max_delay_s', 'pose.max_gap_s')
+"""Settings that have to be shorter than the margins of a shard."""
 
 SETTINGS: dict[str, Any] = {
     **all_scans(),
@@ -62,24 +66,14 @@ class Shard:
         The recording, with absolute paths, and the part that all shards map together.
     config : Config
         The settings.
-    start_ns, stop_ns : int, optional
-        Record time of its first message, and of the first one after it; None at the ends of the
-        part that is mapped.
-    lead_s : float
-        Time before its start at which reading begins, s.
+    span : Span, optional
+        The part of a bag; None for all of the request.
 
     """
 
     request: Request
     config: Config
-    start_ns: int | None = None
-    stop_ns: int | None = None
-    lead_s: float = 0.0
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether it is the whole part of its recording."""
-        return self.start_ns is None and self.stop_ns is None
+    span: Span | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,12 +87,10 @@ class ShardResult:
         Its part of the map.
     config : Config
         The settings, with the source of the poses.
-    start_outlook, end_outlook : str, optional
-        Outlook at its start and at its stop; None at the ends of the bag.
     counts : dict
-        ``Counters.summary`` of this part alone.
+        ``Counters.summary``.
     resets : int
-        Times that the clock was set back, in its lead too.
+        Times that the clock was set back.
     recorded_s, core_s : float
         Time from its start to its stop, and processor time of mapping it.
     stamps_ns : (S,) int64
@@ -112,8 +104,6 @@ class ShardResult:
 
     map: SurfelMap
     config: Config
-    start_outlook: str | None
-    end_outlook: str | None
     counts: dict[str, Any]
     resets: int
     recorded_s: float
@@ -165,12 +155,15 @@ def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
         if not isinstance(recording, BagRecording) or not may_be_cut(recording):
             return [whole]
         start_ns, stop_ns = recording.bounds_ns
+        span = recording.span
     number = max(math.ceil((stop_ns - start_ns) / 1e9 / shard_s - SLACK), 1)
+    if number == 1:
+        return [whole]
     bounds = [start_ns + (stop_ns - start_ns) * k // number for k in range(1, number)]
-    lead_s = LEAD_S + config.input.reset_after_s + sweep_s(config)
+    starts, stops = [span.start_ns, *bounds], [*bounds, span.stop_ns]
     return [
-        replace(whole, start_ns=first, stop_ns=last, lead_s=lead_s)
-        for first, last in zip([None, *bounds], [*bounds, None], strict=True)
+        replace(whole, span=Span(start_ns=first, stop_ns=last))
+        for first, last in zip(starts, stops, strict=True)
     ]
 
 
@@ -181,10 +174,16 @@ def absolute(request: Request) -> Request:
 
 
 def may_be_cut(recording: BagRecording) -> bool:
-    """Return whether a scan depends on neighbouring messages alone, and not on its number."""
-    path = recording.poses.path
+    """Return whether a scan depends on messages within the margins alone."""
+    path, settings = recording.poses.path, recording.config.to_mapping()
     by_number = recording.span.every > 1 or (path is not None and not path.has_stamps)
-    return is_divisible(recording.config) and not by_number
+    return (
+        not by_number
+        and settings['pose.source'] != 'registration'
+        and all(settings[name] == value for name, value in IN_ORDER.items())
+        and all(settings[name] * 1e9 < MARGIN_NS for name in WAITS)
+        and settings['pose.max_gap_s'] > 0.0
+    )
 
 
 def map_shard(shard: Shard) -> ShardResult:
@@ -202,29 +201,22 @@ def map_shard(shard: Shard) -> ShardResult:
     began = time.process_time()
     keep_freed_memory()
     with open_recording(shard.request, shard.config) as recording:
-        mapper = ShardMapper(recording.config)
+        mapper = Mapper(recording.config)
+        mapper.derives = False  # surfels are derived when all shards are merged
         mapper.outcomes, mapper.pose_source = [], recording.describe()['poses_from']
+        updates, recorded_s = recording.replay(mapper), recording.recorded_s
+        if isinstance(recording, BagRecording) and shard.span is not None:
+            reader = recording.reader
+            updates = feed(reader, mapper, recording.topics, recording.poses, span=shard.span)
+            start_ns, stop_ns = shard.span.clipped(reader.start_ns, reader.end_ns)
+            recorded_s = (stop_ns - start_ns) / 1e9
         trajectory = ScanTrajectory(mapper)
-        start = ShardStart()
-        if shard.is_whole:
-            updates = recording.replay(mapper)
-        elif isinstance(recording, BagRecording):
-            updates = replay_middle(recording, mapper, shard, start)
-        else:
-            raise TypeError(f'{shard.request.path}: only bags are cut')
         for update in updates:
             trajectory.add(update)
-        recorded_s = recording.recorded_s
-        if isinstance(recording, BagRecording):
-            first_ns, last_ns = recording.bounds_ns
-            start_ns = first_ns if shard.start_ns is None else shard.start_ns
-            recorded_s = ((shard.stop_ns or last_ns) - start_ns) / 1e9
     return ShardResult(
         map=mapper.map,
         config=mapper.config,
-        start_outlook=start.outlook,
-        end_outlook=None if shard.stop_ns is None else mapper.outlook(),
-        counts=difference(mapper.counters.summary(), start.counts),
+        counts=mapper.counters.summary(),
         resets=mapper.counters.resets,
         recorded_s=recorded_s,
         core_s=time.process_time() - began,
@@ -234,67 +226,26 @@ def map_shard(shard: Shard) -> ShardResult:
     )
 
 
-@dataclass(slots=True)
-class ShardStart:
-    """Outlook and counts of a mapper at the start of its shard."""
-
-    outlook: str | None = None
-    counts: dict[str, Any] = field(default_factory=dict)
-
-    def record(self, mapper: ShardMapper) -> None:
-        """Take them from a mapper that maps from now on."""
-        self.outlook, self.counts = mapper.outlook(), mapper.counters.summary()
-        mapper.passes_over, mapper.outcomes = False, []
-
-
-def replay_middle(
-    recording: BagRecording, mapper: ShardMapper, shard: Shard, start: ShardStart
-) -> Iterator[Update]:
-    """Feed a shard to a mapper after its lead, and record its start; yield the updates."""
-    if recording.config.input.kind == 'depth':
-        raise BagError(f'{recording.reader.path}: depth images are mapped by one process alone')
-    reader, poses, clouds = recording.reader, recording.poses, set(recording.topics)
-    mapper.passes_over = shard.start_ns is not None
-    static = add_static(reader, mapper, poses)
-    for message in messages_of(recording, shard):
-        if mapper.passes_over and message.record_ns >= (shard.start_ns or 0):
-            start.record(mapper)
-        if message.topic not in clouds:
-            add_poses(reader, mapper, message, poses, static)
-        elif recording.span.holds(message.record_ns):
-            add_cloud(reader, mapper, message, poses, 0)
-        yield from mapper.insert_ready()
-    if mapper.passes_over:  # no message was recorded since
-        start.record(mapper)
-    if shard.stop_ns is None:
-        mapper.end_scans()
-        yield from mapper.insert_ready()
-        mapper.finish()
-
-
-def messages_of(recording: BagRecording, shard: Shard) -> Iterator[BagMessage]:
-    """Yield static transforms from before a shard, then its messages from its lead on."""
-    reader, poses, span = recording.reader, recording.poses, recording.span
-    first_ns = span.poses_start_ns
-    if shard.start_ns is not None:
-        earliest_ns = reader.start_ns if first_ns is None else first_ns
-        lead_ns = shard.start_ns - round(shard.lead_s * 1e9)
-        first_ns = lead_ns if lead_ns > earliest_ns else first_ns
-    if poses.static and first_ns is not None:
-        yield from reader.messages(poses.static, None, first_ns)
-    names = {*recording.topics, *poses.kinds, *poses.static}
-    last_ns = span.poses_stop_ns if shard.stop_ns is None else shard.stop_ns
-    yield from reader.messages(names, first_ns, last_ns)
-
-
-def difference(counts: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
-    """Return counts less earlier ones; times of stages stay as they are."""
-    change: dict[str, Any] = {}
-    for name, value in counts.items():
-        if name == 'milliseconds':
-            change[name] = value
-        elif isinstance(value, dict):
-            change[name] = difference(value, earlier.get(name, {}))
-        else:
-            change[name] = value - earlier.get(name, 0)
-    return change
+def continues(results: Sequence[ShardResult]) -> bool:
+    """Return whether shards make the map of one go: no stamp twice, and no time set back."""
+    newest_ns: dict[tuple[str, str], int] = {}
+    all_stamps: set[tuple[str, str, int]] = set()
+    for result in results:
+        if result.resets and len(results) > 1:
+            return False  # which clears the map of all shards before
+        back_ns = round(1e9 * result.config.input.reset_after_s)
+        stamps = {
+            (outcome.frame_id, outcome.topic, outcome.stamp_ns)
+            for outcome in result.outcomes
+            if outcome.stamp_ns is not None
+        }
+        if stamps & all_stamps or any(
+            stamp_ns < newest_ns.get((frame_id, topic), 0) - back_ns
+            for frame_id, topic, stamp_ns in stamps
+        ):
+            return False
+        all_stamps |= stamps
+        for frame_id, topic, stamp_ns in stamps:
+            sensor = (frame_id, topic)
+            newest_ns[sensor] = max(stamp_ns, newest_ns.get(sensor, 0))
+    return True

@@ -31,7 +31,7 @@ POLL_S = 0.02
 
 LOOPBACK = '127.0.0.1'
 
-PRELOADED = ['surfel_mapper.cluster._forkserver_preload', 'distributed']
+PRELOADED = ['surfel_mapper.cluster.shards', 'distributed']
 """Modules of the fork server; loading them would take each local worker 2 s."""
 
 SETTINGS: dict[str, Any] = {

@@ -117,16 +117,12 @@ class Drops:
     ----------
     counters : Counters
         The counters.
-    is_silent : bool
-        Count without warnings.
     outcomes : list of ScanOutcome, optional
         Outcomes of all scans, in the order of the decisions; None does not keep them.
     pose_source : str
         The source of the poses.
 
     """
-
-    is_silent = False
 
     def __init__(self, counters: Counters, pose_source: str) -> None:
         self.counters = counters
@@ -215,7 +211,7 @@ class Drops:
     def warn(self, cause: str, message: str) -> None:
         """Log a warning, unless one of the same cause was logged just before."""
         now_s = time.monotonic()
-        if not self.is_silent and now_s - self._warned_s.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
+        if now_s - self._warned_s.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
             if len(self._warned_s) >= MAX_CAUSES:
                 self._warned_s.clear()
             self._warned_s[cause] = now_s

@@ -267,12 +267,6 @@ class ScanPipeline:
         if newest_ns is not None and (newest_ns - scan.stamp_ns) / 1e9 > reset_after_s:
             self.poses.transforms.clear()  # else the scan would be mapped at a pose of that time
 
-    def pass_over(self) -> None:
-        """Take the scans that arrived as far as their poses; none is mapped."""
-        self.judge_stamps()
-        while self._next_posed(more_follows=False) is not None:
-            pass
-
     def _next_posed(self, more_follows: bool) -> PosedScan | None:
         """Return the next scan and its T_fixed_sensor; None until more input comes."""
         posed = self.queue.posed

@@ -23,7 +23,7 @@ other. The clock is not read, and a replay decides as the node did.
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.poses import TransformBuffer
@@ -113,20 +113,6 @@ class StampGuard:
     def newest_scan_ns(self) -> int | None:
         """The newest stamp of a scan, whether the scan is mapped or still waits."""
         return max(self._scan_ns.values(), default=None)
-
-    @property
-    def scan_stamps(self) -> list[tuple[Source, int]]:
-        """The sources of scans, sorted, and the newest stamp of each, ns."""
-        return sorted(self._scan_ns.items())
-
-    def state(self) -> list[Any]:
-        """Return the content on which later judgements depend, to compare two guards."""
-        recent = [
-            (source, sorted(s for s in stamps if s >= self._scan_ns[source] - self._back_ns))
-            for source, stamps in sorted(self._recent_ns.items())
-        ]
-        odd = [message.stamp_ns for message in self._odd]
-        return [self.scan_stamps, recent, odd, self.newest_ns, self.ahead_ns]
 
     def newest_of(self, scan: Scan) -> int | None:
         """Return the newest stamp of the source of a scan; of all scans if there are no poses."""

@@ -26,7 +26,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import count, filterfalse, groupby, islice, pairwise
+from itertools import count, filterfalse, islice, pairwise
 import math
 from operator import attrgetter
 
@@ -391,34 +391,6 @@ class TransformBuffer:
         """Return the stamps of transforms between two frames in a span, ends included."""
         per_edge = (edge.stamps for edge in self._dynamic(target, source, start_ns))
         return sorted({s for stamps in per_edge for s in _within(stamps, start_ns, end_ns)})
-
-    def content(
-        self, since_ns: int | None = None
-    ) -> list[tuple[str, list[tuple[str, int]], list[int], bytes]]:
-        """
-        Return the content on which lookups from a stamp on depend, to compare two buffers.
-
-        Parameters
-        ----------
-        since_ns : int, optional
-            The oldest stamp of those lookups; any by default.
-
-        Returns
-        -------
-        list of (str, list of (str, int), list of int, bytes)
-            For each edge, sorted: child, parents with the number of their transforms, stamps
-            (none if static), transforms.
-
-        """
-        edges = []
-        for child, edge in sorted(self._edges.items()):
-            first = 0
-            if since_ns is not None and not edge.is_static:
-                first = max(bisect_right(edge.stamps, since_ns) - 1, 0)
-            content = b''.join(transform.tobytes() for transform in edge.transforms[first:])
-            parents = [(name, len([*rows])) for name, rows in groupby(edge.parents[first:])]
-            edges.append((child, parents, edge.stamps[first:], content))
-        return edges
 
     def clear(self) -> None:
         """Drop the dynamic edges; static ones stay."""

@@ -53,7 +53,7 @@ def test_counts_add_up_and_the_map_is_its_window_for_any_input(events, limit, ga
             updates += len(list(mapper.insert_ready()))
     counters = mapper.counters
     waiting = counters.received - counters.mapped - counters.gated - sum(dropped(mapper).values())
-    num_odd = len(mapper._pipeline.guard.state()[2])
+    num_odd = len(mapper._pipeline.guard._odd)
     assert 0 <= waiting <= 4 + num_odd
     assert updates == counters.mapped
     alone = SurfelMap(0.5)
