@@ -210,6 +210,7 @@ def replay(
             **pose_errors(options.truth, trajectory),
             **mapper.summary(),
             'settings': mapper.config.to_mapping(),
+            'settings_set': changed_settings(config),
         }
         summary = finite_or_none(figures)
     if options.poses_out is not None:
@@ -278,6 +279,15 @@ def map_recording(
 
 DEPTH_VOXEL_M = 0.08
 """Edge of the voxels of a map of depth images, m: twice that for models of one image."""
+
+
+def changed_settings(config: Config | str | Path | None) -> list[str]:
+    """Return the names of the settings that a configuration changes."""
+    from surfel_mapper.config import Config, load_config
+
+    chosen = config if isinstance(config, Config) else load_config(config)
+    default = Config().to_mapping()
+    return [name for name, value in chosen.to_mapping().items() if value != default[name]]
 
 
 def configured(config: Config | str | Path | None, options: ReplayOptions) -> Config:

@@ -51,7 +51,7 @@ def show(
     shown: SurfelMap | Surfels, *, min_points: int = 5, place: npt.ArrayLike | None = None
 ) -> InlineView:
     """
-    Return an interactive 3D view for a notebook, of at most 80,000 surfels (1.3 MB).
+    Return an interactive 3D view for a notebook, of at most 60,000 surfels (1.7 MB).
 
     Parameters
     ----------
@@ -96,5 +96,5 @@ def show(
         surfels = drawn = shown
     summary['surfels'] = len(surfels)
     valid = drawn.select(np.isfinite(drawn.planarity))
-    body = turning_view(valid, np.empty((0, 3)), summary, None, {})
+    body = turning_view(valid, np.empty((0, 3)), np.empty(0), summary, None, {})
     return InlineView(page('map', body), f'{len(surfels)} surfels')

@@ -37,6 +37,15 @@ POLICY = (
 )
 """Content security policy, to be filled with the hashes of the style sheet and the script."""
 
+STATES = {
+    'lost': 'not placed on the map',
+    'unconfirmed': 'placed again, not yet confirmed by the next scans',
+    'ambiguous': 'of which another pose fits as well',
+    'degenerate': 'without surfaces that fix every direction',
+    'surrounded': 'of which most points move along with the sensor',
+}
+"""States of tracking in words."""
+
 TAG = re.compile(r'<[a-z][^<>]*>')
 INLINE_STYLE = re.compile(r' style="([^"]*)"')
 
@@ -88,14 +97,14 @@ def write_report(
     shown = valid if drawn is None else drawn.select(np.isfinite(drawn.planarity))
     blocks = [
         f'<h1>{as_html(title)}</h1><p class="about">{as_html(about(summary))}</p>',
-        figures(summary, history),
-        turning_view(shown, history.trajectory, summary, picture, layers or {}),
+        turning_view(shown, history.trajectory, history.seconds, summary, picture, layers or {}),
+        figures(summary, history, valid),
         *sections,
         plots(valid, summary, history),
         pose_errors_table(summary.get('pose_errors')),
         tracking_table(summary.get('registration', {})),
         f'<h2>Milliseconds a scan</h2>{times_table(summary)}',
-        settings_table(summary.get('settings', {})),
+        settings_table(summary.get('settings', {}), summary.get('settings_set')),
     ]
     with replace_file(path) as file:
         file.write(page(title, ''.join(blocks)).encode('utf-8', 'replace'))
@@ -148,14 +157,15 @@ def about(summary: Mapping[str, Any]) -> str:
     return ' \u00b7 '.join(filter(None, [source, f'digest {summary.get("digest", "unknown")}']))
 
 
-def figures(summary: Mapping[str, Any], history: History) -> str:
+def figures(summary: Mapping[str, Any], history: History, surfels: Surfels) -> str:
     """Return the main figures of the map, as HTML."""
     scans = summary['scans']
     shown = {
-        'scans mapped': f'{scans["mapped"]} of {scans["received"]}',
-        'points': short(summary['points']),
-        'surfels': f'{summary["surfels"]:,}',
-        'voxels': f'{summary["voxels"]:,} of {summary["voxel_size_m"]:g} m',
+        'scans mapped': f'{scans["mapped"]:,} of {scans["received"]:,}',
+        'surfels': f'{len(surfels):,}',
+        'points in them': short(int(surfels.num_points.sum())),
+        'points of all scans': short(summary['points']),
+        'voxel size': f'{summary["voxel_size_m"]:g} m',
     }
     origin_m = summary.get('origin_m', [0.0, 0.0, 0.0])
     if any(origin_m):
@@ -165,29 +175,30 @@ def figures(summary: Mapping[str, Any], history: History) -> str:
         shown['distance driven'] = f'{np.sqrt((steps * steps).sum(axis=1)).sum():.1f} m'
     if 'recorded_s' in summary:
         shown['recorded'] = f'{summary["recorded_s"]:.1f} s'
-    if summary.get('replay_s'):
-        speed = summary.get('recorded_s', 0.0) / summary['replay_s']
-        shown['speed'] = f'{speed:.3g} \u00d7 real time'
+    if 'total' in summary['milliseconds']:
+        shown['time a scan (median)'] = f'{summary["milliseconds"]["total"]["median"]:.1f} ms'
     cells = ''.join(f'<div><dt>{k}</dt><dd>{as_html(v)}</dd></div>' for k, v in shown.items())
     return f'<dl class="figures">{cells}</dl>'
 
 
 def tracking_table(registration: Mapping[str, Any]) -> str:
-    """Return the states of tracking and the parts that stayed apart, as HTML."""
+    """Return the scans of doubtful poses by reason and the parts that stayed apart, as HTML."""
     if 'tracking' not in registration:
         return ''
     states = ''.join(
-        f'<tr><td>{as_html(state)}</td><td>{spent["scans"]}</td>'
-        f'<td>{spent["seconds"]:.1f}</td></tr>'
+        f'<tr><td>{as_html(STATES.get(state, state))}</td><td class="number">{spent["scans"]}</td>'
+        f'<td class="number">{spent["seconds"]:.1f}</td></tr>'
         for state, spent in registration['tracking'].items()
+        if spent['scans']
     )
     paragraphs = ''.join(
         f'<p>apart_{number}: {track["scans"]} scans from {track["first_s"]:.3f} to '
         f'{track["last_s"]:.3f} s have no certain place on the map: {as_html(track["reason"])}</p>'
         for number, track in enumerate(registration['apart'], start=1)
     )
-    head = '<tr><th>state</th><th>scans</th><th>s</th></tr>'
-    return f'<h2>Tracking</h2><table>{head}{states}</table>{paragraphs}'
+    head = '<tr><th>scans</th><th class="number">number</th><th class="number">s</th></tr>'
+    table = f'<table>{head}{states}</table>' if states else '<p class="none">None.</p>'
+    return f'<h2>Scans of doubtful pose</h2>{table}{paragraphs}'
 
 
 def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str:
@@ -279,10 +290,12 @@ def stage_order(stage: str) -> int:
     return STAGES.index(stage) if stage in STAGES else len(STAGES) - 1
 
 
-def settings_table(settings: Mapping[str, Any]) -> str:
-    """Return a table of all settings, those that differ from their defaults first."""
+def settings_table(settings: Mapping[str, Any], chosen: Sequence[str] | None = None) -> str:
+    """Return a table of all settings, those that the user set first; None: all not at default."""
     default = Config().to_mapping()
-    ours = {name: value for name, value in settings.items() if value != default.get(name)}
+    if chosen is None:
+        chosen = [name for name, value in settings.items() if value != default.get(name)]
+    ours = {name: value for name, value in settings.items() if name in chosen}
     usual = {name: value for name, value in settings.items() if name not in ours}
 
     def table(values: Mapping[str, Any]) -> str:
@@ -292,8 +305,8 @@ def settings_table(settings: Mapping[str, Any]) -> str:
         )
         return f'<table>{rows}</table>'
 
-    changed = table(ours) if ours else '<p class="none">All settings are at their defaults.</p>'
+    changed = table(ours) if ours else '<p class="none">No setting was changed.</p>'
     return (
         f'<h2>Settings</h2>{changed}'
-        f'<details><summary>{len(usual)} at their defaults</summary>{table(usual)}</details>'
+        f'<details><summary>{len(usual)} others</summary>{table(usual)}</details>'
     )

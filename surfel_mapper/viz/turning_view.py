@@ -3,14 +3,15 @@
 """
 The interactive 3D view of report.html: its elements and the data for page/view.js.
 
-The data is JSON without the character <, so it cannot begin a tag. A surfel takes 12 bytes, 1.3 MB
-of text for the limit, which keeps the page below 2 MB; with meshes fewer surfels are shown.
+The data is JSON without the character <, so it cannot begin a tag. A surfel takes 12 bytes and one
+or two for each of its values, 1.7 MB of text for the limit of surfels, which keeps the page below
+2 MB; with meshes fewer surfels are shown.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import io
 import json
 from pathlib import Path
@@ -21,23 +22,30 @@ import numpy.typing as npt
 
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.discs import SPREAD
+from surfel_mapper.viz.discs import COLUMNS, SPREAD, UNITS
 from surfel_mapper.viz.mesh import MAX_TRIANGLES, mesh_data
 
 Array = npt.NDArray[np.float64]
 
-MAX_SHOWN, BESIDE_MESHES = 80_000, 45_000
+MAX_SHOWN, BESIDE_MESHES = 60_000, 35_000
 """Limits of the surfels shown, alone and if there are meshes; see ``detail.drawn_surfels``."""
 
 SURFEL = np.dtype(
-    [('place', '<u2', 3), ('radius', 'u1'), ('planarity', 'u1'), ('normal', 'i1', 3), ('', 'u1')]
+    [('place', '<u2', 3), ('radius', 'u1'), ('time', 'u1'), ('normal', 'i1', 3), ('', 'u1')]
 )
 """Surfel format of page/view.js."""
+
+MOST_POSES = 2000
+"""Limit of the positions of the trajectory."""
+
+LOGARITHMIC = 20.0
+"""Values are coded by their logarithm if the largest is more than this times the median."""
 
 
 def turning_view(
     surfels: Surfels,
     trajectory: Array,
+    seconds: Array,
     summary: Mapping[str, Any],
     picture: str | Path | None,
     layers: Mapping[str, Mesh],
@@ -46,7 +54,8 @@ def turning_view(
     Return the 3D view with its data; layers can be shown in the place of the surfels.
 
     ``surfels`` are those drawn, of several levels for a large map; if they are more than the limit
-    a selection with a fixed seed is shown.
+    a selection with a fixed seed is shown. ``trajectory`` has the positions of the sensor, (S, 3)
+    m, and ``seconds`` their times.
     """
     layers = {name: mesh for name, mesh in layers.items() if len(mesh)}
     shown = within_sight(surfels)
@@ -54,7 +63,7 @@ def turning_view(
         '<span class="keys">Drag or arrows turn, with shift they move; wheel, + and - zoom, '
         '0 resets, F is full screen. A click shows the values of a surfel.</span>'
         '<span class="touch">A finger turns, two move and zoom; a tap shows the values of a '
-        'surfel.</span>'
+        'surfel.</span> The slider shows the surfels that the sensor passed nearest up to a time.'
     )
     mixed = np.random.default_rng(0).permutation(
         len(shown)
@@ -67,36 +76,47 @@ def turning_view(
             f' The {summary["surfels"]:,} surfels are shown by {len(shown):,}: parts of the map, '
             'first those far from the end of the trajectory, by larger voxels of the same points.'
         )
-    choice = ''
-    if layers:
-        kinds = ''.join(f'<option>{name}</option>' for name in ('surfels', *layers))
-        choice = f'<label>show <select id="shown">{kinds}</select></label>'
+    choice = labelled('show', 'shown', ('surfels', *layers)) if layers else ''
     for name, mesh in layers.items():
         if len(mesh) > MAX_TRIANGLES // len(layers):
             note += f' {len(mesh):,} triangles of the {name} are merged into fewer.'
     origin_m = np.asarray(summary.get('origin_m', (0.0, 0.0, 0.0)), np.float64)
-    data = json.dumps(view_data(shown, trajectory, layers, origin_m)).replace('<', '\\u003c')
+    data = json.dumps(view_data(shown, trajectory, seconds, layers, origin_m)).replace(
+        '<', '\\u003c'
+    )
     fallback = '<p class="none">This browser has no WebGL 2.</p>'
     if picture is not None:
         png = base64.b64encode(small_png(picture)).decode()
         fallback = f'<img alt="the map, drawn" src="data:image/png;base64,{png}">'
-    colours = ''.join(f'<option>{n}</option>' for n in ('normal', 'planarity', 'height', 'slope'))
     return (
-        '<h2>The map</h2><div class="view" id="view">'
+        '<h2>The map</h2><div class="view" id="view"><div class="tools">'
+        f'{choice}<label>colour <select id="colouring"></select></label>'
+        '<label>discs <input type="range" id="discs" min="0.4" max="2" step="0.1" value="1">'
+        '</label>'
+        '<label><input type="checkbox" id="hide" checked> hide surfels that face away</label>'
+        '<label id="drive">time <input type="range" id="time" min="0" max="255" value="255"> '
+        '<output id="seconds"></output></label>'
+        '<span><button data-yaw="-90" data-pitch="89">top</button>'
+        '<button data-yaw="-90" data-pitch="0">front</button>'
+        '<button data-yaw="0" data-pitch="0">side</button><button id="reset">reset</button></span>'
+        '<span><button id="measure" aria-pressed="false">measure</button>'
+        '<button id="full">full screen</button></span></div><div class="stage">'
         '<canvas id="surfels" tabindex="0" role="application" aria-describedby="help" '
         'aria-label="The map in three dimensions"></canvas>'
         f'<div id="picture" hidden>{fallback}</div>'
-        f'<div class="tools">{choice}'
-        f'<label>colour <select id="colouring">{colours}</select></label>'
-        '<label><input type="checkbox" id="hide" checked> hide surfels that face away</label>'
-        '<button id="reset">reset</button><button id="full">full screen</button></div>'
         '<div class="length" aria-hidden="true">'
         '<span id="bar"></span><span id="metres"></span></div>'
         '<output class="values" id="values" aria-live="polite" hidden></output>'
-        '<div class="scale"><span id="least">0</span><span class="ramp"></span>'
-        f'<span id="most">1</span></div></div><p class="none" id="help">{note}</p>'
+        '<div class="scale"><b id="unit"></b><span id="least"></span><span class="ramp"></span>'
+        f'<span id="most"></span></div></div></div><p class="none" id="help">{note}</p>'
         f'<script type="application/json" id="map">{data}</script>'
     )
+
+
+def labelled(text: str, name: str, options: Sequence[str]) -> str:
+    """Return a labelled choice as HTML."""
+    kinds = ''.join(f'<option>{option}</option>' for option in options)
+    return f'<label>{text} <select id="{name}">{kinds}</select></label>'
 
 
 def most_shown(layers: Mapping[str, Mesh]) -> int:
@@ -125,7 +145,11 @@ def within_sight(surfels: Surfels) -> Surfels:
 
 
 def view_data(
-    surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh], origin_m: Array
+    surfels: Surfels,
+    trajectory: Array,
+    seconds: Array,
+    layers: Mapping[str, Mesh],
+    origin_m: Array,
 ) -> dict[str, Any]:
     """
     Return the data for page/view.js, in metres from the middle of the map.
@@ -142,25 +166,71 @@ def view_data(
     size = np.maximum(high - low, 1e-3)
     radius = SPREAD * surfels.radius
     largest = float(radius.max(initial=1e-3))
-    decimals = max(2 - int(np.floor(np.log10(size[2]))), 0)
+    rows = np.unique(np.linspace(0, max(len(trajectory) - 1, 0), MOST_POSES).astype(np.int64))
+    way = trajectory[rows[: len(trajectory)]]
+    passed = nearest_pose(surfels.position, way[:: max(len(way) // 256, 1)])
     packed = np.zeros(len(surfels), SURFEL)
     packed['place'] = np.rint((surfels.position - low) / size * 65535.0)
     packed['radius'] = np.ceil(radius / largest * 255.0)
-    packed['planarity'] = np.rint(surfels.planarity * 255.0)
+    packed['time'] = np.rint(255.0 * passed)
     packed['normal'] = np.rint(surfels.normal * 127.0)
-    path = (trajectory - (low + 0.5 * size)).astype('<f4')
     ramp = np.rint(colormaps['viridis'](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0)
+    columns = {name: getattr(surfels, name) for name in COLUMNS} | dict(surfels.channels)
     return {
         'surfels': encoded(packed),
-        'trajectory': encoded(path),
+        'columns': [column_data(name, values) for name, values in columns.items()],
+        'trajectory': encoded((way - (low + 0.5 * size)).astype('<f4')),
+        'seconds': seconds[rows[: len(way)]].round(2).tolist() if len(seconds) else [],
         'ramp': encoded(ramp.astype(np.uint8)),
-        'size': [float(side) for side in size],
+        'size': size.tolist(),
         'largest': largest,
         'layers': [
             mesh_data(mesh, low, size, MAX_TRIANGLES // len(layers)) for mesh in layers.values()
         ],
-        'middle': [float(value) for value in low + 0.5 * size + origin_m],
-        'heights': [f'{origin_m[2] + end:.{decimals}f} m' for end in (low[2], high[2])],
+        'middle': (low + 0.5 * size + origin_m).tolist(),
+    }
+
+
+def nearest_pose(position: Array, way: Array) -> Array:
+    """Return which of some poses (S, 3) is nearest to each position, (K,) from 0 to 1."""
+    if len(way) < 2:
+        return np.ones(len(position))
+    nearest = [
+        ((way * way).sum(axis=1) - 2.0 * block @ way.T).argmin(axis=1)
+        for block in np.array_split(position, len(position) // 8192 + 1)
+    ]
+    return np.asarray(np.concatenate(nearest) / (len(way) - 1.0))
+
+
+def column_data(name: str, values: npt.NDArray[Any]) -> dict[str, Any]:
+    """
+    Return a column for page/view.js: its name and unit, and codes from low to high.
+
+    Whole numbers are exact up to 65,535. Others have 255 steps, of their logarithm if a few are
+    much larger; a code of 0 is nan.
+    """
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
+    steps = 65535 if values.dtype.kind == 'i' and 254 < high - low < 65535 else 255
+    is_log = low > 0.0 and high > LOGARITHMIC * float(np.median(finite)) and steps == 255
+    if values.dtype.kind == 'i' and high - low < 65535:
+        high = low + steps - 1.0
+    scaled = (
+        np.log(values / low) / np.log(high / low)
+        if is_log
+        else (values - low) / (high - low or 1.0)
+    )
+    codes = np.where(np.isfinite(values), 1.0 + np.rint(scaled * (steps - 1.0)), 0.0)
+    return {
+        'name': name.replace('_', ' '),
+        'unit': UNITS.get(name, ''),
+        'low': low,
+        'high': high,
+        'log': is_log,
+        'shown': [float(v) for v in np.percentile(finite, [1.0, 99.0])] if len(finite) else [0, 1],
+        'bytes': 2 if steps > 255 else 1,
+        'whole': values.dtype.kind == 'i',
+        'codes': encoded(codes.astype('<u2' if steps > 255 else 'u1')),
     }
 
 

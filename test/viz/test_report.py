@@ -14,7 +14,7 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.viz.report import write_report
-from surfel_mapper.viz.turning_view import MAX_SHOWN, SURFEL
+from surfel_mapper.viz.turning_view import column_data, MAX_SHOWN, nearest_pose, SURFEL
 from test.viz.test_history import mapped
 
 NASTY = '</title></script><script>alert("x")</script><img src=x onerror=alert(1)>'
@@ -59,6 +59,15 @@ def shown(parsed):
     return data, rows
 
 
+def decoded(column):
+    """Return the values of a column as page/view.js decodes them."""
+    kind, steps = ('<u2', 65535) if column['bytes'] == 2 else ('u1', 255)
+    codes = np.frombuffer(base64.b64decode(column['codes']), kind).astype(float)
+    part = (np.where(codes > 0.0, codes, np.nan) - 1.0) / (steps - 1.0)
+    low, high = column['low'], column['high']
+    return low * (high / low) ** part if column['log'] else low + part * (high - low)
+
+
 def plane(num, normal=(0.0, 0.0, 1.0)):
     rng = np.random.default_rng(2)
     grid = np.stack(np.meshgrid(*[np.arange(num)] * 2), axis=-1).reshape(-1, 1, 2) * 0.5
@@ -80,9 +89,10 @@ def test_the_page_holds_the_surfels_where_they_are(tmp_path):
     assert distance.max() < 1e-3
     assert sorted(nearest) == list(range(400))
     np.testing.assert_array_equal(rows['normal'], np.tile([0, 0, 127], (400, 1)))
-    np.testing.assert_allclose(
-        np.sort(rows['planarity']) / 255.0, np.sort(surfels.planarity), atol=1 / 255
-    )
+    for column in data['columns']:
+        expected = getattr(surfels, column['name'].replace(' ', '_'))[nearest]
+        # 254 steps from the least to the largest value
+        np.testing.assert_allclose(decoded(column), expected, atol=np.ptp(expected) / 254.0)
     np.testing.assert_allclose(high - low, data['size'], atol=1e-3)
     assert (rows['radius'] > 0).all()
 
@@ -126,7 +136,7 @@ def test_large_map_is_subsampled_and_the_page_says_so(tmp_path):
     parsed = report(tmp_path, surfels, surfels=len(surfels))
 
     assert len(shown(parsed)[1]) == MAX_SHOWN < len(surfels)
-    assert any('80,000 of 108,900 surfels are shown' in text for *_, text in parsed.text)
+    assert any('60,000 of 108,900 surfels are shown' in text for *_, text in parsed.text)
 
 
 @pytest.mark.parametrize('num', [0, 1])
@@ -147,3 +157,58 @@ def test_without_history_there_are_histograms_alone(tmp_path):
 def test_a_page_that_cannot_be_written_is_an_error(tmp_path):
     with pytest.raises(FileFormatError, match='nowhere'):
         write_report(tmp_path / 'nowhere' / 'r.html', 'a', Mapper().summary(), plane(2))
+
+
+@pytest.mark.parametrize('high', [9, 300, 60_000])
+def test_whole_numbers_of_a_column_are_exact(high):
+    values = np.random.default_rng(1).integers(3, high, 500)
+    np.testing.assert_allclose(decoded(column_data('num_points', values)), values, atol=1e-9)
+
+
+def test_columns_of_wide_ranges_are_coded_by_their_logarithm_and_keep_gaps():
+    values = np.concatenate([np.geomspace(1e-4, 1e-3, 300), [2.0, np.nan]])
+    column = column_data('normal_sigma', values)
+    assert column['log']
+    # a step is a 254th of four decades
+    np.testing.assert_allclose(decoded(column), values, rtol=np.log(2e4) / 254.0)
+
+
+@pytest.mark.parametrize('values', [np.full(4, np.nan), np.zeros(3), np.empty(0)])
+def test_columns_without_a_range_are_coded_too(values):
+    np.testing.assert_array_equal(decoded(column_data('thickness', values)), values)
+
+
+def test_surfels_belong_to_the_pose_that_is_nearest():
+    way = np.column_stack([np.arange(11.0), np.zeros(11), np.zeros(11)])
+    position = np.array([[-5.0, 1.0, 0.0], [3.2, 9.0, 1.0], [40.0, 0.0, 0.0]])
+    np.testing.assert_allclose(nearest_pose(position, way), [0.0, 0.3, 1.0])
+    np.testing.assert_allclose(nearest_pose(position, way[:1]), 1.0)
+
+
+def test_figures_are_those_of_the_map_and_of_the_median_scan(tmp_path):
+    surfels = plane(4)
+    parsed = report(tmp_path, surfels, milliseconds={'total': {'median': 3.21, 'p99': 9.0}})
+    texts = [text for tag, _, text in parsed.text if tag in ('dt', 'dd')]
+    figures = dict(zip(texts[::2], texts[1::2], strict=True))
+    assert figures['surfels'] == str(len(surfels))
+    assert figures['points in them'] == str(surfels.num_points.sum())
+    assert figures['time a scan (median)'] == '3.2 ms'
+    assert 'speed' not in figures
+
+
+def test_settings_of_the_user_are_named_first(tmp_path):
+    settings = {'map.voxel_size_m': 0.2, 'pose.source': 'tf', 'map.min_points': 5}
+    parsed = report(tmp_path, settings=settings, settings_set=['map.voxel_size_m'])
+    cells = [text for tag, _, text in parsed.text if tag == 'td']
+    assert cells.index('map.voxel_size_m') < cells.index('pose.source')
+    assert any(text == '2 others' for tag, _, text in parsed.text if tag == 'summary')
+
+
+def test_doubtful_poses_are_stated_in_words(tmp_path):
+    spent = {'scans': 15, 'seconds': 1.5}
+    tracking = {'surrounded': spent, 'lost': {'scans': 0, 'seconds': 0.0}}
+    parsed = report(tmp_path, registration={'tracking': tracking, 'apart': []})
+    cells = [text for tag, _, text in parsed.text if tag == 'td']
+    assert 'of which most points move along with the sensor' in cells
+    assert 'surrounded' not in cells
+    assert 'not placed on the map' not in cells

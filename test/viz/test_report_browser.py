@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from array import array
 import io
 import os
 import re
@@ -14,7 +15,11 @@ import numpy as np
 from PIL import Image
 import pytest
 
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.viz.discs import COLUMNS
+from surfel_mapper.viz.report import write_report
 from test import extras
+from test.viz.test_history import mapped
 from test.viz.test_mesh import sphere
 from test.viz.test_report import plane, report
 
@@ -91,7 +96,7 @@ def opened(shown):
     """Return the page as it is first shown, with the whole map and the first colours."""
     page, _ = shown
     page.locator('#colouring').select_option('normal', force=True)
-    page.locator('#surfels').click(position={'x': 605, 'y': 60})  # above the horizon of the map
+    page.locator('#surfels').click(position={'x': 605, 'y': 8})  # above the horizon of the map
     page.locator('#surfels').evaluate('part => part.blur()')
     page.locator('#reset').dispatch_event('click')
     page.locator('#values').wait_for(state='hidden')
@@ -173,22 +178,165 @@ def test_a_click_shows_the_values_of_a_surfel(opened):
     box = page.locator('#surfels').bounding_box()
     page.mouse.click(box['x'] + box['width'] / 2, box['y'] + box['height'] / 2)
     page.locator('#values').wait_for()
-    found = dict(
-        re.match(r'(x y z|normal|planarity) (.*)', line).groups()
-        for line in page.locator('#values').inner_text().splitlines()
-    )
-    place = [float(word) for word in found['x y z'].split()[:3]]
+    found = shown_values(page)
+    place = found['x y z']
 
     surfels = plane(30)
     away = np.linalg.norm(surfels.position - place, axis=1)
     assert away.min() < 0.02
     row = away.argmin()
-    normal = [float(word) for word in found['normal'].split()]
-    np.testing.assert_allclose(normal, surfels.normal[row], atol=0.02)
-    np.testing.assert_allclose(float(found['planarity']), surfels.planarity[row], atol=0.01)
-    page.mouse.click(box['x'] + box['width'] - 5, box['y'] + 60)  # above the horizon of the map
+    np.testing.assert_allclose(found['normal'], surfels.normal[row], atol=0.02)
+    for name in COLUMNS:
+        value = getattr(surfels, name)[row]
+        # a column has 255 steps from its least to its largest value, and three digits
+        step = np.ptp(getattr(surfels, name)) / 254.0 + 0.005 * abs(value)
+        np.testing.assert_allclose(found[name.replace('_', ' ')], [value], atol=step)
+    text = page.locator('#values').inner_text()
+    assert re.search(r'thickness .* m\n', text)
+    assert re.search(r'normal sigma .* rad\n', text)
+    page.mouse.click(box['x'] + box['width'] - 5, box['y'] + 8)  # above the horizon of the map
     page.locator('#values').wait_for(state='hidden')
     assert complaints == []
+
+
+def box_surfels():
+    """Return the six sides of a box of 4 m, seen from inside, as a room."""
+    steps = np.arange(0.0, 4.0, 0.08) + 0.04
+    a, b = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    sides = []
+    for axis in range(3):
+        for end in (0.02, 3.98):
+            sides.append(np.insert(np.column_stack([a, b]), axis, end, axis=1))
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add(np.concatenate(sides), origin=[2.0, 2.0, 2.0])
+    return surfel_map.surfels(20)
+
+
+@pytest.fixture(scope='module')
+def room(browser, tmp_path_factory):
+    """Return a page that shows a room, and its surfels."""
+    folder = tmp_path_factory.mktemp('room')
+    surfels = box_surfels()
+    mapper, history = mapped(3)
+    history._positions[:] = array('d', [0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 3.5, 2.0, 2.0])
+    write_report(folder / 'report.html', 'room', mapper.summary(), surfels, history)
+    page = new_page(browser)
+    page.goto((folder / 'report.html').as_uri())
+    picture_when(page, is_drawn)
+    yield page, surfels
+    page.close()
+
+
+def click(page, across, down):
+    """Click at a part of the width and height of the canvas."""
+    box = page.locator('#surfels').bounding_box()
+    page.mouse.click(box['x'] + across * box['width'], box['y'] + down * box['height'])
+
+
+def shown_values(page):
+    """Return the numbers of the values that are shown, by name."""
+    lines = page.locator('#values').inner_text().splitlines()
+    named = (re.match(r'(x y z|[a-z ]*[a-z]) (-?[\d.].*)', line).groups() for line in lines)
+    return {
+        name: [float(n) for n in re.findall(r'-?[\d.]+(?:e-?\d+)?', text)] for name, text in named
+    }
+
+
+def test_a_click_picks_a_surfel_that_is_drawn_and_marks_it(room):
+    page, surfels = room
+    picked = 0
+    for across, down in np.ndindex(5, 5):
+        click(page, 0.3 + 0.1 * across, 0.3 + 0.1 * down)
+        if not page.locator('#values').is_visible():
+            continue
+        picked += 1
+        found = shown_values(page)
+        # the viewer is above and to the south: ceiling and near wall face away
+        assert found['normal'][2] > -0.2
+        assert found['normal'][1] < 0.2
+        away = np.linalg.norm(surfels.position - found['x y z'], axis=1)
+        np.testing.assert_allclose(surfels.normal[away.argmin()], found['normal'], atol=0.02)
+    assert picked >= 15
+    click(page, 0.5, 0.5)
+    settle(page)
+    orange = np.abs(pixels(page) - [1.0, 0.55, 0.0]).max(axis=2) < 0.05
+    assert orange.sum() > 30
+
+
+def test_two_clicks_measure_the_distance_between_them(room):
+    page, _ = room
+    page.locator('#measure').click()
+    page.locator('button', has_text='top').click()
+    box = page.locator('#surfels').bounding_box()
+    for across in (0.4, 0.6):
+        click(page, across, 0.5)
+    found = shown_values(page)
+    page.locator('#measure').click()
+
+    assert not page.locator('#values').is_visible()
+    bar = page.locator('#bar').evaluate('bar => bar.getBoundingClientRect().width')
+    metres = float(page.locator('#metres').inner_text().split()[0])
+    # the bar holds at the middle of the room, the floor is 2 m farther
+    expected = 0.2 * box['width'] * metres / bar
+    assert found['distance'][0] == pytest.approx(expected, rel=0.35)
+    assert found['horizontal'][0] == pytest.approx(found['distance'][0], rel=0.01)
+    assert abs(found['height'][0]) < 0.05
+
+
+def test_buttons_look_along_the_axes(room):
+    page, _ = room
+    seen = {}
+    for name in ('top', 'front', 'side'):
+        page.locator('button', has_text=name).click()
+        settle(page)
+        click(page, 0.5, 0.5)
+        seen[name] = shown_values(page)['normal']
+    np.testing.assert_allclose(seen['top'], [0.0, 0.0, 1.0], atol=0.1)
+    np.testing.assert_allclose(seen['front'], [0.0, -1.0, 0.0], atol=0.1)
+    np.testing.assert_allclose(seen['side'], [1.0, 0.0, 0.0], atol=0.1)
+    page.locator('#reset').click()
+
+
+@pytest.mark.parametrize('column', ['height', 'slope', 'num points', 'thickness', 'size'])
+def test_every_column_has_a_legend(room, column):
+    page, _ = room
+    page.locator('#colouring').select_option(column)
+    assert page.locator('#unit').inner_text().startswith(column)
+    least, most = (float(page.locator(f'#{end}').inner_text()) for end in ('least', 'most'))
+    assert least <= most
+    page.locator('#colouring').select_option('normal')
+    assert not page.locator('.scale').is_visible()
+
+
+def test_the_slider_hides_what_the_sensor_passes_later(room):
+    page, _ = room
+    number = num_coloured(picture_when(page, is_drawn))
+    set_time = """(part, value) => {
+      part.value = value;
+      part.dispatchEvent(new Event('input'));
+    }"""
+    page.locator('#time').evaluate(set_time, 0)
+    fewer = picture_when(page, lambda image: num_coloured(image) < 0.9 * number)
+    assert num_coloured(fewer) < 0.9 * number
+    assert page.locator('#seconds').inner_text() == '0.0 s'
+    page.locator('#time').evaluate(set_time, 255)
+
+
+def test_a_phone_has_the_map_in_view(browser, written):
+    context = browser.new_context(
+        viewport={'width': 390, 'height': 844}, has_touch=True, is_mobile=True
+    )
+    page = context.new_page()
+    page.set_default_timeout(1000 * WAIT_S)
+    page.goto(written.as_uri())
+    canvas, tools = (page.locator(name).bounding_box() for name in ('#surfels', '.tools'))
+    assert canvas['y'] + canvas['height'] < 844
+    assert canvas['height'] > 300
+    assert tools['y'] >= canvas['y'] + canvas['height']  # beside the map, not over it
+    assert page.evaluate('document.documentElement.scrollWidth') <= 390
+    page.locator('#surfels').tap()
+    page.locator('#values').wait_for()
+    context.close()
 
 
 def test_a_mesh_can_be_shown_in_its_colours(browser, tmp_path):

@@ -3,8 +3,9 @@
 //
 // The 3D view of report.html: surfels as discs, drawn in one call, and the trajectory.
 //
-// A surfel is 12 bytes: place in the box of the map (3 uint16), radius and value (2 uint8),
-// normal (3 int8) and a spare byte. Discs are hexagons, so that no fragment is discarded and
+// A surfel is 12 bytes: place in the box of the map (3 uint16), radius and time (2 uint8), normal
+// (3 int8) and a spare byte. Its values are columns of codes, of which one at a time becomes the
+// paint of the discs. Discs are hexagons about circles, so that no fragment is discarded and
 // hidden ones cost next to nothing. Every surfel is copied for each of its six corners, 7 MB for
 // 100,000: drawn as instances, of which each has so few corners, they take 30 times as long
 // where there is no graphics card. The picture is drawn only when something has changed, and
@@ -21,11 +22,10 @@
     in vec3 place;
     in vec2 look;
     in vec3 normal;
+    in vec3 paint;
     uniform mat4 camera;
     uniform vec3 low, size, eye;
-    uniform float largest, hide;
-    uniform int colouring;
-    uniform sampler2D ramp;
+    uniform float largest, hide, until, lamp;
     out vec3 colour;
     void main() {
       vec3 centre = low + place * size;
@@ -34,11 +34,10 @@
       float turn = corner * 1.0471975512;
       vec3 at = centre + look.x * largest * (cos(turn) * u + sin(turn) * cross(n, u));
       float facing = dot(n, normalize(eye - centre));
-      gl_Position = facing < -0.2 * hide - (1.0 - hide) ? vec4(2, 2, 2, 1) : camera * vec4(at, 1);
-      float value = colouring == 1 ? look.y : colouring == 2 ? place.z : abs(n.z);
-      float lit = 0.65 + 0.35 * dot(n, vec3(-0.40, -0.55, 0.73)); // as in viz/picture.py
-      colour = colouring == 0 ? (0.484 + 0.45 * (0.5 + 0.5 * n)) * lit
-        : texture(ramp, vec2(value, 0.5)).rgb * (0.62 + 0.38 * abs(facing));
+      bool gone = look.y > until || facing < -hide;
+      gl_Position = gone ? vec4(2, 2, 2, 1) : camera * vec4(at, 1);
+      float lit = 0.725 + 0.275 * dot(n, vec3(-0.40, -0.55, 0.73)); // as in viz/discs.py
+      colour = paint * mix(0.62 + 0.38 * abs(facing), lit, lamp);
     }`;
   const FRAGMENT = `#version 300 es
     precision mediump float;
@@ -61,16 +60,20 @@
   const LINE_VERTEX = `#version 300 es
     in vec3 place;
     uniform mat4 camera;
-    void main() { gl_Position = camera * vec4(place, 1); }`;
+    void main() { gl_Position = camera * vec4(place, 1); gl_PointSize = 9.0; }`;
   const LINE_FRAGMENT = `#version 300 es
     precision mediump float;
+    uniform vec3 ink;
     out vec4 pixel;
-    void main() { pixel = vec4(0.86, 0.16, 0.13, 1); }`;
+    void main() { pixel = vec4(ink, 1); }`;
 
   const BYTES = 12;
   const SLOW_MS = 40;
   const REST_MS = 200;
   const LEAST = 4000;
+  const OUTER = 2 / Math.sqrt(3); // of a hexagon about a circle of radius 1
+  const FACING = 0.05; // discs are hidden that face away by more than this
+  const RED = [0.86, 0.16, 0.13], MARK = [1, 0.55, 0];
   const HEXAGON = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5];
   const canvas = document.getElementById('surfels');
   const data = JSON.parse(document.getElementById('map').textContent);
@@ -130,6 +133,10 @@
   attribute(discs, 'look', 2, gl.UNSIGNED_BYTE, true, BYTES, 6);
   attribute(discs, 'normal', 3, gl.BYTE, true, BYTES, 8);
   attribute(discs, 'corner', 1, gl.UNSIGNED_BYTE, false, BYTES, 11);
+  const paints = new Uint8Array(24 * count);
+  const paintBuffer = gl.createBuffer();
+  gl.bindBuffer(gl.ARRAY_BUFFER, paintBuffer);
+  attribute(discs, 'paint', 3, gl.UNSIGNED_BYTE, true, 4, 0);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, triangles, gl.STATIC_DRAW);
 
@@ -138,6 +145,11 @@
   gl.bindVertexArray(lineArrays);
   const path = new Float32Array(bytes(data.trajectory).buffer);
   buffer(path);
+  attribute(line, 'place', 3, gl.FLOAT, false, 0, 0);
+  const markArrays = gl.createVertexArray();
+  const markBuffer = gl.createBuffer();
+  gl.bindVertexArray(markArrays);
+  gl.bindBuffer(gl.ARRAY_BUFFER, markBuffer);
   attribute(line, 'place', 3, gl.FLOAT, false, 0, 0);
 
   const mesh = data.layers.length ? program(MESH_VERTEX, FRAGMENT) : null;
@@ -158,11 +170,11 @@
   const layerShown = () => (shown ? layers[shown.selectedIndex - 1] : undefined);
   if (shown) {
     shown.addEventListener('change', () => {
-      for (const part of ['colouring', 'hide']) {
+      for (const part of ['colouring', 'hide', 'discs']) {
         document.getElementById(part).closest('label').hidden = Boolean(layerShown());
       }
       document.querySelector('.scale').style.display = layerShown() ? 'none' : '';
-      redraw();
+      showPicks([]);
     });
   }
 
@@ -181,18 +193,33 @@
 
   // All places are about the middle of the map, so that float32 is precise enough anywhere.
   const half = data.size.map((side) => side / 2);
-  const reach = half.map((side) => side + data.largest); // with the discs on the edge
-  const radius = Math.max(Math.hypot(...reach), 1);
-  const across = data.size[0] >= data.size[1];
-  const start = { yaw: across ? -Math.PI / 2 : 0, pitch: 0.75, target: [0, 0, -0.15 * half[2]] };
+  // The view begins with the box of the surfels that do not face down, without the farthest of them.
+  const words = new DataView(surfels.buffer);
+  const placeOf = (row, axis) => (
+    words.getUint16(row * BYTES + 2 * axis, true) / 65535 * data.size[axis] - half[axis]
+  );
+  const box = [0, 1, 2].map((axis) => {
+    const all = [];
+    for (let row = 0; row < count; row++) {
+      if (words.getInt8(row * BYTES + 10) > -25) all.push(placeOf(row, axis));
+    }
+    const sorted = Float32Array.from(all).sort();
+    return all.length ? [0.03, 0.97].map((part) => sorted[Math.floor(part * (all.length - 1))])
+      : [-half[axis], half[axis]];
+  });
+  const middle = box.map(([low, high]) => (low + high) / 2);
+  const reach = box.map(([low, high]) => (high - low) / 2 + data.largest);
+  const radius = Math.max(Math.hypot(...reach), 0.5);
+  const across = reach[0] >= reach[1];
+  const start = { yaw: across ? -Math.PI / 2 : 0, pitch: 0.75 };
   const MARGIN = 0.94;
   let view, running = false, moved = false, share = 1, last = 0, rest = 0;
 
-  function reset() {
+  function reset(direction) {
     let [near, far] = [0.5 * radius, 20 * radius];
     for (let step = 0; step < 20; step++) {
       const distance = 0.5 * (near + far);
-      view = { ...start, target: [...start.target], distance };
+      view = { ...start, ...direction, target: [...middle], distance };
       if (isWhole()) far = distance;
       else near = distance;
     }
@@ -206,7 +233,9 @@
     const [right, up, back] = axes();
     const wide = MARGIN * Math.tan(0.35) * (canvas.clientWidth || 1) / (canvas.clientHeight || 1);
     for (let corner = 0; corner < 8; corner++) {
-      const from = [0, 1, 2].map((axis) => (corner >> axis & 1 ? 1 : -1) * reach[axis] - eye[axis]);
+      const from = [0, 1, 2].map((axis) => (
+        middle[axis] + (corner >> axis & 1 ? 1 : -1) * reach[axis] - eye[axis]
+      ));
       const ahead = -dot(back, from);
       if (ahead <= 0 || Math.abs(dot(right, from)) > wide * ahead) return false;
       if (Math.abs(dot(up, from)) > MARGIN * Math.tan(0.35) * ahead) return false;
@@ -243,7 +272,7 @@
   function camera(eye) {
     const [right, up, back] = axes();
     const near = Math.max(view.distance / 500, 0.02);
-    const far = view.distance + 4 * radius;
+    const far = view.distance + 4 * Math.hypot(radius, ...half);
     const zoom = 1 / Math.tan(0.35);
     const wide = zoom * canvas.height / canvas.width;
     const depth = (far + near) / (near - far);
@@ -276,11 +305,52 @@
     const matrix = camera(eye);
     if (layerShown()) drawMesh(layerShown(), matrix, eye);
     else drawDiscs(drawn, matrix, eye);
+    drawWay(matrix);
+    drawMarks(matrix);
+    showLength();
+  }
+
+  const time = document.getElementById('time');
+  const until = () => time.value / 255;
+
+  function drawWay(matrix) {
+    const poses = path.length / 3;
+    if (!poses) return;
     gl.useProgram(line);
     gl.bindVertexArray(lineArrays);
     gl.uniformMatrix4fv(gl.getUniformLocation(line, 'camera'), false, matrix);
-    gl.drawArrays(gl.LINE_STRIP, 0, path.length / 3);
-    showLength();
+    gl.uniform3f(gl.getUniformLocation(line, 'ink'), ...RED);
+    const last = Math.round(until() * (poses - 1));
+    gl.drawArrays(gl.LINE_STRIP, 0, last + 1);
+    gl.drawArrays(gl.POINTS, last, 1);
+  }
+
+  // Rings about the discs that were picked, and the line between two, over all else.
+  function drawMarks(matrix) {
+    if (!picks.length) return;
+    gl.useProgram(line);
+    gl.bindVertexArray(markArrays);
+    gl.bindBuffer(gl.ARRAY_BUFFER, markBuffer);
+    gl.uniformMatrix4fv(gl.getUniformLocation(line, 'camera'), false, matrix);
+    gl.uniform3f(gl.getUniformLocation(line, 'ink'), ...MARK);
+    gl.disable(gl.DEPTH_TEST);
+    for (const { row } of picks) {
+      const [u, w] = planeOf(row), ring = [];
+      for (let step = 0; step <= 24; step++) {
+        for (const far of [1, 1.25]) {
+          const size = far * Math.max(radiusOf(row) * OUTER, 0.006 * view.distance);
+          const [cos, sin] = [Math.cos(step * Math.PI / 12), Math.sin(step * Math.PI / 12)];
+          for (let i = 0; i < 3; i++) ring.push(placeOf(row, i) + size * (cos * u[i] + sin * w[i]));
+        }
+      }
+      gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(ring), gl.DYNAMIC_DRAW);
+      gl.drawArrays(gl.TRIANGLE_STRIP, 0, ring.length / 3);
+    }
+    const ends = picks.flatMap(({ at }) => at);
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(ends), gl.DYNAMIC_DRAW);
+    gl.drawArrays(gl.POINTS, 0, picks.length);
+    gl.drawArrays(gl.LINES, 0, picks.length);
+    gl.enable(gl.DEPTH_TEST);
   }
 
   // A bar of a round length at the distance of the point that the view turns about.
@@ -294,43 +364,139 @@
       length < 0.01 ? `${+(length * 1000).toPrecision(1)} mm` : `${+length.toPrecision(1)} m`;
   }
 
-  // Values of the surfel nearest to the eye among those whose disc covers a place of the canvas.
-  const words = new DataView(surfels.buffer);
+  const cross = (a, b) => [
+    a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
+  ];
+  const unit = (a) => a.map((value) => value / Math.hypot(...a));
+  const normalOf = (row) => unit([0, 1, 2].map((i) => words.getInt8(row * BYTES + 8 + i)));
+  const hides = () => document.getElementById('hide').checked;
+  const growth = () => Number(document.getElementById('discs').value);
+  const radiusOf = (row) => surfels[row * BYTES + 6] / 255 * data.largest * growth();
+
+  // Two axes in the plane of a disc, the first to a corner, as in the shader.
+  function planeOf(row) {
+    const n = normalOf(row);
+    const u = unit(cross(n, Math.abs(n[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0]));
+    return [u, cross(n, u)];
+  }
+
+  // The disc that is drawn at a place of the canvas: the first that the line of sight meets.
   function pick(x, y) {
     const eye = eyeOf();
     const [right, up, back] = axes();
-    const scale = canvas.clientHeight / (2 * Math.tan(0.35));
-    let nearest = Infinity, found = -1;
+    const px = 2 * Math.tan(0.35) / canvas.clientHeight;
+    const [dx, dy] = [(x - canvas.clientWidth / 2) * px, (canvas.clientHeight / 2 - y) * px];
+    const ray = [0, 1, 2].map((i) => dx * right[i] + dy * up[i] - back[i]);
+    let nearest = Infinity, picked = null;
     for (let row = 0; row < count; row++) {
-      const at = row * BYTES;
-      const from = [0, 1, 2].map((axis) => (
-        words.getUint16(at + 2 * axis, true) / 65535 * data.size[axis] - half[axis] - eye[axis]
-      ));
-      const ahead = -dot(back, from);
-      if (ahead <= 0 || ahead >= nearest) continue;
-      const dx = canvas.clientWidth / 2 + scale * dot(right, from) / ahead - x;
-      const dy = canvas.clientHeight / 2 - scale * dot(up, from) / ahead - y;
-      const size = Math.max(surfels[at + 6] / 255 * data.largest * scale / ahead, 3);
-      if (dx * dx + dy * dy < size * size) {
-        nearest = ahead;
-        found = row;
-      }
+      if (surfels[row * BYTES + 7] / 255 > until()) continue;
+      const from = [0, 1, 2].map((i) => placeOf(row, i) - eye[i]);
+      const beside = Math.hypot(...cross(from, ray)) / Math.hypot(...ray);
+      const size = radiusOf(row) * OUTER;
+      if (beside > size) continue;
+      const n = normalOf(row);
+      if (hides() && -dot(n, unit(from)) < -FACING) continue;
+      const ahead = dot(n, from) / dot(n, ray);
+      if (!(ahead > 0 && ahead < nearest)) continue;
+      const at = from.map((value, i) => ahead * ray[i] - value);
+      const [u, w] = planeOf(row);
+      const [a, b] = [dot(at, u), dot(at, w)];
+      const sides = [30, 90, 150].map((deg) => deg * Math.PI / 180);
+      if (sides.some((t) => Math.abs(a * Math.cos(t) + b * Math.sin(t)) > radiusOf(row))) continue;
+      nearest = ahead;
+      picked = { row, at: eye.map((value, i) => value + ahead * ray[i]) };
     }
-    return found;
+    return picked;
   }
 
-  function showValues(row) {
+  let picks = [];
+  const measure = document.getElementById('measure');
+  const measures = () => measure.getAttribute('aria-pressed') === 'true';
+
+  function showPicks(shownPicks) {
+    picks = shownPicks;
     const values = document.getElementById('values');
-    values.hidden = row < 0;
-    if (row < 0) return;
-    const at = row * BYTES;
-    const place = [0, 1, 2].map((axis) => (
-      words.getUint16(at + 2 * axis, true) / 65535 * data.size[axis] - half[axis]
-        + data.middle[axis]
-    ).toFixed(2));
-    const normal = [0, 1, 2].map((axis) => (words.getInt8(at + 8 + axis) / 127).toFixed(2));
-    values.textContent = `x y z ${place.join(' ')} m\nnormal ${normal.join(' ')}\n`
-      + `planarity ${(surfels[at + 7] / 255).toFixed(2)}`;
+    values.hidden = !picks.length;
+    if (picks.length > 1) values.textContent = measured(...picks);
+    else if (picks.length) values.textContent = valuesOf(picks[0].row);
+    redraw();
+  }
+
+  function clicked(x, y) {
+    const picked = pick(x, y);
+    if (!picked) showPicks([]);
+    else showPicks(measures() && picks.length === 1 ? [picks[0], picked] : [picked]);
+  }
+
+  function measured(first, second) {
+    const away = second.at.map((value, i) => value - first.at[i]);
+    const cos = Math.min(Math.abs(dot(normalOf(first.row), normalOf(second.row))), 1);
+    return `distance ${Math.hypot(...away).toFixed(3)} m\n`
+      + `horizontal ${Math.hypot(away[0], away[1]).toFixed(3)} m\n`
+      + `height ${away[2].toFixed(3)} m\n`
+      + `between the normals ${(Math.acos(cos) * 180 / Math.PI).toFixed(1)}\u00b0`;
+  }
+
+  const columns = data.columns.map((column) => {
+    const codes = bytes(column.codes);
+    const steps = column.bytes === 2 ? 65535 : 255;
+    return { ...column, steps, codes: column.bytes === 2 ? new Uint16Array(codes.buffer) : codes };
+  });
+
+  function valueOf(column, row) {
+    if (!column.codes[row]) return NaN;
+    const part = (column.codes[row] - 1) / (column.steps - 1);
+    const value = column.log ? column.low * (column.high / column.low) ** part
+      : column.low + part * (column.high - column.low);
+    return column.whole ? Math.round(value) : value;
+  }
+
+  const worded = (column, value) => (
+    `${column.whole ? value : +value.toPrecision(3)}${column.unit ? ` ${column.unit}` : ''}`
+  );
+  const slopeOf = (row) => Math.acos(Math.min(Math.abs(normalOf(row)[2]), 1)) * 180 / Math.PI;
+
+  function valuesOf(row) {
+    const place = [0, 1, 2].map((i) => (placeOf(row, i) + data.middle[i]).toFixed(2));
+    const normal = normalOf(row).map((value) => value.toFixed(2));
+    return [
+      `x y z ${place.join(' ')} m`, `normal ${normal.join(' ')}`,
+      `slope ${slopeOf(row).toFixed(1)}\u00b0`,
+      ...columns.map((column) => `${column.name} ${worded(column, valueOf(column, row))}`),
+    ].join('\n');
+  }
+
+  // What discs can be coloured by: a paint (red, green, blue) or a value of a scale, of each row.
+  const heights = box[2].map((value) => value + data.middle[2]);
+  const colourings = [
+    {
+      name: 'normal',
+      paint: (row) => normalOf(row).map((value) => 255 * (0.484 + 0.45 * (0.5 + 0.5 * value))),
+    },
+    {
+      name: 'height', unit: 'm', shown: heights,
+      value: (row) => placeOf(row, 2) + data.middle[2],
+    },
+    { name: 'slope', unit: '\u00b0', shown: [0, 90], value: slopeOf },
+    ...columns.map((column) => ({ ...column, value: (row) => valueOf(column, row) })),
+  ];
+  const channels = ['red', 'green', 'blue'].map(
+    (name) => columns.find((column) => column.name === name),
+  );
+  if (channels.every(Boolean)) {
+    colourings.push({ name: 'colour', paint: (row) => channels.map((one) => valueOf(one, row)) });
+  }
+  const colouring = document.getElementById('colouring');
+  colouring.append(...colourings.map(({ name }) => new Option(name)));
+
+  function paintOf({ paint, value, log, shown: [least, most] = [] }, row) {
+    if (paint) return paint(row);
+    const one = value(row);
+    if (Number.isNaN(one)) return [153, 153, 153];
+    const part = log ? Math.log(one / least) / Math.log(most / least)
+      : (one - least) / (most - least || 1);
+    const entry = Math.round(255 * Math.min(Math.max(part, 0), 1));
+    return ramp.subarray(3 * entry, 3 * entry + 3);
   }
 
   function drawMesh(layer, matrix, eye) {
@@ -350,9 +516,11 @@
     gl.uniform3f(at('low'), -half[0], -half[1], -half[2]);
     gl.uniform3f(at('size'), ...data.size);
     gl.uniform3f(at('eye'), ...eye);
-    gl.uniform1f(at('largest'), data.largest * Math.min(Math.sqrt(count / drawn), 2.5));
-    gl.uniform1f(at('hide'), document.getElementById('hide').checked ? 1 : 0);
-    gl.uniform1i(at('colouring'), document.getElementById('colouring').selectedIndex);
+    const larger = OUTER * growth() * Math.min(Math.sqrt(count / drawn), 2.5);
+    gl.uniform1f(at('largest'), data.largest * larger);
+    gl.uniform1f(at('hide'), hides() ? FACING : 2);
+    gl.uniform1f(at('until'), until() + 1e-4);
+    gl.uniform1f(at('lamp'), colouring.selectedIndex ? 0 : 1);
     gl.drawElements(gl.TRIANGLES, 12 * drawn, gl.UNSIGNED_INT, 0);
   }
 
@@ -412,8 +580,8 @@
   canvas.addEventListener('click', (event) => {
     const away = pressed ? Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) : 0;
     if (away > 4 || layerShown()) return; // the end of a drag
-    const box = canvas.getBoundingClientRect();
-    showValues(pick(event.clientX - box.left, event.clientY - box.top));
+    const edge = canvas.getBoundingClientRect();
+    clicked(event.clientX - edge.left, event.clientY - edge.top);
   });
   const KEYS = {
     ArrowLeft: [-30, 0], ArrowRight: [30, 0], ArrowUp: [0, -30], ArrowDown: [0, 30],
@@ -434,7 +602,7 @@
     else if (event.key === '0') reset();
     else if (event.key === 'f' && document.fullscreenEnabled) fullScreen();
     else if (event.key === 'Enter') {
-      showValues(pick(canvas.clientWidth / 2, canvas.clientHeight / 2));
+      clicked(canvas.clientWidth / 2, canvas.clientHeight / 2);
     } else return;
     event.preventDefault();
     move();
@@ -472,22 +640,49 @@
   );
   document.querySelector('.scale .ramp').style.background =
     `linear-gradient(to right, ${stops.join()})`;
-  const ends = [null, ['0', '1'], data.heights, ['90\u00b0', '0\u00b0']];
   function recolour() {
-    const chosen = ends[document.getElementById('colouring').selectedIndex];
-    document.querySelector('.scale').hidden = !chosen;
-    if (chosen) {
-      [document.getElementById('least').textContent,
-        document.getElementById('most').textContent] = chosen;
+    const chosen = colourings[colouring.selectedIndex];
+    for (let row = 0; row < count; row++) {
+      const paint = paintOf(chosen, row);
+      for (let corner = 0; corner < 6; corner++) paints.set(paint, 24 * row + 4 * corner);
+    }
+    gl.bindBuffer(gl.ARRAY_BUFFER, paintBuffer);
+    gl.bufferData(gl.ARRAY_BUFFER, paints, gl.DYNAMIC_DRAW);
+    document.querySelector('.scale').hidden = !chosen.shown;
+    if (chosen.shown) {
+      const unitText = chosen.unit ? ` (${chosen.unit})` : '';
+      document.getElementById('unit').textContent = chosen.name + unitText;
+      [document.getElementById('least').textContent, document.getElementById('most').textContent] =
+        chosen.shown.map((value) => +value.toPrecision(3));
     }
     redraw();
   }
-  document.getElementById('colouring').addEventListener('change', recolour);
+
+  function showTime() {
+    const at = data.seconds[Math.round(until() * (data.seconds.length - 1))];
+    document.getElementById('seconds').textContent = at === undefined ? '' : `${at.toFixed(1)} s`;
+    if (picks.some(({ row }) => surfels[row * BYTES + 7] / 255 > until())) showPicks([]);
+    redraw();
+  }
+  document.getElementById('drive').hidden = path.length < 6;
+  time.addEventListener('input', showTime);
+  measure.addEventListener('click', () => {
+    measure.setAttribute('aria-pressed', String(!measures()));
+    showPicks([]);
+  });
+  for (const button of document.querySelectorAll('[data-yaw]')) {
+    button.addEventListener('click', () => {
+      const [yaw, pitch] = ['yaw', 'pitch'].map((name) => button.dataset[name] * Math.PI / 180);
+      reset({ yaw, pitch });
+    });
+  }
+  colouring.addEventListener('change', recolour);
   document.getElementById('hide').addEventListener('change', redraw);
-  document.getElementById('reset').addEventListener('click', reset);
+  document.getElementById('discs').addEventListener('input', redraw);
+  document.getElementById('reset').addEventListener('click', () => reset());
   new ResizeObserver(redraw).observe(canvas);
   matchMedia('(prefers-color-scheme: dark)').addEventListener('change', redraw);
   reset();
   recolour();
-
+  showTime();
 })();
