@@ -8,9 +8,9 @@ parameter is affine in x, as the least squares fit requires. Equally spaced cont
 bend x by up to 0.9 of a cell; as a NURBS patch they are placed at the Greville abscissae, where
 x(u) is affine and z unchanged.
 
-There are more control points than cells, so the fit is underdetermined. ``pspline`` adds second
-differences (Eilers and Marx 1996), which fill holes and boundaries; ``lsqr`` takes the solution
-nearest to the initial control points, the limit of gradient descent.
+There are more control points than cells, so the fit is underdetermined. ``fit_pspline`` adds
+second differences (Eilers and Marx 1996), which fill holes and boundaries. ``fit_nearest`` takes
+the solution nearest to the initial control points, the limit of gradient descent.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ import numpy.typing as npt
 
 from surfel_mapper.models.bspline_solvers import FieldSamples, is_direct, relax, solve_band
 from surfel_mapper.models.grid import Cells
+from surfel_mapper.models.kernels.splines import basis_functions, tensor_heights, tensor_rows
 
 Array = npt.NDArray[np.float64]
 
 RIDGE = 1e-6
 """Weight that pulls control points without data nearby to 0."""
 
-LSQR_STEPS = 2000
-"""Most iterations of LSQR."""
+NEAREST = 1e-9
+"""The same for the change from the initial control points: the smallest of equally good ones."""
 
 CACHED_AXES = 4096
 """Cached axes (knots, Greville abscissae): few different sizes occur."""
@@ -90,27 +91,10 @@ def basis(u: Array, knot: Array, degree: int) -> tuple[npt.NDArray[np.int64], Ar
         Their derivatives.
 
     """
-    last = len(knot) - degree - 2
-    is_number = ~np.isnan(u)
-    span = (np.where(is_number, u, 1.0) * (last + 1 - degree)).astype(np.int64) + degree
-    span = np.minimum(span, last)
-    span -= (span > degree) & (u < knot[span])  # rounding
-    span += (span < last) & (u >= knot[span + 1])
-    values, lower = [np.where(is_number, 1.0, np.nan)], []
-    for order in range(1, degree + 1):
-        lower = values
-        values = [np.zeros(len(u)) for _ in range(order + 1)]
-        for k, value in enumerate(lower):
-            low, high = knot[span + 1 - order + k], knot[span + 1 + k]
-            share = (u - low) / (high - low) * value
-            values[k] += value - share
-            values[k + 1] = share
-    slopes = np.zeros((len(u), degree + 1))
-    for k, value in enumerate(lower):
-        slope = degree * value / (knot[span + 1 + k] - knot[span + 1 - degree + k])
-        slopes[:, k] -= slope
-        slopes[:, k + 1] += slope
-    return span - degree, np.stack(values, axis=1), slopes
+    first = np.empty(len(u), np.int64)
+    values, slopes = np.empty((2, len(u), degree + 1))
+    basis_functions(u, knot, degree, first, values, slopes)
+    return first, values, slopes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,14 +123,8 @@ class HeightField:
     def heights(self, xy: Array) -> Array:
         """Return z at (M, 2) x and y, m; beyond the grid, that at its boundary; at nan, nan."""
         (first_x, x, _), (first_y, y, _) = (self._basis(xy, axis) for axis in range(2))
-        control, start = self.control.ravel(), first_x * self.control.shape[1] + first_y
-        result = np.zeros(len(xy))
-        for j in range(x.shape[1]):
-            along = np.zeros(len(xy))
-            for k in range(y.shape[1]):
-                along += y[:, k] * control[start + k]
-            result += x[:, j] * along
-            start += self.control.shape[1]
+        result = np.empty(len(xy))
+        tensor_heights(first_x, x, first_y, y, self.control, result)
         return result
 
     def slopes(self, xy: Array) -> Array:
@@ -202,16 +180,13 @@ def design(
         Factor of the derivatives.
 
     """
-    firsts, factors, unit = [], [], 1.0
-    for axis in range(2):
-        first, values, slopes = field._basis(xy, axis)
-        firsts.append(first[:, None] + np.arange(values.shape[1]))
-        factors.append(slopes if axis == along else values)
-        unit = 1.0 / field.width_m(axis) if axis == along else unit
-    rows = firsts[0][:, :, None] * field.control.shape[1] + firsts[1][:, None, :]
-    weights = factors[0][:, :, None] * factors[1][:, None, :]
+    (first_x, *x), (first_y, *y) = (field._basis(xy, axis) for axis in range(2))
+    unit = 1.0 if along < 0 else 1.0 / field.width_m(along)
     shape = len(xy), (field.degrees[0] + 1) * (field.degrees[1] + 1)
-    return rows.reshape(shape), weights.reshape(shape), unit
+    rows, weights = np.empty(shape, np.int64), np.empty(shape)
+    factors = first_x, x[int(along == 0)], first_y, y[int(along == 1)]
+    tensor_rows(*factors, field.control.shape[1], rows, weights)
+    return rows, weights, unit
 
 
 def initial_field(
@@ -240,23 +215,17 @@ def initial_field(
     return HeightField(pitch_m, origin, degrees, control)
 
 
-def fit_lsqr(start: HeightField, xy: Array, z: Array) -> HeightField:
+def fit_nearest(start: HeightField, xy: Array, z: Array) -> HeightField:
     """Return the least squares field of (M,) heights at (M, 2) nearest to the initial one."""
-    from scipy.sparse import csr_array  # 0.4 s that mapping without models saves
-    from scipy.sparse.linalg import lsqr
-
-    rows, weights, _ = design(start, xy)
-    shape = (len(xy), start.control.size)
-    ends = np.arange(0, rows.size + 1, rows.shape[1])
-    matrix = csr_array((weights.ravel(), rows.ravel(), ends), shape=shape)
-    missing = z - matrix @ start.control.ravel()
-    change = lsqr(matrix, missing, atol=1e-12, btol=1e-12, iter_lim=LSQR_STEPS)[0]
-    control = start.control + change.reshape(start.control.shape)
+    flat = HeightField(start.pitch_m, start.origin, start.degrees, np.zeros_like(start.control))
+    missing, rules = z - start.heights(xy), (0.0, NEAREST)
+    change = fit_pspline(flat, xy, missing, np.ones(len(z)), rules)
+    control = start.control + change.control
     return HeightField(start.pitch_m, start.origin, start.degrees, control)
 
 
 def fit_pspline(
-    start: HeightField, xy: Array, z: Array, weight: Array, smoothing: float
+    start: HeightField, xy: Array, z: Array, weight: Array, rules: tuple[float, float]
 ) -> HeightField:
     """
     Return the field that minimises weighted squared residuals plus squared second differences.
@@ -267,8 +236,8 @@ def fit_pspline(
         Grid and degrees.
     xy, z, weight : (M, 2), (M,), (M,) float64
         Samples, m, and their weights.
-    smoothing : float
-        Weight of the second differences, for a mean weight of 1.
+    rules : (float, float)
+        Weight of the second differences, for a mean weight of 1, and of the squares of heights.
 
     Notes
     -----
@@ -277,18 +246,19 @@ def fit_pspline(
 
     """
     if start.control.shape[1] > start.control.shape[0]:  # the bandwidth is the short side
-        turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, smoothing)
+        turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, rules)
         return transposed(turned)
     rows, weights, _ = design(start, xy)
     samples = FieldSamples(rows, weights, z, weight / weight.mean())
     if is_direct(start.control.shape, max(*start.degrees, 2)):
-        control = solve_band(samples, start.greville(), (smoothing, RIDGE))
+        control = solve_band(samples, start.greville(), rules)
         return HeightField(start.pitch_m, start.origin, start.degrees, control)
     active = np.zeros(start.control.shape, np.bool_)
     active.ravel()[rows] = True
     initial = continued(start.control, start.control != 0.0)
-    control = relax(samples, start.greville(), active, (smoothing, RIDGE), initial)
-    control = continued(control, active)
+    control = relax(samples, start.greville(), active, rules, initial)
+    if rules[0] > 0.0:
+        control = continued(control, active)
     return HeightField(start.pitch_m, start.origin, start.degrees, control)
 
 
@@ -316,7 +286,7 @@ def fit_cells(cells: Cells, patch: int, degree: int, smoothing: float | None) ->
     degree : int
         Degree of the splines, reduced along axes with too few cells.
     smoothing : float or None
-        Weight of the second differences, for a mean weight of 1; None for fit_lsqr.
+        Weight of the second differences, for a mean weight of 1; None for fit_nearest.
 
     """
     sums, (num_x, num_y) = cells.sums[cells.of(patch)], cells.sizes[patch]
@@ -329,8 +299,8 @@ def fit_cells(cells: Cells, patch: int, degree: int, smoothing: float | None) ->
     start = initial_field(float(cells.pitches[patch]), origin, heights, filled, degree)
     xy, z = means[used, :2], means[used, 2]
     if smoothing is None:
-        return fit_lsqr(start, xy, z)
-    return fit_pspline(start, xy, z, sums[used, 3], smoothing)
+        return fit_nearest(start, xy, z)
+    return fit_pspline(start, xy, z, sums[used, 3], (smoothing, RIDGE))
 
 
 def transposed(field: HeightField) -> HeightField:

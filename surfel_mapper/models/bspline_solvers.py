@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.models.kernels.splines import add_equations
+
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -92,11 +94,8 @@ def solve_band(
     reach = samples.rows[:, -1:] - samples.rows[:, :1] if len(samples.rows) else np.zeros((1, 1))
     width = max(int(reach.max()), 2 * shape[1], 2) + 1
     number = shape[0] * shape[1]
-    weighted = samples.weights * samples.share[:, None]
-    i, j = np.triu_indices(samples.rows.shape[1])
-    index = (samples.rows[:, j] - samples.rows[:, i]) * number + samples.rows[:, i]
-    entries = weighted[:, i] * samples.weights[:, j]
-    band = np.bincount(index.ravel(), entries.ravel(), width * number)
+    band, right = np.zeros((width, number)), np.zeros(number)
+    add_equations(samples.rows, samples.weights, samples.z, samples.share, band, right)
     grid = band.reshape(width, *shape)
     for axis in range(2):
         second = second_differences(positions[axis])
@@ -106,10 +105,7 @@ def solve_band(
             along[: shape[axis] - k] = np.diagonal(product, -k)
             grid[k * step] += smoothing * (along[:, None] if axis == 0 else along)
     grid[0] += ridge
-    right = np.bincount(samples.rows.ravel(), (weighted * samples.z[:, None]).ravel(), number)
-    solution = solveh_banded(
-        band.reshape(width, number), right, lower=True, check_finite=False, overwrite_ab=True
-    )
+    solution = solveh_banded(band, right, lower=True, check_finite=False, overwrite_ab=True)
     return np.array(solution.reshape(shape), np.float64)  # a view would keep the band
 
 

@@ -11,7 +11,7 @@ from surfel_mapper.models.bspline import (
     axis_degree,
     basis,
     design,
-    fit_lsqr,
+    fit_nearest,
     fit_pspline,
     initial_field,
     knots,
@@ -53,13 +53,28 @@ def scene(function, cells=(9, 6), holes=False):
 
 
 @pytest.mark.parametrize('cells', [(1, 1), (2, 1), (3, 4), (9, 6), (5, 30)])
-@pytest.mark.parametrize('solver', ['lsqr', 'pspline'])
+@pytest.mark.parametrize('solver', ['nearest', 'pspline'])
 def test_planes_are_reproduced(cells, solver):
     start, xy, z = scene(lambda x, y: 0.3 * x - 0.2 * y + 0.1, cells)
     ones = np.ones(len(z))
-    field = fit_lsqr(start, xy, z) if solver == 'lsqr' else fit_pspline(start, xy, z, ones, 1e-2)
+    field = (
+        fit_nearest(start, xy, z)
+        if solver == 'nearest'
+        else fit_pspline(start, xy, z, ones, (1e-2, RIDGE))
+    )
     scale = max(np.ptp(z), 0.1)
     assert np.abs(field.heights(xy) - z).max() < 1e-4 * scale
+
+
+@pytest.mark.parametrize('cells', [(1, 1), (3, 4), (9, 6)])
+def test_nearest_field_is_the_least_change_of_the_least_squares(cells):
+    start, xy, z = scene(lambda x, y: np.sin(3 * x) * y, cells, holes=cells == (9, 6))
+    rows, weights, _ = design(start, xy)
+    matrix = np.zeros((len(z), start.control.size))
+    np.add.at(matrix, (np.arange(len(z))[:, None], rows), weights)
+    change = np.linalg.pinv(matrix) @ (z - matrix @ start.control.ravel())
+    expected = start.control + change.reshape(start.control.shape)
+    np.testing.assert_allclose(fit_nearest(start, xy, z).control, expected, atol=1e-6)
 
 
 def test_quadrics_are_reproduced_and_holes_are_filled():
@@ -67,11 +82,11 @@ def test_quadrics_are_reproduced_and_holes_are_filled():
         return 0.4 * x**2 - 0.1 * x * y + 0.2 * y**2
 
     start, xy, z = scene(bowl, holes=True)
-    field = fit_pspline(start, xy, z, np.ones(len(z)), 1e-6)
+    field = fit_pspline(start, xy, z, np.ones(len(z)), (1e-6, RIDGE))
     assert np.abs(field.heights(xy) - z).max() < 1e-3 * np.ptp(z)
     hole = ORIGIN + PITCH * np.array([[4.0, 3.0], [3.5, 2.5]])
     expected = bowl(hole[:, 0], hole[:, 1])
-    usual = fit_pspline(start, xy, z, np.ones(len(z)), 1e-2)
+    usual = fit_pspline(start, xy, z, np.ones(len(z)), (1e-2, RIDGE))
     np.testing.assert_allclose(usual.heights(hole), expected, atol=0.05 * np.ptp(z))
 
 
@@ -101,7 +116,7 @@ def test_banded_fields_equal_the_dense_normal_equations(cells):
 
 def test_slopes_are_the_derivatives_of_the_heights():
     start, xy, z = scene(lambda x, y: np.sin(2 * x) + y**2)
-    field = fit_pspline(start, xy, z, np.ones(len(z)), 1e-3)
+    field = fit_pspline(start, xy, z, np.ones(len(z)), (1e-3, RIDGE))
     step = 1e-6
     for axis in range(2):
         by = step * np.eye(2)[axis]
@@ -114,7 +129,7 @@ def test_greville_points_make_the_same_surface_a_nurbs_patch(cells):
     from scipy.interpolate import BSpline  # seconds to import
 
     start, xy, z = scene(lambda x, y: x**2 - y, cells)
-    field = fit_pspline(start, xy, z, np.ones(len(z)), 1e-2)
+    field = fit_pspline(start, xy, z, np.ones(len(z)), (1e-2, RIDGE))
     control = field.greville()
     for axis in range(2):
         degree, width = field.degrees[axis], (cells[axis] + 1) * PITCH
