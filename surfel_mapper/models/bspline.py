@@ -129,11 +129,11 @@ class HeightField:
 
     def slopes(self, xy: Array) -> Array:
         """Return dz/dx and dz/dy at (M, 2) x and y."""
-        result = np.empty((len(xy), 2))
-        for axis in range(2):
-            rows, weights, unit = design(self, xy, along=axis)
-            result[:, axis] = unit * np.einsum('ij,ij->i', self.control.ravel()[rows], weights)
-        return result
+        (first_x, x, slope_x), (first_y, y, slope_y) = (self._basis(xy, k) for k in range(2))
+        along = np.empty((2, len(xy)))
+        tensor_heights(first_x, slope_x, first_y, y, self.control, along[0])
+        tensor_heights(first_x, x, first_y, slope_y, self.control, along[1])
+        return np.stack([along[0] / self.width_m(0), along[1] / self.width_m(1)], axis=1)
 
     def _basis(self, xy: Array, axis: int) -> tuple[npt.NDArray[np.int64], Array, Array]:
         """Return the basis functions along an axis at locations (M, 2); see basis."""
@@ -155,9 +155,7 @@ class HeightField:
         return x, y
 
 
-def design(
-    field: HeightField, xy: Array, along: int = -1
-) -> tuple[npt.NDArray[np.int64], Array, float]:
+def design(field: HeightField, xy: Array) -> tuple[npt.NDArray[np.int64], Array]:
     """
     Return the rows of the design matrix: control points and their weights for each location.
 
@@ -167,8 +165,6 @@ def design(
         Grid and degrees; control points are not used.
     xy : (M, 2) float64, m
         Locations.
-    along : int
-        0 or 1: the derivative along that axis; -1: the height.
 
     Returns
     -------
@@ -176,17 +172,13 @@ def design(
         Indices of the control points, y within x.
     (M, W) float64
         Their weights.
-    float
-        Factor of the derivatives.
 
     """
-    (first_x, *x), (first_y, *y) = (field._basis(xy, axis) for axis in range(2))
-    unit = 1.0 if along < 0 else 1.0 / field.width_m(along)
+    (first_x, x, _), (first_y, y, _) = (field._basis(xy, axis) for axis in range(2))
     shape = len(xy), (field.degrees[0] + 1) * (field.degrees[1] + 1)
     rows, weights = np.empty(shape, np.int64), np.empty(shape)
-    factors = first_x, x[int(along == 0)], first_y, y[int(along == 1)]
-    tensor_rows(*factors, field.control.shape[1], rows, weights)
-    return rows, weights, unit
+    tensor_rows(first_x, x, first_y, y, field.control.shape[1], rows, weights)
+    return rows, weights
 
 
 def initial_field(
@@ -248,7 +240,7 @@ def fit_pspline(
     if start.control.shape[1] > start.control.shape[0]:  # the bandwidth is the short side
         turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, rules)
         return transposed(turned)
-    rows, weights, _ = design(start, xy)
+    rows, weights = design(start, xy)
     samples = FieldSamples(rows, weights, z, weight / weight.mean())
     if is_direct(start.control.shape, max(*start.degrees, 2)):
         control = solve_band(samples, start.greville(), rules)

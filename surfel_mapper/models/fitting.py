@@ -156,7 +156,7 @@ def fit_points(
     laps.append(clock())
     surfaces = merge_clusters(clusters, config, view)
     laps.append(clock())
-    patches = fitted_patches(clusters, surfaces, config, view)
+    patches = fitted_patches(clusters, surfaces, config, view, whole=False)
     laps.append(clock())
     label, group = np.full((2, len(core)), -1, np.int32)
     at = rows[clusters.order]
@@ -306,9 +306,14 @@ def group_moments(points: Array, group: Indices, counts: Indices) -> tuple[Array
 
 
 def fitted_patches(
-    clusters: Clusters, surfaces: list[Indices], config: ModelsConfig, viewpoint: Array
+    clusters: Clusters,
+    surfaces: list[Indices],
+    config: ModelsConfig,
+    viewpoint: Array,
+    *,
+    whole: bool = True,
 ) -> list[tuple[Plane, Indices]]:
-    """Return the patches that could be fitted, each with the rows of its clusters."""
+    """Return the patches that could be fitted, each with its clusters; see fit_patches."""
     least = 1 if is_paper(config) else config.min_surface_points
     counts = clusters.num_points
     kept = [members for members in surfaces if counts[members].sum() >= least]
@@ -324,7 +329,7 @@ def fitted_patches(
         normals=np.array([mean_normal(clusters, members) for members in kept]),
         thickness=thickness(means, config, viewpoint),
     )
-    patches = fit_patches(groups, config, viewpoint)
+    patches = fit_patches(groups, config, viewpoint, whole=whole)
     return [(p, members) for p, members in zip(patches, kept, strict=True) if p is not None]
 
 

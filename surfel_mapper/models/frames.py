@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.frames import eigen_frames, group_moments
+from surfel_mapper.models.kernels.frames import eigen_frames, group_scatters
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -41,16 +41,10 @@ def means_and_scatters(
         Weighted sums of outer products of deviations.
 
     """
-    sums = np.empty((len(starts) - 1, 10))
-    group_moments(points, weights, starts, sums)
-    has_weight = sums[:, 0] > 0.0
-    away = sums[:, 1:4] / np.where(has_weight, sums[:, 0], 1.0)[:, None]
-    scatters = sums[:, 4:][:, PACKED] - sums[:, 1:4, None] * away[:, None, :]
-    diagonal = np.arange(3)
-    scatters[:, diagonal, diagonal] = np.maximum(scatters[:, diagonal, diagonal], 0.0)
-    means = np.zeros_like(away)
-    means[has_weight] = points[starts[:-1][has_weight]] + away[has_weight]
-    return sums[:, 0], means, scatters
+    number = len(starts) - 1
+    totals, means, scatters = np.empty(number), np.empty((number, 3)), np.empty((number, 3, 3))
+    group_scatters(points, weights, starts, totals, means, scatters)
+    return totals, means, scatters
 
 
 def eigen(matrices: Array) -> tuple[Array, Array]:

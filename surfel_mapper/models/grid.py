@@ -136,7 +136,7 @@ class Cells:
         local: Array,
         patch: Indices,
         pitches: Array,
-        margin_m: float,
+        margin_m: float | None,
         *,
         snapped: bool,
     ) -> Cells:
@@ -154,8 +154,8 @@ class Cells:
             Patch of each point, ascending; each has points.
         pitches : (K,) float64, m
             Edges of the cells.
-        margin_m : float
-            Distance left between a cut and the points, m.
+        margin_m : float or None
+            Distance left between a cut and the points, m; None leaves boundary cells whole.
         snapped : bool
             Whether grids start at multiples of their pitch, else at the first point.
 
@@ -184,7 +184,8 @@ class Cells:
             corner=np.zeros(total, np.uint8),
             cuts=np.zeros((total, 3), np.uint8),
         )
-        cells._cut(xy - origins[patch], row, margin_m)
+        if margin_m is not None:
+            cells._cut(xy - origins[patch], row, margin_m)
         return cells
 
     def _cut(self, offset: Array, row: Indices, margin_m: float) -> None:

@@ -32,6 +32,7 @@ from surfel_mapper.models.kernels.growth import (
     find_facets,
     FREE,
     grow_patches,
+    rename_owners,
     SLOTS,
 )
 from surfel_mapper.models.kernels.joining import sort_owners
@@ -210,19 +211,8 @@ def grow(
     num = len(patches) + len(add_facets(voxels, owner, len(patches), (size_m, facet_m), config))
     table = owner_table(voxels, owner)
     index, normals, curved = join_patches(pieces_of(voxels, table, num), view, noise, size_m)
-    owner = renamed(voxels.starts, group, index, owner)
+    rename_owners(voxels.starts, group, index, owner)
     return grown(owner, owner_table(voxels, owner), normals, curved, median_m)
-
-
-def renamed(starts: Indices, group: Owners, index: Owners, owner: Owners) -> Owners:
-    """
-    Return owners (P,), where patch k is index[k] and a free one -1 less the group of its voxel.
-
-    starts: first owner of each voxel, (V + 1,)
-    """
-    free = -1 - np.repeat(group, np.diff(starts))
-    names: Owners = np.where(owner >= 0, np.append(index, 0)[owner], free).astype(np.int32)
-    return names
 
 
 def grown(
@@ -388,10 +378,9 @@ def tolerances(
 ) -> Array:
     """Return the distance (K,) up to which a point lies on each patch, m; noise (K,) across it."""
     number = len(noise)
-    voxel = np.repeat(np.arange(len(label)), np.diff(voxels.starts))
-    rows = np.flatnonzero(label[voxel] >= 0)
-    rows = rows[:: 1 + len(rows) // SAMPLES]
-    voxel = voxel[rows]
+    rows: Indices = np.arange(0, len(voxels.points), 1 + len(voxels.points) // SAMPLES)
+    voxel = np.searchsorted(voxels.starts, rows, side='right') - 1
+    rows, voxel = (array[label[voxel] >= 0] for array in (rows, voxel))
     who, plane = label[voxel], tangent[voxel]
     distance = np.abs(np.einsum('ij,ij->i', voxels.points[rows], plane[:, :3]) + plane[:, 3])
     order = np.argsort(who, kind='stable')

@@ -23,7 +23,13 @@ from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.kernels.surfel_classes import FLAT
 from surfel_mapper.models.kernels.surfel_groups import mean_normals, merge_voxels, sample_voxels
 from surfel_mapper.models.multi_model import Plane, Surface
-from surfel_mapper.models.patches import cells_of, described, PatchPoints, rms_across
+from surfel_mapper.models.patches import (
+    cells_of,
+    described,
+    MARGIN_VOXELS,
+    PatchPoints,
+    rms_across,
+)
 from surfel_mapper.models.surfel_graph import SurfelGraph
 
 Array = npt.NDArray[np.float64]
@@ -170,7 +176,7 @@ class PatchFitter:
         origins = self._steadied(previous, groups)
         pitches = np.where(curved, self._surface_pitch_m, PLANE_PITCH_VOXELS * self._size_m)
         placed = origins, frames, pitches
-        cells, _ = cells_of(samples, placed, 0.5 * self._size_m, snapped=True)
+        cells, _ = cells_of(samples, placed, MARGIN_VOXELS * 0.5 * self._size_m, snapped=True)
         ends = np.array([len(extra) for extra in beyond])
         fields = fields_of(cells, np.flatnonzero(curved & (ends == 0)))
         seams = np.flatnonzero(curved & (ends > 0))
@@ -213,7 +219,7 @@ class PatchFitter:
         starts = np.concatenate([[0], ends])
         groups = PatchPoints(points, starts, samples.normals[chosen], samples.thickness[chosen])
         origins, axes, pitches = (array[chosen] for array in frames)
-        return cells_of(groups, (origins, axes, pitches), 0.5 * self._size_m, snapped=True)[0]
+        return cells_of(groups, (origins, axes, pitches), None, snapped=True)[0]
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
         """Return number, mean and covariance of all points of groups of voxels."""

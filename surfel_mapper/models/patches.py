@@ -67,8 +67,14 @@ class PatchPoints:
     curved: npt.NDArray[np.bool_] | None = None
 
 
-def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> list[Plane | None]:
-    """Return a Plane or Surface for every group, in order; None for multi-valued ones."""
+def fit_patches(
+    groups: PatchPoints, config: ModelsConfig, viewpoint: Array, *, whole: bool = True
+) -> list[Plane | None]:
+    """
+    Return a Plane or Surface for every group, in order; None for multi-valued ones.
+
+    Without `whole`, their grids have no boundary: such patches are fitted again.
+    """
     number, by_paper = len(groups.thickness), is_paper(config)
     a = config.voxel_size_m
     thickness, bent = groups.thickness, not by_paper
@@ -78,7 +84,8 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     means, covariances, frames, curved = described(groups, viewpoint, rules)
     plane_pitch = PAPER_PLANE_PITCH_VOXELS if by_paper else config.plane_pitch_voxels
     pitches = np.where(curved, SURFACE_PITCH_VOXELS, plane_pitch) * a
-    cells, local = cells_of(groups, (means, frames, pitches), a, snapped=not by_paper)
+    margin_m = MARGIN_VOXELS * a if whole else None
+    cells, local = cells_of(groups, (means, frames, pitches), margin_m, snapped=not by_paper)
     splines = splines_of(cells, np.flatnonzero(curved), config)
     numbers, grids = np.diff(groups.starts), cells.grids()
     rms_m = rms_across(covariances, frames[:, 2], numbers)
@@ -190,7 +197,11 @@ def weighted_fit(basis: Array, z: Array, weight: Array) -> Array:
 
 
 def cells_of(
-    groups: PatchPoints, frames: tuple[Array, Array, Array], a: float, *, snapped: bool
+    groups: PatchPoints,
+    frames: tuple[Array, Array, Array],
+    margin_m: float | None,
+    *,
+    snapped: bool,
 ) -> tuple[Cells, Array]:
     """
     Return the cells of all patches, and the points (N, 3) in their frames.
@@ -201,8 +212,8 @@ def cells_of(
         The points.
     frames : tuple
         Origins (K, 3) and axes (K, 3, 3) of the frames, edges of the cells (K,), m.
-    a : float
-        Edge of the voxels, m.
+    margin_m : float or None
+        Distance between the boundary and the points, m; None for no boundary.
     snapped : bool
         Whether grids start at multiples of the edges of their cells.
 
@@ -210,7 +221,7 @@ def cells_of(
     origins, axes, pitches = frames
     patch = np.repeat(np.arange(len(origins)), np.diff(groups.starts))
     local = np.einsum('nij,nj->ni', axes[patch], groups.points - origins[patch])
-    return Cells.around(local, patch, pitches, MARGIN_VOXELS * a, snapped=snapped), local
+    return Cells.around(local, patch, pitches, margin_m, snapped=snapped), local
 
 
 def splines_of(cells: Cells, curved: Indices, config: ModelsConfig) -> dict[int, HeightField]:

@@ -82,7 +82,7 @@ def with_smooth_seams(
     frames = np.array([surfaces[number].R_patch_map for number in chosen])
     pitches = np.full(len(chosen), PITCH_VOXELS * config.voxel_size_m)
     placed = means, frames, pitches
-    cells, _ = cells_of(groups, placed, config.voxel_size_m, snapped=True)
+    cells, _ = cells_of(groups, placed, None, snapped=True)
     splines = splines_of(cells, np.arange(len(chosen)), config)
     smooth = list(surfaces)
     for k, number in enumerate(chosen):
@@ -120,8 +120,13 @@ def continuations(
     beyond = []
     for surface, own in enumerate(members):
         low, high = points[own].min(axis=0) - reach_m, points[own].max(axis=0) + reach_m
-        near = (owner != surface) & ((low <= points) & (points <= high)).all(axis=1)
+        near = (owner != surface) & (np.abs(normals @ axes[surface]) > UPRIGHT)
+        for axis in range(3):
+            near &= (points[:, axis] >= low[axis]) & (points[:, axis] <= high[axis])
         rows = np.flatnonzero(near)
+        if not len(rows):
+            beyond.append(rows)
+            continue
         tree = cKDTree(points[own])
         away, nearest = tree.query(points[rows], distance_upper_bound=reach_m)
         rows, away, nearest = (array[nearest < len(own)] for array in (rows, away, nearest))
@@ -129,5 +134,5 @@ def continuations(
         height = np.abs(((points[rows] - points[host]) * normals[host]).sum(axis=1))
         smooth = height < STEEPEST * np.maximum(away, voxel_size_m)
         smooth &= np.abs((normals[rows] * normals[host]).sum(axis=1)) > CREASE
-        beyond.append(rows[smooth & (np.abs(normals[rows] @ axes[surface]) > UPRIGHT)])
+        beyond.append(rows[smooth])
     return beyond

@@ -58,7 +58,7 @@ class Thinned:
 
     def by_voxel(self) -> VoxelPoints:
         """Return the finite points by voxel, with the neighbours of voxels."""
-        points = self.points[self.rows].astype(np.float64)
+        points = np.take(self.points, self.rows, axis=0).astype(np.float64)
         return VoxelPoints.of(points, self.rows, self.starts, self.keys, self.bits)
 
     def point_labels(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

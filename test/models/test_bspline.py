@@ -69,7 +69,7 @@ def test_planes_are_reproduced(cells, solver):
 @pytest.mark.parametrize('cells', [(1, 1), (3, 4), (9, 6)])
 def test_nearest_field_is_the_least_change_of_the_least_squares(cells):
     start, xy, z = scene(lambda x, y: np.sin(3 * x) * y, cells, holes=cells == (9, 6))
-    rows, weights, _ = design(start, xy)
+    rows, weights = design(start, xy)
     matrix = np.zeros((len(z), start.control.size))
     np.add.at(matrix, (np.arange(len(z))[:, None], rows), weights)
     change = np.linalg.pinv(matrix) @ (z - matrix @ start.control.ravel())
@@ -94,7 +94,7 @@ def test_quadrics_are_reproduced_and_holes_are_filled():
 def test_banded_fields_equal_the_dense_normal_equations(cells):
     rng = np.random.default_rng(4)
     start, xy, z = scene(lambda x, y: np.sin(2 * x) + y**2, cells, holes=cells == (9, 6))
-    rows, weights, _ = design(start, xy)
+    rows, weights = design(start, xy)
     share = rng.uniform(0.5, 2.0, len(z))
     samples = np.zeros((len(z), start.control.size))
     np.add.at(samples, (np.arange(len(z))[:, None], rows), weights)

@@ -111,14 +111,16 @@ def plane_of(sums, divisor, value, axes):
 
 
 @kernel(error_model='numpy')
-def group_moments(points, weights, starts, sums):
+def group_scatters(points, weights, starts, totals, means, scatters):
     """
-    Sum the moments of groups of points, each about its first point.
+    Sum the moments of groups of points, each about its first point, and move them to the mean.
 
-    points   (N, 3) float64; group k has the rows starts[k] to starts[k + 1] - 1
-    weights  (N,) float64
-    starts   (K + 1,) int64
-    sums     (K, 10) float64, out: weight, x y z, xx xy xz yy yz zz
+    points    (N, 3) float64; group k has the rows starts[k] to starts[k + 1] - 1
+    weights   (N,) float64
+    starts    (K + 1,) int64
+    totals    (K,) float64, out: weights
+    means     (K, 3) float64, out: 0 without weight
+    scatters  (K, 3, 3) float64, out: weighted sums of outer products of deviations
     """
     for k in range(len(starts) - 1):
         low = starts[k]
@@ -142,9 +144,17 @@ def group_moments(points, weights, starts, sums):
             yy += v * y
             yz += v * z
             zz += t * z
-        sums[k, 0], sums[k, 1], sums[k, 2], sums[k, 3] = s, sx, sy, sz
-        sums[k, 4], sums[k, 5], sums[k, 6] = xx, xy, xz
-        sums[k, 7], sums[k, 8], sums[k, 9] = yy, yz, zz
+        totals[k], means[k], scatters[k] = s, 0.0, 0.0
+        if s > 0.0:
+            x, y, z = sx / s, sy / s, sz / s
+            means[k, 0], means[k, 1] = points[low, 0] + x, points[low, 1] + y
+            means[k, 2] = points[low, 2] + z
+            scatters[k, 0, 0] = max(xx - sx * x, 0.0)
+            scatters[k, 1, 1] = max(yy - sy * y, 0.0)
+            scatters[k, 2, 2] = max(zz - sz * z, 0.0)
+            scatters[k, 0, 1] = scatters[k, 1, 0] = xy - sx * y
+            scatters[k, 0, 2] = scatters[k, 2, 0] = xz - sx * z
+            scatters[k, 1, 2] = scatters[k, 2, 1] = yz - sy * z
 
 
 @inlined(error_model='numpy')
