@@ -95,41 +95,67 @@ Drawing = MeshDrawing | RingsDrawing | EllipsoidsDrawing
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Panel:
+class PointsPanel:
     """
-    Points of a picture.
+    A cloud, coloured by the distance from the viewer.
 
     Attributes
     ----------
     title : str
     points : (N, 3) float64
-    colors : (N, 3) float64, optional
-        Without them points are coloured by their distance from the viewer.
 
     """
 
     title: str
     points: Array
-    colors: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ShapesPanel:
+    """
+    Filled, shaded and outlined shapes.
+
+    Attributes
+    ----------
+    title : str
+    corners : (T, 3, 3) float64
+        Corners of triangles.
+    colors : (T, 3) float64
+        Their colours.
+    rings : sequence of (M, 3) float64
+        Outlines.
+    ring_colors : (R, 3) float64
+        Their colours.
+    legend : sequence of (str, face, edge)
+        Texts, each with a colour of faces and one of outlines or None.
+
+    """
+
+    title: str
+    corners: Array
+    colors: Array
+    rings: Sequence[Array]
+    ring_colors: Array
+    legend: Sequence[tuple[str, tuple[float, ...], tuple[float, ...] | None]] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PointsPicture:
     """
-    Panels side by side, seen from the same place.
+    A cloud, and shapes that stand for it, side by side and seen from the same place.
 
     Attributes
     ----------
     file_name : str
         Name of the PNG file that a replay writes.
-    panels : sequence of Panel
-        The first decides the direction of view.
+    panels : PointsPanel, ShapesPanel
+        The cloud decides the direction of view.
     viewpoint : (3,) float64
 
     """
 
     file_name: str
-    panels: Sequence[Panel]
+    panels: tuple[PointsPanel, ShapesPanel]
     viewpoint: Array
 
 

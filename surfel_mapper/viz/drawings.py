@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The drawings of layers: meshes for the page of a report, a picture of points, a section of HTML.
+The drawings of layers: meshes for the page of a report, a picture of models, a section of HTML.
 
 Layers describe shapes and tables as arrays (layers/drawings.py); only this folder draws them. A
 picture is seen without perspective.
@@ -12,17 +12,20 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.geometry import face_normals
 from surfel_mapper.layers.drawings import (
     Drawing,
     EllipsoidsDrawing,
     MeshDrawing,
     PointsPicture,
     Section,
+    ShapesPanel,
     Table,
 )
 from surfel_mapper.models.shapes import CORNERS, FACES
@@ -30,19 +33,35 @@ from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 from surfel_mapper.viz.charts import as_html
 from surfel_mapper.viz.discs import as_bytes, DrawnDiscs
 from surfel_mapper.viz.mesh import MAX_TRIANGLES
-from surfel_mapper.viz.rendering import fitted, rendered
+from surfel_mapper.viz.rendering import Camera, rendered
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Array = npt.NDArray[np.float64]
 
-HEIGHT_INCH, PANEL_INCH, TITLE_INCH, DPI = 6.0, 6.5, 0.4, 120
+PANEL_INCH, TEXT_INCH, LEAST_INCH, MOST_INCH, DPI = 6.0, 0.6, 3.0, 9.0, 120
+"""Width of a panel, height of its texts, least and greatest height of both, pixels of an inch."""
 
-POINT_PX = 1.2
-"""Radius of a point."""
+BEYOND, MARGIN = 0.5, 0.03
+"""Points left out of the frame at either end of an axis, per cent, and its margin."""
+
+MOST_RADIUS_PX = 4.0
+"""Largest radius of a point: points fill the frame if they are evenly spread."""
+
+GROUND, LIGHT, AMBIENT = (0.93, 0.94, 0.95), np.array([-0.35, 0.5, 0.8]), 0.45
+"""Background; direction to the light: right, up, towards the viewer; share of all sides."""
+
+NEAR_COLOR, FAR_COLOR = (0.95, 0.75, 0.25), (0.15, 0.2, 0.45)
+"""Colours of points by their distance."""
+
+BAR_SHARE = 0.3
+"""Largest length of the scale bar, as a share of the width of the frame."""
 
 
 def draw_points(path: str | Path, picture: PointsPicture) -> None:
     """
-    Draw panels of points side by side as a PNG file, written whole or not at all.
+    Draw a cloud and its shapes side by side as a PNG file, written whole or not at all.
 
     Parameters
     ----------
@@ -60,29 +79,112 @@ def draw_points(path: str | Path, picture: PointsPicture) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    R = view_axes(picture.panels[0].points, picture.viewpoint)
-    at = np.concatenate([panel.points @ R[:2].T for panel in picture.panels])
-    low, high = (at.min(axis=0), at.max(axis=0)) if len(at) else (-np.ones(2), np.ones(2))
-    panel_px = round(PANEL_INCH * DPI), round((HEIGHT_INCH - TITLE_INCH) * DPI)
-    camera = fitted(R, low, np.maximum(high, low + 1e-3), *panel_px)
-    radius_m = POINT_PX / camera.px_per_m
-    size = PANEL_INCH * len(picture.panels), HEIGHT_INCH
-    figure = Figure(figsize=size, dpi=DPI)
+    cloud, shapes = picture.panels
+    R = view_axes(cloud.points, picture.viewpoint)
+    low, high = frame_of(np.concatenate([cloud.points, shapes.corners.reshape(-1, 3)]) @ R[:2].T)
+    aspect = (high[1] - low[1]) / (high[0] - low[0])
+    height = min(max(PANEL_INCH * aspect + TEXT_INCH, LEAST_INCH), MOST_INCH)
+    size = 2.0 * PANEL_INCH + TEXT_INCH, height
+    figure = Figure(figsize=size, dpi=DPI, layout='constrained')
     FigureCanvasAgg(figure)
-    for number, panel in enumerate(picture.panels):
-        colors = panel.colors
-        if colors is None:
-            colors = depth_colors(-panel.points @ R[2])
-        normal = np.broadcast_to(R[2], panel.points.shape)
-        discs = DrawnDiscs(panel.points, normal, np.full(len(panel.points), radius_m))
-        image, _ = rendered(camera, discs, as_bytes(colors[:, :3]))
-        across = 1.0 / len(picture.panels)
-        ax = figure.add_axes((number * across, 0.0, across, 1.0 - TITLE_INCH / HEIGHT_INCH))
-        ax.imshow(image, interpolation='nearest', aspect='auto')
-        ax.set_title(panel.title)
-        ax.set_axis_off()
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    fill_points(left, cloud.points, R, (low, high))
+    fill_shapes(right, shapes, R)
+    for ax, panel in ((left, cloud), (right, shapes)):
+        ax.set(aspect='equal', xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        ax.set(xticks=[], yticks=[], facecolor=GROUND)
+        ax.set_title(panel.title, fontsize='medium')
+        draw_scale(ax, low, high)
     with replace_file(path) as file:
         figure.savefig(file, format='png')
+
+
+def frame_of(projected: Array) -> tuple[Array, Array]:
+    """Return the lowest and highest corner (2,) of a picture of points (N, 2), m."""
+    if not len(projected):
+        return np.full(2, -1.0), np.full(2, 1.0)
+    low, high = np.percentile(projected, [BEYOND, 100.0 - BEYOND], axis=0)
+    margin = MARGIN * max(float((high - low).max()), 1e-3)
+    return low - margin, high + margin
+
+
+def fill_points(ax: Axes, points: Array, R: Array, frame: tuple[Array, Array]) -> None:
+    """Draw points (N, 3) as discs that close their gaps, with a bar of their distances."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    low, high = frame
+    px_per_m = PANEL_INCH * DPI / float(high[0] - low[0])
+    width, height = np.rint((high - low) * px_per_m).astype(int).tolist()
+    spacing_m = float(np.sqrt(np.prod(high - low) / max(len(points), 1)))
+    radius_m = min(spacing_m, MOST_RADIUS_PX / px_per_m)
+    distance = -points @ R[2]
+    near, far = np.percentile(distance, [1.0, 99.0]) if len(points) else (0.0, 1.0)
+    colours = LinearSegmentedColormap.from_list('distance', [NEAR_COLOR, FAR_COLOR])
+    scale = ScalarMappable(Normalize(0.0, max(float(far - near), 1e-9), clip=True), colours)
+    normals = np.broadcast_to(R[2], points.shape)
+    discs = DrawnDiscs(points, normals, np.full(len(points), radius_m))
+    camera = Camera(R, 0.5 * (low + high), width, height, px_per_m)
+    image, _ = rendered(camera, discs, as_bytes(scale.to_rgba(distance - near)[:, :3]))
+    ax.imshow(image, extent=(low[0], high[0], low[1], high[1]), interpolation='nearest')
+    bar = ax.figure.colorbar(scale, ax=ax, location='left', shrink=0.5, pad=0.01)
+    bar.set_label('distance beyond the nearest (m)', fontsize='small')
+    bar.ax.tick_params(labelsize='small')
+
+
+def fill_shapes(ax: Axes, panel: ShapesPanel, R: Array) -> None:
+    """Draw triangles, shaded, and outlines from far to near, and the legend."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.patches import Patch
+
+    corners = panel.corners @ R.T
+    normals = face_normals(corners)
+    lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-300)
+    lit = np.abs(normals @ (LIGHT / np.linalg.norm(LIGHT))) / lengths
+    faces = panel.colors * (AMBIENT + (1.0 - AMBIENT) * lit)[:, None]
+    sides, edges = sides_of(panel, R)
+    depth = np.concatenate([corners[:, :, 2].mean(axis=1), sides[:, :, 2].mean(axis=1)])
+    # outlines are on top of their own triangles
+    depth[len(corners) :] += 0.01 * max(float(np.ptp(depth)), 1e-9) if len(depth) else 0.0
+    order = np.argsort(depth, kind='stable')
+    outlines = [*corners[:, :, :2], *sides[:, :, :2]]
+    widths = np.repeat([0.5, 0.9], [len(corners), len(sides)])
+    colors = np.concatenate([faces, edges])
+    ax.add_collection(
+        PolyCollection(
+            [outlines[k] for k in order],
+            facecolors=colors[order],
+            edgecolors=colors[order],
+            linewidths=widths[order],
+            closed=False,
+        )
+    )
+    handles = [
+        Patch(facecolor=face, edgecolor=edge or face, label=text)
+        for text, face, edge in panel.legend
+    ]
+    if handles:
+        below = {'loc': 'upper center', 'bbox_to_anchor': (0.5, 0.0), 'ncols': len(handles)}
+        ax.legend(handles=handles, fontsize='small', frameon=False, **below)
+
+
+def sides_of(panel: ShapesPanel, R: Array) -> tuple[Array, Array]:
+    """Return the sides of all rings, (S, 2, 3) in the axes of the picture, and their colours."""
+    sides = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) @ R.T for ring in panel.rings]
+    counts = [len(ring) for ring in panel.rings]
+    colors = np.repeat(panel.ring_colors, counts, axis=0)
+    return np.concatenate([np.empty((0, 2, 3)), *sides]), colors
+
+
+def draw_scale(ax: Axes, low: Array, high: Array) -> None:
+    """Draw a bar of 1, 2 or 5 times a power of ten metres in the lower left corner."""
+    width, height = high - low
+    power = 10.0 ** np.floor(np.log10(BAR_SHARE * width))
+    length_m = max(step * power for step in (1, 2, 5) if step * power <= BAR_SHARE * width)
+    x, y = low[0] + 0.03 * width, low[1] + 0.04 * height
+    ax.plot([x, x + length_m], [y, y], color='black', linewidth=3.0, solid_capstyle='butt')
+    text = f'{length_m:g} m' if length_m >= 1.0 else f'{100.0 * length_m:g} cm'
+    ax.text(x, y + 0.015 * height, text, fontsize='small')
 
 
 def page_meshes(drawings: Iterable[Drawing]) -> dict[str, Mesh]:
@@ -140,15 +242,6 @@ def joined_mesh(meshes: Sequence[Mesh]) -> Mesh:
         triangles=np.concatenate(moved).astype(np.int32),
         colors=np.concatenate([m.colors for m in meshes]) if has_colors else EMPTY.colors,
     )
-
-
-def depth_colors(depth: Array) -> Array:
-    """Return the colours (N, 3) of points by their distance: near ones are bright."""
-    low, high = np.percentile(depth, [1.0, 99.0]) if len(depth) else (0.0, 1.0)
-    far = np.clip((depth - low) / max(high - low, 1e-9), 0.0, 1.0)[:, None]
-    near_color, far_color = np.array([0.95, 0.75, 0.25]), np.array([0.15, 0.2, 0.45])
-    colors: Array = (1.0 - far) * near_color + far * far_color
-    return colors
 
 
 def view_axes(cloud: Array, viewpoint: Array) -> Array:

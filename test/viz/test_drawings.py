@@ -94,6 +94,55 @@ def test_models_are_a_layer_and_a_section_of_the_report(seen, tmp_path):
     ]
 
 
+def painted(tmp_path, points, model, viewpoint):
+    """Return the pixels (H, W, 3) of the picture of a cloud and its models, 0 to 1."""
+    pyplot = pytest.importorskip('matplotlib.pyplot')
+    path = tmp_path / 'models.png'
+    panels = panels_of(points, model)
+    draw_points(path, PointsPicture(file_name=path.name, panels=panels, viewpoint=viewpoint))
+    return pyplot.imread(path)[:, :, :3]
+
+
+def test_a_plane_fills_its_frame_in_its_shaded_colour(tmp_path):
+    """Facing the viewer, a square of 2 m leaves a margin of 3 % at either side of its frame."""
+    x, y = np.mgrid[-1:1:0.02, -1:1:0.02]
+    points = np.stack([x, y, np.full_like(x, 3.0)], -1).reshape(-1, 3)
+    model = fit(points, ModelsConfig(voxel_size_m=0.05))
+    image = painted(tmp_path, points, model, np.zeros(3))
+    light = viz_drawings.LIGHT / np.linalg.norm(viz_drawings.LIGHT)
+    shade = viz_drawings.AMBIENT + (1.0 - viz_drawings.AMBIENT) * abs(light[2])
+    (color,) = primitive_colors([plane.id for plane in model.planes])
+    is_plane = (np.abs(image - shade * color[:3]) < 0.02).all(axis=2)
+    is_frame = np.abs(image - viz_drawings.GROUND).max(axis=2) < 0.01
+    right = slice(image.shape[1] // 2, None)
+    assert is_plane[:, right].sum() > 0.8 * (is_plane | is_frame)[:, right].sum()
+    assert not is_plane[:, : image.shape[1] // 2].any()
+
+
+def test_pictures_of_rooms_are_mostly_filled(seen, tmp_path):
+    image = painted(tmp_path, room(160, 120)[0], seen[0], VIEW)
+    assert (image.min(axis=2) > 0.98).mean() < 0.2  # paper around the frames
+    empty = np.abs(image - viz_drawings.GROUND).max(axis=2) < 0.01
+    assert empty.mean() < 0.35
+
+
+def test_a_picture_of_nothing_has_two_empty_frames(tmp_path):
+    image = painted(tmp_path, np.empty((0, 3)), fit(np.empty((0, 3))), np.zeros(3))
+    assert (np.abs(image - viz_drawings.GROUND).max(axis=2) < 0.01).mean() > 0.5
+
+
+def test_the_scale_bar_is_a_round_length_below_a_third_of_the_width():
+    from matplotlib.figure import Figure  # seconds to import
+
+    for width, text in ((10.0, '2 m'), (0.5, '10 cm'), (2000.0, '500 m')):
+        ax = Figure().subplots()
+        viz_drawings.draw_scale(ax, np.zeros(2), np.array([width, width]))
+        ends = ax.lines[0].get_xdata()
+        assert ax.texts[0].get_text() == text
+        number, unit = text.split()
+        assert ends[1] - ends[0] == pytest.approx(float(number) * (0.01 if unit == 'cm' else 1.0))
+
+
 def test_texts_of_a_section_are_escaped():
     table = Table(titles=('<b>',), num_texts=1, rows=[['<i>']], colors=np.zeros((1, 3)))
     section = Section(title='<script>', figures={'<a>': '<u>'}, table=table, note='<s>')

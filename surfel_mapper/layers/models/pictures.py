@@ -9,7 +9,7 @@ Every plane and surface has a colour of its own; Gaussians are grey.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -19,22 +19,32 @@ from surfel_mapper.layers.drawings import (
     Drawing,
     EllipsoidsDrawing,
     MeshDrawing,
-    Panel,
+    PointsPanel,
     PointsPicture,
     RingsDrawing,
     Section,
+    ShapesPanel,
     Table,
 )
 from surfel_mapper.messages.model_messages import GREY, primitive_colors
 from surfel_mapper.models.multi_model import Gaussians, MultiModel
-from surfel_mapper.models.shapes import ellipsoid_frames, PatchShape
+from surfel_mapper.models.shapes import (
+    ellipsoid_corners,
+    ellipsoid_frames,
+    FACES,
+    PatchShape,
+    shape_of,
+)
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 
 MOST_POINTS = 120_000
 """Maximum number of points drawn of a cloud; a larger one is subsampled evenly."""
 
-MOST_OF_GAUSSIAN = 50
-"""Points drawn of one Gaussian: a voxel of a map may have thousands."""
+MOST_ELLIPSOIDS = 1_500
+"""Maximum number of Gaussians drawn in a picture, those of most points."""
+
+PLANE_EDGE, SURFACE_EDGE, FACE = (0.1, 0.1, 0.1), (0.05, 0.2, 0.7), (0.75, 0.8, 0.75)
+"""Outlines of planes and of surfaces, and the swatch of both in a legend."""
 
 MOST_ROWS = 25
 """Rows of the table of a report, for the largest planes and surfaces."""
@@ -80,9 +90,11 @@ def patches_mesh(shapes: Sequence[PatchShape]) -> Mesh:
     )
 
 
-def panels_of(points: npt.NDArray[Any], model: MultiModel, title: str = '') -> list[Panel]:
+def panels_of(
+    points: npt.NDArray[Any], model: MultiModel, title: str = ''
+) -> tuple[PointsPanel, ShapesPanel]:
     """
-    Return a cloud, and beside it points on the models that stand for it.
+    Return a cloud, and beside it the models that stand for it.
 
     Parameters
     ----------
@@ -96,19 +108,30 @@ def panels_of(points: npt.NDArray[Any], model: MultiModel, title: str = '') -> l
     """
     cloud = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     cloud = cloud[:: -(-len(cloud) // MOST_POINTS) or 1]
-    samples = [patch.samples(0.5 * model.voxel_size_m) for patch in model.patches]
-    colors = np.concatenate([primitive_colors([p.id for p in model.patches]), [GREY]])
-    few = np.minimum(model.gaussians.num_points, MOST_OF_GAUSSIAN)
-    samples.append(replace(model.gaussians, num_points=few).samples())
-    caption = (
-        f'{len(model.planes)} planes, {len(model.surfaces)} surfaces, '
-        f'{len(model.gaussians)} Gaussians: {model.size_bytes} bytes'
+    shapes = [shape_of(patch) for patch in model.patches]
+    gaussians = model.gaussians
+    largest = np.argsort(-gaussians.num_points, kind='stable')[:MOST_ELLIPSOIDS]
+    drawn = Gaussians(*(getattr(gaussians, f.name)[largest] for f in fields(gaussians)))
+    ellipsoids = ellipsoid_corners(drawn)[:, FACES].reshape(-1, 3, 3)
+    corners = [shape.corners for shape in shapes]
+    colors = [*primitive_colors([patch.id for patch in model.patches]), np.array(GREY[:3])]
+    counts = [*map(len, corners), len(ellipsoids)]
+    edges = [SURFACE_EDGE if shape.is_curved else PLANE_EDGE for shape in shapes]
+    panel = ShapesPanel(
+        title=f'{model.size_bytes:,} bytes',
+        corners=np.concatenate([*corners, ellipsoids]),
+        colors=np.repeat(np.array(colors)[:, :3], counts, axis=0),
+        rings=[ring for shape in shapes for ring in shape.rings],
+        ring_colors=np.array(
+            [edge for shape, edge in zip(shapes, edges, strict=True) for _ in shape.rings]
+        ).reshape(-1, 3),
+        legend=[
+            (f'{len(model.planes)} planes', FACE, PLANE_EDGE),
+            (f'{len(model.surfaces)} surfaces', FACE, SURFACE_EDGE),
+            (f'{len(gaussians)} Gaussians, 2 sigma', GREY, None),
+        ],
     )
-    painted = np.repeat(colors, [len(sample) for sample in samples], axis=0)
-    return [
-        Panel(title=title or f'{len(points)} points', points=cloud),
-        Panel(title=caption, points=np.concatenate(samples), colors=painted),
-    ]
+    return PointsPanel(title=title or f'{len(points):,} points', points=cloud), panel
 
 
 def section_of(
