@@ -369,6 +369,11 @@ class PublishConfig(Stage):
         'Add the covariance of the points to ~/normals and ~/changed, cov_xx to cov_zz, m^2.',
         live=True,
     )
+    adaptive: bool = setting(
+        False,
+        'Publish adaptive surfels on ~/normals, ~/changed, ~/removed and ~/markers: of the '
+        'largest cells, of up to 16 voxels an axis, whose points lie on one plane.',
+    )
     diagnostics_rate_hz: float = setting(
         1.0, 'Rate of /diagnostics, Hz; 0: never.', low=0.0, high=100.0
     )
@@ -376,6 +381,19 @@ class PublishConfig(Stage):
     # No settings: callers of the library may change the fields.
     max_markers: int = 20_000
     """At most this many surfels are drawn in ~/markers."""
+
+    def check(self, stage: str) -> None:
+        """Refuse adaptive surfels with what belongs to single voxels."""
+        if self.adaptive and self.moments:
+            raise ConfigError(
+                f'{stage}.adaptive: the moments are those of voxels, expected {stage}.moments '
+                'false; a client that mirrors the map has mirror.map.adaptive()'
+            )
+        if self.adaptive and self.marker_color == 'age':
+            raise ConfigError(
+                f'{stage}.marker_color: age is known of voxels, expected another colour with '
+                f'{stage}.adaptive'
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -56,6 +56,8 @@ Rows = npt.NDArray[np.int32]
 Keys = tuple[npt.NDArray[Any], npt.NDArray[Any]]
 """Keys of voxels and of cells."""
 
+NO_KEYS: Keys = np.empty(0, np.int64), np.empty(0, np.int64)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CutChange:
@@ -199,12 +201,21 @@ class AdaptiveCut:
         if not 0.0 < as_real('max_thickness_m', max_thickness_m) < math.inf:
             raise ValueError(f'max_thickness_m: {max_thickness_m}, expected positive and finite')
         self._map = surfel_map
-        self._min_points = max(as_whole('min_points', min_points), 1)
+        self.min_points = min_points
         self._levels = levels
         self._bits = layout.BITS + surfel_map.level
         self._thickness = max_thickness_m / surfel_map.voxel_size_m * 2**self._bits
-        self._lost: Keys = np.empty(0, np.int64), np.empty(0, np.int64)
+        self._lost = self._removed = NO_KEYS
         self._reset()
+
+    @property
+    def min_points(self) -> int:
+        """Cells and voxels with fewer points have no surfel; a new number holds after restart."""
+        return self._min_points
+
+    @min_points.setter
+    def min_points(self, value: int) -> None:
+        self._min_points = max(as_whole('min_points', value), 1)
 
     def _reset(self) -> None:
         """Forget the map; ``_lost`` keeps the keys of the surfels that were reported."""
@@ -223,9 +234,14 @@ class AdaptiveCut:
         rows, stamps, channels = self._map.slabs
         return rows, stamps, self._links.array, channels
 
-    def refresh(self) -> CutChange:
+    def refresh(self, *, covariance: bool = False) -> CutChange:
         """
         Follow the map; return the changes of the surfels since the last call.
+
+        Parameters
+        ----------
+        covariance : bool
+            With the covariances of the points.
 
         Raises
         ------
@@ -234,42 +250,53 @@ class AdaptiveCut:
 
         """
         if self._map.cleared_at > self._version:
-            self._lose()
+            self.restart()
         try:
-            change = self._refresh()
+            change = self._refresh(covariance)
         except BaseException:
-            self._lose()
+            self.restart()
             raise
-        self._lost = np.empty(0, np.int64), np.empty(0, np.int64)
+        self._lost = NO_KEYS
         return change
 
-    def _lose(self) -> None:
-        """Start anew, and keep the keys of the surfels that were reported."""
-        shown = self._keys(*self._shown())
-        self._lost = joined(self._lost, shown)
+    def restart(self, *, undo: bool = False) -> None:
+        """
+        Start anew: the next change has all surfels, and those of the former ones to be removed.
+
+        Parameters
+        ----------
+        undo : bool
+            The last change did not arrive: what it removed is removed by the next one, and
+            surfels may be removed that only it had.
+
+        """
+        if undo:
+            self._lost = joined(self._lost, self._removed)
+        self._lost = joined(self._lost, self._keys(*self._shown()))
+        self._removed = NO_KEYS
         self._reset()
 
-    def _refresh(self) -> CutChange:
+    def _refresh(self, covariance: bool) -> CutChange:
         changed = self._map.rows_changed(self._version)
         self._version, self._num_rows = self._map.version, self._map.rows_used
         if len(self._links.array) < self._num_rows:
             self._links.grow(2 * self._num_rows)
         dirty, detached = self._judge(changed)
         voxels, cells, left_voxels, left_cells = self._compare(dirty[-1])
-        surfels = self._surfels(voxels, cells)
+        surfels = self._surfels(voxels, cells, covariance)
         shown = self._keys(voxels, cells)
         for level, dirty_cells in enumerate(dirty, 1):
             self._cells.clean(dirty_cells, level)
         kernels.clean_voxels(changed, self._links.array)
         gone = joined(self._lost, (np.concatenate([detached, left_voxels]), left_cells))
-        removed = (np.setdiff1d(*keys) for keys in zip(gone, shown, strict=True))
-        index, levels = indices(*removed)
+        self._removed = np.setdiff1d(gone[0], shown[0]), np.setdiff1d(gone[1], shown[1])
+        index, levels = indices(*self._removed)
         size = np.asarray(self._map.voxel_size_m * 2.0**levels)
         return CutChange(surfels, index, size)
 
-    def surfels(self) -> Surfels:
+    def surfels(self, *, covariance: bool = False) -> Surfels:
         """
-        Return the surfels.
+        Return the surfels, with the covariances of their points if asked for.
 
         Raises
         ------
@@ -277,7 +304,7 @@ class AdaptiveCut:
             If the map has changed since the last call of ``refresh``.
 
         """
-        return self._surfels(*self._current())
+        return self._surfels(*self._current(), covariance)
 
     def _current(self) -> tuple[Rows, Rows]:
         if self._map.version != self._version:
@@ -360,15 +387,15 @@ class AdaptiveCut:
             tables.append(arrays[1:])
         return [np.concatenate(arrays) for arrays in zip(*tables, strict=True)]
 
-    def _surfels(self, voxels: Rows, cells: Rows) -> Surfels:
+    def _surfels(self, voxels: Rows, cells: Rows, covariance: bool) -> Surfels:
         """Return the surfels of rows of voxels and cells."""
         levels = levels_of(self._cells.nodes[0][cells.astype(np.intp), KEY])
-        tables = [self._surfels_at(0, voxels)]
+        tables = [self._surfels_at(0, voxels, covariance)]
         for level in range(1, self._levels + 1):
-            tables.append(self._surfels_at(level, cells[levels == level]))
+            tables.append(self._surfels_at(level, cells[levels == level], covariance))
         return concatenated([table for table in tables if len(table)] or tables[:1])
 
-    def _surfels_at(self, level: int, chosen: Rows) -> Surfels:
+    def _surfels_at(self, level: int, chosen: Rows, covariance: bool) -> Surfels:
         """Return the surfels of rows of a level."""
         rows, stamps, _, channels = self._cells.nodes if level else self._voxels
         chosen = chosen.astype(np.intp)
@@ -376,7 +403,8 @@ class AdaptiveCut:
         kernels.copy_rows(rows, chosen, level, slab)
         numbers = np.arange(len(chosen), dtype=np.int32)
         size_m = self._map.voxel_size_m * 2.0**level
-        surfels = derive((slab, stamps[chosen]), numbers, size_m, self._bits + level)
+        slabs, bits = (slab, stamps[chosen]), self._bits + level
+        surfels = derive(slabs, numbers, size_m, bits, covariance)
         names = channel_names(self._map.columns)
         return replace(surfels, channels=means(channels[chosen], surfels.num_points, names))
 

@@ -286,7 +286,9 @@ class SurfelMap(MomentMap):
             changed = self._table.changed_after(since, least)
         return self._derive(changed, covariance)
 
-    def adaptive(self, min_points: int = 1, **settings: Any) -> Surfels:
+    def adaptive(
+        self, min_points: int = 1, *, covariance: bool = False, **settings: Any
+    ) -> Surfels:
         """
         Return surfels of the size that fits: of the largest cell whose points lie on one plane.
 
@@ -297,11 +299,14 @@ class SurfelMap(MomentMap):
         ----------
         min_points : int
             Cells and voxels with fewer points are skipped.
+        covariance : bool
+            With the covariances of the points.
         **settings
             Those of ``adaptive_cut``.
 
         """
-        return self.adaptive_cut(min_points, **settings).refresh().surfels
+        cut = self.adaptive_cut(min_points, **settings)
+        return cut.refresh(covariance=covariance).surfels
 
     def adaptive_cut(
         self,

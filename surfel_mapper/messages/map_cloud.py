@@ -52,11 +52,22 @@ FIELDS = ('x', 'y', 'z', *NORMAL, 'curvature', 'planarity', 'num_points')
 Columns = dict[str, npt.NDArray[Any]]
 
 
-def voxel_columns(voxel_index: npt.NDArray[np.int32], voxel_size_m: float) -> Columns:
-    """Return the columns of ~/removed: the centres of voxels as x y z, and their indices."""
-    centers = ((voxel_index + 0.5) * voxel_size_m).astype(np.float32)
-    index = np.asarray(voxel_index, np.int32)
-    return dict(zip((*'xyz', *VOXEL), (*centers.T, *index.T), strict=True))
+def voxel_columns(voxel_index: npt.NDArray[np.int32], size_m: npt.ArrayLike) -> Columns:
+    """Return the columns of ~/removed: centres of voxels or cells, indices and sizes, m."""
+    size = np.broadcast_to(np.asarray(size_m, np.float64), len(voxel_index))
+    centers = ((voxel_index + 0.5) * size[:, None]).astype(np.float32)
+    columns = dict(zip('xyz', centers.T, strict=True))
+    return {**columns, **index_columns(voxel_index), 'size': size.astype(np.float32)}
+
+
+def index_columns(voxel_index: npt.NDArray[Any]) -> Columns:
+    """Return the columns of voxel indices (K, 3)."""
+    return dict(zip(VOXEL, np.asarray(voxel_index, np.int32).T, strict=True))
+
+
+def adaptive_cloud(surfels: Surfels) -> CloudBytes:
+    """Return the cloud of adaptive surfels, with their indices floor(point / size)."""
+    return from_columns({**surfel_columns(surfels), **index_columns(surfels.voxel_index)})
 
 
 def moment_cloud(

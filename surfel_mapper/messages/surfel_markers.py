@@ -85,7 +85,7 @@ def surfel_markers(
     surfels : Surfels
         Surfels without a normal are left out.
     voxel_size_m : float
-        Bounds the radius of a disc at half the diagonal of a voxel's face.
+        Twice the length of the normals.
     colors : (K, 4) float32
         Red, green, blue and opacity of each surfel in [0, 1]; see shades and normal_colors.
     stamp_ns, frame_id : int, str
@@ -102,7 +102,7 @@ def surfel_markers(
     drawn = (surfels.position, surfels.normal)
     discs = np.empty((len(rows) * 3 * (SEGMENTS - 2), 3))
     disc_colors = np.empty((len(discs), 4), np.float32)
-    radius = disc_radius(surfels.eigenvalues[rows], voxel_size_m)
+    radius = disc_radius(surfels.eigenvalues[rows], surfels.size[rows])
     draw_discs(drawn, rows, radius, colors[rows], CIRCLE, discs, disc_colors)
     lines = np.empty((2 * len(rows), 3))
     draw_normals(drawn, rows, 0.5 * voxel_size_m, lines)
@@ -133,16 +133,18 @@ def surfel_markers(
 
 
 def disc_radius(
-    eigenvalues: npt.NDArray[np.float64], voxel_size_m: float
+    eigenvalues: npt.NDArray[np.float64], size_m: npt.ArrayLike
 ) -> npt.NDArray[np.float64]:
     """
     Return the radius of the disc that stands for each surfel, (K,) m.
+
+    It is at most half the diagonal of a face of the voxel, of edge size_m.
 
     The variance along the side of a square patch is side^2 / 12; half of the side, so that the
     discs of a plane touch, is sqrt(3 e2) for the larger variance in the patch.
     """
     radius: npt.NDArray[np.float64] = np.sqrt(3.0 * np.maximum(eigenvalues[:, 2], 0.0))
-    return np.minimum(radius, math.sqrt(0.5) * voxel_size_m, out=radius)
+    return np.minimum(radius, math.sqrt(0.5) * np.asarray(size_m), out=radius)
 
 
 def shades(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:

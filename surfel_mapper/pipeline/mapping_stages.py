@@ -45,6 +45,8 @@ def compile_deriving(config: Config) -> None:
     surfel_map = compile_adding(config)
     surfel_map.surfels_changed(since=0)
     surfel_map.surfels()
+    if config.publish.adaptive:
+        surfel_map.adaptive()
     if config.publish.levels:
         surfel_map.coarsen(1).surfels()
 

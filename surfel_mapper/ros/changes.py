@@ -40,12 +40,16 @@ class MapChange:
     surfels : Surfels
         The surfels of changed voxels that have enough points.
     removed : (E, 3) int32
-        Indices of voxels that had enough points and no longer do.
+        Indices of voxels that had enough points and no longer do; of adaptive surfels those of
+        cells, too.
+    removed_size_m : float or (E,) float64
+        Their edges, m.
 
     """
 
     surfels: Surfels
     removed: npt.NDArray[np.int32]
+    removed_size_m: npt.ArrayLike
 
 
 class ChangeTracker:
@@ -112,10 +116,10 @@ class ChangeTracker:
         if self._published is None:
             self._published = PublishedKeys(self._keys())
         if not self._mapper.config.publish.moments:
-            change = MapChange(update.changed, update.removed_voxel_index)
+            change = self._change(update.changed, update.removed_voxel_index)
         else:
             surfels = self._mapper.map.surfels_changed(self._version, 1)
-            change = MapChange(surfels, self._emptied(update))
+            change = self._change(surfels, self._emptied(update))
         self._version = self._mapper.map.version
         self._published.append(change)
         if len(self._published) >= LIST_EVERY:
@@ -135,7 +139,12 @@ class ChangeTracker:
         self._published = PublishedKeys(keys)
         self._version = surfel_map.version
         self._num_mapped = self._mapper.counters.mapped
-        return MapChange(surfels, unpack_keys(np.setdiff1d(published, keys, assume_unique=True)))
+        return self._change(
+            surfels, unpack_keys(np.setdiff1d(published, keys, assume_unique=True))
+        )
+
+    def _change(self, surfels: Surfels, removed: npt.NDArray[np.int32]) -> MapChange:
+        return MapChange(surfels, removed, self._mapper.map.voxel_size_m)
 
     def _keys(self) -> Keys:
         """Return the keys of all voxels to be published."""
@@ -148,6 +157,61 @@ class ChangeTracker:
             return np.empty((0, 3), np.int32)
         evicted = np.unique(np.concatenate(keys))
         return unpack_keys(evicted[self._mapper.map.find(evicted) < 0])
+
+
+class AdaptiveTracker:
+    """
+    Collects the changes of the adaptive surfels (``publish.adaptive``), as ChangeTracker does.
+
+    Parameters
+    ----------
+    mapper : Mapper
+        The mapper whose map is published.
+
+    """
+
+    def __init__(self, mapper: Mapper) -> None:
+        self._mapper = mapper
+        self._cut = mapper.map.adaptive_cut(self.min_points)
+
+    @property
+    def min_points(self) -> int:
+        """Points that a surfel needs to be published."""
+        return self._mapper.config.map.min_points
+
+    def reset(self) -> None:
+        """Start from the present map, as the next full map does."""
+
+    @contextmanager
+    def undone_on_error(self) -> Iterator[None]:
+        """In a with-block, take a change back that cannot be published; it comes with the next."""
+        try:
+            yield
+        except Exception:  # MemoryError too
+            self._cut.restart(undo=True)
+            raise
+
+    def after_scan(self, _: Update) -> MapChange:
+        """Return the changes of a scan, and all others since the last call."""
+        return self.changes()
+
+    def collect(self) -> MapChange:
+        """Return all surfels, as the map or its settings have changed otherwise than by a scan."""
+        self._cut.min_points = self.min_points
+        self._cut.restart()
+        return self.changes()
+
+    def surfels(self, at_most: int | None = None) -> Surfels:
+        """Return the surfels of the last change, the largest ones if there are too many."""
+        surfels = self._cut.surfels(covariance=self._mapper.config.publish.covariance)
+        if at_most is None or len(surfels) <= at_most:
+            return surfels
+        return surfels.select(np.argsort(-surfels.size, kind='stable')[:at_most])
+
+    def changes(self) -> MapChange:
+        """Return all changes since the last call."""
+        change = self._cut.refresh(covariance=self._mapper.config.publish.covariance)
+        return MapChange(change.surfels, change.removed_index, change.removed_size)
 
 
 class PublishedKeys:

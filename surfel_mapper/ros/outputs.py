@@ -30,14 +30,14 @@ from surfel_mapper.filters.columns import as_fields
 from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import surfel_columns, Surfels
-from surfel_mapper.messages.map_cloud import moment_cloud, voxel_columns
+from surfel_mapper.messages.map_cloud import adaptive_cloud, moment_cloud, voxel_columns
 from surfel_mapper.messages.markers import marker_array
 from surfel_mapper.messages.pointcloud2 import from_columns
 from surfel_mapper.messages.scan_normals import scan_with_normals
 from surfel_mapper.messages.surfel_markers import disc_colors, surfel_markers
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.ros.base_node import LATCHED, result_of, steady_timer
-from surfel_mapper.ros.changes import ChangeTracker, MapChange
+from surfel_mapper.ros.changes import AdaptiveTracker, ChangeTracker, MapChange
 from surfel_mapper.ros.layer_outputs import LayerOutputs
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import cloud_message
@@ -73,8 +73,10 @@ class Outputs:
         self._node = node
         self._mapper = mapper
         self._thread = thread
-        self._changes = ChangeTracker(mapper)
-        self._removals = ChangeTracker(mapper)  # of ~/removed while publish.changed is false
+        self._adaptive = AdaptiveTracker(mapper) if mapper.config.publish.adaptive else None
+        self._changes = self._adaptive or ChangeTracker(mapper)
+        # of ~/removed while publish.changed is false
+        self._removals = self._adaptive or ChangeTracker(mapper)
         self._ages = Ages()
         self._origin = OriginOutput(node, mapper)
         self._alignment = AlignmentOutputs(node, mapper)
@@ -130,7 +132,7 @@ class Outputs:
             self._origin.publish(self._stamp_ns)
         self._layers.expire()
         if self._mapper.derives:
-            self._publish_changes(ChangeTracker.collect)
+            self._publish_changes(lambda tracker: tracker.collect())
         if not self._timers:
             self.publish_latest()
 
@@ -214,7 +216,9 @@ class Outputs:
         if self._scan_normals.get_subscription_count():
             self._publish_scan_normals(update)
 
-    def _publish_changes(self, find: Callable[[ChangeTracker], MapChange]) -> None:
+    def _publish_changes(
+        self, find: Callable[[ChangeTracker | AdaptiveTracker], MapChange]
+    ) -> None:
         """
         Publish the changes that ``find`` returns of a tracker, if they are subscribed to.
 
@@ -237,7 +241,7 @@ class Outputs:
         mapper = self._mapper
         if mapper.config.publish.changed:
             self._changed.publish(self._surfel_cloud(change.surfels, change.removed))
-        columns = voxel_columns(change.removed, mapper.map.voxel_size_m)
+        columns = voxel_columns(change.removed, change.removed_size_m)
         content = from_columns(columns)
         self._removed.publish(cloud_message(content, self._stamp_ns, mapper.map_frame))
 
@@ -245,6 +249,9 @@ class Outputs:
         self, surfels: Surfels, removed: npt.NDArray[np.int32] = NO_VOXELS
     ) -> PointCloud2:
         """Return surfels as a cloud; with ``publish.moments`` also moments and removed voxels."""
+        if self._adaptive:
+            content = adaptive_cloud(surfels)
+            return cloud_message(content, self._stamp_ns, self._mapper.map_frame)
         if self._mapper.config.publish.covariance:
             rows = self._mapper.map.find(pack_keys(surfels.voxel_index))
             surfels = self._mapper.map.surfels_of(rows, covariance=True)
@@ -265,8 +272,19 @@ class Outputs:
         content = from_columns(as_fields(scan))
         self._filtered.publish(cloud_message(content, scan.stamp_ns, scan.frame_id))
 
+    def _followed(self, tracker: AdaptiveTracker, at_most: int | None = None) -> Surfels:
+        """Return the adaptive surfels; changes that they have are published first."""
+        with tracker.undone_on_error():
+            change = tracker.changes()
+            if len(change.surfels) or len(change.removed):
+                self._publish_change(change)
+        return tracker.surfels(at_most)
+
     def _publish_normals(self) -> int:
-        surfels = self._mapper.map.surfels(self._changes.min_points)
+        if self._adaptive:
+            surfels = self._followed(self._adaptive)
+        else:
+            surfels = self._mapper.map.surfels(self._changes.min_points)
         self._normals.publish(self._surfel_cloud(surfels))
         self._published[self._normals] = self._mapper.map.version
         return len(surfels)
@@ -278,7 +296,11 @@ class Outputs:
 
     def _publish_markers(self) -> None:
         config, surfel_map = self._mapper.config, self._mapper.map
-        surfels = surfel_map.surfels(config.map.min_points, config.publish.max_markers)
+        at_most = config.publish.max_markers
+        if self._adaptive:
+            surfels = self._followed(self._adaptive, at_most)
+        else:
+            surfels = surfel_map.surfels(config.map.min_points, at_most)
         markers = surfel_markers(
             surfels,
             surfel_map.voxel_size_m,

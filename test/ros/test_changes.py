@@ -27,7 +27,7 @@ from surfel_mapper.messages.map_cloud import (
 )
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.pipeline.regions import Ball
-from surfel_mapper.ros.changes import ChangeTracker
+from surfel_mapper.ros.changes import AdaptiveTracker, ChangeTracker
 
 SECOND = 10**9
 NO_VOXELS = np.empty((0, 3), np.int32)
@@ -245,7 +245,57 @@ def test_removed_voxels_have_position_and_index():
         'voxel_x': [0],
         'voxel_y': [-1],
         'voxel_z': [3],
+        'size': [0.5],
     }
+
+
+def test_mirror_derives_the_adaptive_surfels_of_the_node():
+    node, mirror = Node(**{'window.max_scans': 3}), MapMirror(0.5)
+    for number in range(6):
+        mirror.change(node.map_scan(number * SECOND)[1])
+    cuts = [m.adaptive_cut(max_thickness_m=0.3) for m in (node.mapper.map, mirror.map)]
+    surfels = [cut.refresh().surfels for cut in cuts]
+    assert cuts[0].digest() == cuts[1].digest()
+    assert len(np.unique(surfels[0].size)) > 1
+
+
+def test_adaptive_changes_add_up_to_the_adaptive_surfels():
+    settings = {'publish.moments': False, 'publish.adaptive': True, 'window.max_scans': 2}
+    node = Node(**settings)
+    tracker, shown = AdaptiveTracker(node.mapper), {}
+
+    def follow(change):
+        sizes = np.broadcast_to(change.removed_size_m, len(change.removed)).tolist()
+        for key in zip(sizes, map(tuple, change.removed.tolist()), strict=True):
+            shown.pop(key, None)  # of a lost change it may not know some
+        index = map(tuple, change.surfels.voxel_index.tolist())
+        keys = zip(change.surfels.size.tolist(), index, strict=True)
+        shown.update(zip(keys, change.surfels.num_points.tolist(), strict=True))
+
+    for number in range(8):
+        node.map_scan(number * SECOND)
+        if number == 4:  # cannot be published: comes with the next
+            with pytest.raises(MemoryError):
+                lose_change(tracker)
+            continue
+        follow(tracker.after_scan(None))
+        check_shown(node, shown)
+    node.mapper.clear()
+    follow(tracker.collect())
+    assert not shown
+
+
+def lose_change(tracker):
+    with tracker.undone_on_error():
+        tracker.after_scan(None)
+        raise MemoryError
+
+
+def check_shown(node, shown):
+    surfels = node.mapper.map.adaptive(node.mapper.config.map.min_points)
+    index = map(tuple, surfels.voxel_index.tolist())
+    keys = zip(surfels.size.tolist(), index, strict=True)
+    assert shown == dict(zip(keys, surfels.num_points.tolist(), strict=True))
 
 
 def test_clouds_without_moments_are_refused_and_change_nothing():

@@ -121,6 +121,39 @@ def test_changed_minus_removed_equals_the_map(start, peer):
     assert voxels(removed[-1]) == expected
 
 
+def test_adaptive_surfels_are_published_with_their_changes(start, peer):
+    node = start_node(start, peer, **{'publish.adaptive': 'true', 'publish.covariance': 'true'})
+    changed = peer.collect(PointCloud2, f'{BASE}/changed', MANY)
+    removed = peer.collect(PointCloud2, f'{BASE}/removed', MANY)
+    normals = peer.collect(PointCloud2, f'{BASE}/normals', LATCHED)
+    markers = peer.collect(MarkerArray, f'{BASE}/markers', LATCHED)
+    messages = drive(8)
+    send(peer, messages)
+    expected = mapped(messages)[1].map.adaptive(5)
+    assert len(np.unique(expected.size)) > 2
+    peer.spin_until(
+        lambda: normals and normals[-1].width == len(expected), what=lambda: node.output
+    )
+    peer.spin_until(lambda: markers and len(changed) == len(removed) >= len(messages))
+
+    def cells(message):
+        columns = to_scan(message).columns
+        if not columns:
+            return set()
+        rows = [columns[name] for name in ('size', 'voxel_x', 'voxel_y', 'voxel_z')]
+        return set(zip(*(row.tolist() for row in rows), strict=True))
+
+    known = set()
+    for now, gone in zip(changed, removed, strict=True):
+        assert cells(gone) <= known
+        known = (known - cells(gone)) | cells(now)
+    assert known == cells(normals[-1])
+    index = expected.voxel_index.tolist()
+    assert known == {(s, *i) for s, i in zip(expected.size.tolist(), index, strict=True)}
+    assert 'cov_xx' in to_scan(normals[-1]).columns
+    assert Surfels.from_message(normals[-1]).num_points.sum() == expected.num_points.sum()
+
+
 def test_the_full_map_is_published_on_request(start, peer):
     start_node(start, peer, **{'publish.normals_rate_hz': 0.0})
     late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
