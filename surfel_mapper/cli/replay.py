@@ -172,6 +172,14 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     add_overwrite(group)
     names = (*MAP_FORMATS, *layer_formats())
     add_formats(group, names, ReplayOptions().formats, known_formats)
+    add(
+        '--adaptive',
+        dest='settings',
+        action='append_const',
+        const=('publish.adaptive', True),
+        help='write adaptive surfels to map.ply, map.pcd and the bag of normals: of the largest '
+        'cells whose points lie on one plane',
+    )
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
     add(
         '--truth',

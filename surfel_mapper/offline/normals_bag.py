@@ -44,6 +44,9 @@ class NormalsBag:
     def __init__(self, bag: BagWriter, mapper: Mapper) -> None:
         self._bag = bag
         self._mapper = mapper
+        self._min_points = mapper.config.map.min_points
+        is_adaptive = mapper.config.publish.adaptive
+        self._cut = mapper.map.adaptive_cut(self._min_points) if is_adaptive else None
         self._newest: Update | None = None
         self._written_ns: int | None = None
         self._changed = 0
@@ -51,10 +54,11 @@ class NormalsBag:
     def add(self, update: Update) -> None:
         """Write the surfels that a scan changed, and the whole map when it is due."""
         self._newest = update
-        if len(update.changed):
-            self._write(CHANGED, update, update.changed)
-        self._changed += len(update.changed)
-        num_surfels = self._mapper.map.num_surfels(self._mapper.config.map.min_points)
+        changed = self._cut.refresh().surfels if self._cut else update.changed
+        if len(changed):
+            self._write(CHANGED, update, changed)
+        self._changed += len(changed)
+        num_surfels = self._mapper.map.num_surfels(self._min_points)
         last_ns = self._written_ns
         is_due = last_ns is None or abs(update.stamp_ns - last_ns) >= EVERY_NS
         if is_due and self._changed >= num_surfels:
@@ -66,7 +70,7 @@ class NormalsBag:
             self._write_map(self._newest)
 
     def _write_map(self, update: Update) -> None:
-        surfels = self._mapper.map.surfels(self._mapper.config.map.min_points)
+        surfels = self._cut.surfels() if self._cut else self._mapper.map.surfels(self._min_points)
         if len(surfels):
             self._write(NORMALS, update, surfels)
         self._written_ns, self._changed = update.stamp_ns, 0

@@ -366,11 +366,11 @@ def write_files(
         drawings += layer.drawings()
         section = layer.section()
         if section is not None:
-            drawn = None
+            picture_path = None
             if section.picture is not None:
-                drawn = output / section.picture.file_name
-                draw_points(drawn, section.picture)
-            sections.append(section_html(section, drawn))
+                picture_path = output / section.picture.file_name
+                draw_points(picture_path, section.picture)
+            sections.append(section_html(section, picture_path))
     meshes = page_meshes(drawings)
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     surfels = mapper.map.surfels(mapper.config.map.min_points)
@@ -379,8 +379,8 @@ def write_files(
         f'{rounded(summary["points"])} points, '
         f'{len(surfels):,} surfels in voxels of {mapper.map.voxel_size_m:g} m'
     )
-    origin_m = mapper.map.origin_m
-    draw_map(surfels, picture, title, trajectory=trajectory.positions, origin_m=origin_m)
+    origin_m, drawn = mapper.map.origin_m, mapper.map.adaptive(mapper.config.map.min_points)
+    draw_map(drawn, picture, title, trajectory=trajectory.positions, origin_m=origin_m)
     target = trajectory.positions[-1] if trajectory.stamps_ns else (0.0, 0.0, 0.0)
     in_view = drawn_surfels(mapper.map, mapper.config.map.min_points, target, most_shown(meshes))
     write_report(page, title, summary, surfels, history, picture, meshes, sections, in_view)
@@ -424,11 +424,12 @@ def write_map(path: Path, name: str, mapper: Mapper, *, window: bool = False) ->
     from surfel_mapper.files import parquet, pcd, ply
     from surfel_mapper.pipeline.saved_state import save_mapper
 
-    surfels = mapper.map.surfels(mapper.config.map.min_points, covariance=True)
+    derive = mapper.map.adaptive if mapper.config.publish.adaptive else mapper.map.surfels
+    min_points, origin_m = mapper.config.map.min_points, mapper.map.origin_m
     if name == 'ply':
-        ply.write_surfels(path, surfels, mapper.map.origin_m)
+        ply.write_surfels(path, derive(min_points, covariance=True), origin_m)
     elif name == 'pcd':
-        pcd.write_surfels(path, surfels, mapper.map.origin_m)
+        pcd.write_surfels(path, derive(min_points, covariance=True), origin_m)
     elif name == 'parquet':
         parquet.write_map(path, mapper.map)
     elif name == TILES:

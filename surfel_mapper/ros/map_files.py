@@ -109,13 +109,14 @@ def copied_map(mapper: Mapper) -> Callable[[], str]:
         if not is_inside(directory, file):
             raise ConfigError(f'{file}: a link that leads out of output.directory, {directory}')
     copied = CopiedMapper(state, mapper)
-    min_points = mapper.config.map.min_points
+    min_points, is_adaptive = mapper.config.map.min_points, mapper.config.publish.adaptive
     scans = f'{len(mapper.window)} scans ({mapper.counters.received} received)'
     layers = ''.join(f', {file.name}' for file in beside)
 
     def write() -> str:
-        surfels = copied.map().surfels(min_points)
-        write_surfels(path, surfels, copied.map().origin_m)
+        surfel_map = copied.map()
+        surfels = (surfel_map.adaptive if is_adaptive else surfel_map.surfels)(min_points)
+        write_surfels(path, surfels, surfel_map.origin_m)
         digest = copied.write()
         return f'{path} and .npz{layers}: {len(surfels)} surfels of {scans}, digest {digest}'
 

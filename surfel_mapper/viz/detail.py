@@ -163,7 +163,7 @@ def drawn_surfels(
     surfel_map: SurfelMap, min_points: int, target: npt.ArrayLike, at_most: int
 ) -> Surfels:
     """
-    Return the surfels of a map by which it is drawn, of several levels if there are many.
+    Return the surfels of a map by which it is drawn: adaptive ones, of parts if there are many.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def drawn_surfels(
         Limit of their number.
 
     """
-    surfels = surfel_map.surfels(min_points)
+    surfels = surfel_map.adaptive(min_points)
     if len(surfels) <= at_most:
         return surfels
     detailed = DetailedMap(surfel_map.moments(), min_points)

@@ -73,8 +73,8 @@ def turning_view(
         note += f' {len(shown):,} of {summary["surfels"]:,} surfels are shown.'
     elif len(surfels) < summary['surfels']:
         note += (
-            f' The {summary["surfels"]:,} surfels are shown by {len(shown):,}: parts of the map, '
-            'first those far from the end of the trajectory, by larger voxels of the same points.'
+            f' The {summary["surfels"]:,} surfels are shown by {len(shown):,} of larger cells of '
+            'the same points: planes, and of a large map parts far from the end of the trajectory.'
         )
     choice = labelled('show', 'shown', ('surfels', *layers)) if layers else ''
     for name, mesh in layers.items():

@@ -106,6 +106,7 @@ class Viewer:
         self._last: Update | None = None
         self._is_placed = False
         self._ages = Ages()
+        self._cut = mapper.map.adaptive_cut(mapper.config.map.min_points)
         if scene is None:
             scene = Scene.to_window()
         self._scene = scene if isinstance(scene, Scene) else Scene.to_file(scene)
@@ -150,7 +151,7 @@ class Viewer:
         surfels, drawings = None, []
         if whole or change > NEW * num_voxels:
             self._shown_voxels, self._removed = num_voxels, 0
-            surfels = self._discs(mapper.map.surfels(mapper.config.map.min_points))
+            surfels = self._discs(self._surfels())
             drawings = [drawn for layer in mapper.layers.values() for drawn in layer.drawings()]
         window = np.array([scan.T_map_sensor[:3, 3] for scan in mapper.window])
         return Snapshot(
@@ -201,6 +202,13 @@ class Viewer:
             turns = quaternions(drawing.R_map_axes)
             sizes = drawing.half_sizes_m
             self._scene.ellipsoids(name, drawing.centers, sizes, turns, drawing.color)
+
+    def _surfels(self) -> Surfels:
+        """Return the adaptive surfels; those of voxels if ages are shown, which voxels have."""
+        if self._colouring == 'age':
+            return self._mapper.map.surfels(self._mapper.config.map.min_points)
+        self._cut.refresh()
+        return self._cut.surfels()
 
     def _discs(self, surfels: Surfels) -> DrawnDiscs:
         """Return surfels as discs; with their ages if these are shown."""

@@ -13,6 +13,7 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.parquet import read_map
 from surfel_mapper.files.trajectory import read_trajectory
+from surfel_mapper.mapping.surfels import Surfels
 from test import extras
 from test.bags.recorded import (
     cut,
@@ -80,6 +81,23 @@ def test_ply_pcd_and_bag_hold_the_same_surfels_to_their_own_readers(output):
         np.testing.assert_array_equal(cloud[f'normal_{axis}'], vertices[f'n{axis}'])
         np.testing.assert_array_equal(rows[f'normal_{axis}'], vertices[f'n{axis}'])
     np.testing.assert_array_equal(cloud['num_points'], vertices['num_points'])
+
+
+def test_adaptive_surfels_are_in_files_and_bag(bag, tmp_path):
+    output, formats = tmp_path / 'map', ['--formats', 'ply,npz,bag']
+    assert main(['replay', str(bag), '--adaptive', *formats, '--output', str(output)]) == 0
+    surfel_map = load_map(output / 'map.npz')[0]
+    expected = surfel_map.adaptive(5)
+    assert len(expected) < surfel_map.num_surfels(5)
+    with AnyReader([output / 'normals']) as reader:
+        (connection,) = (c for c in reader.connections if c.topic == '/surfel_mapper/normals')
+        *_, (_, _, raw) = reader.messages([connection])
+        last = Surfels.from_message(reader.deserialize(raw, connection.msgtype))
+    plyfile = pytest.importorskip('plyfile')
+    vertices = plyfile.PlyData.read(output / 'map.ply')['vertex']
+    for surfels in (last.num_points, vertices['num_points']):
+        np.testing.assert_array_equal(np.sort(surfels), np.sort(expected.num_points))
+    np.testing.assert_array_equal(np.sort(vertices['size']), np.sort(expected.size))
 
 
 def test_the_bag_plays_in_step_with_the_input(output):
