@@ -3,19 +3,17 @@
 """
 Poses from messages: odometry, stamped poses and transforms.
 
-``poses_in`` reads message objects of rclpy or rosbags by the names of their attributes.
-``raw_poses`` reads the same from serialised bytes, which node and replay use: only the part up to
-the pose is parsed, in 20 us, where rclpy takes 0.3 ms to build an odometry message with its two
-covariances, at 100 Hz more than mapping takes.
+``raw_poses`` reads serialised bytes. Only the part up to the pose is parsed, in 20 us. rclpy takes
+0.3 ms to build an odometry message with its two covariances, at 100 Hz more than mapping takes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import lru_cache
 import logging
 import struct
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from surfel_mapper.errors import PoseError
 from surfel_mapper.messages.cdr import frame_name, MessageReader, read_header, stamp_ns
@@ -38,49 +36,10 @@ class StampedPose(NamedTuple):
     q_xyzw: Iterable[float]
 
 
-def poses_in(kind: str, msg: Any, base: str) -> Iterator[StampedPose]:
-    """
-    Yield the poses in a message.
-
-    Parameters
-    ----------
-    kind : str
-        odometry (nav_msgs/Odometry), pose (geometry_msgs/PoseStamped, with covariance or not) or
-        tf (tf2_msgs/TFMessage).
-    msg : message
-        From rclpy or rosbags.
-    base : str
-        Child frame of a stamped pose, and of odometry that states none.
-
-    """
-    if kind == TF:
-        for stamped in msg.transforms:
-            transform = stamped.transform
-            child = stamped.child_frame_id
-            yield stamped_pose(stamped.header, child, transform.translation, transform.rotation)
-    elif kind == ODOMETRY:
-        pose = msg.pose.pose
-        child = msg.child_frame_id or base
-        yield stamped_pose(msg.header, child, pose.position, pose.orientation)
-    else:
-        yield stamped_pose(msg.header, base, msg.pose.position, msg.pose.orientation)
-
-
 @lru_cache(maxsize=MAX_WARNED)
 def warn_of_child(topic: str, base: str) -> None:
     """Warn once of odometry that does not state the frame of its pose."""
     _log.warning('%s: child_frame_id is empty, its poses are taken for those of %s', topic, base)
-
-
-def stamped_pose(header: Any, child: str, position: Any, orientation: Any) -> StampedPose:
-    """Return a pose from the parts of a message."""
-    return StampedPose(
-        parent=frame_name(header.frame_id),
-        child=frame_name(child),
-        stamp_ns=stamp_ns(header),
-        xyz=(position.x, position.y, position.z),
-        q_xyzw=(orientation.x, orientation.y, orientation.z, orientation.w),
-    )
 
 
 SMALLEST_TRANSFORM_BYTES = 72
@@ -96,7 +55,8 @@ def raw_poses(
     Parameters
     ----------
     kind, base : str
-        As ``poses_in`` takes them.
+        odometry (nav_msgs/Odometry), pose (geometry_msgs/PoseStamped, with covariance or not) or
+        tf (tf2_msgs/TFMessage), and the child frame of poses that state none.
     raw : bytes or memoryview
         The message: CDR in either byte order, or as ROS 1 writes it.
     topic : str

@@ -30,7 +30,6 @@ from surfel_mapper.config import Config
 from surfel_mapper.evaluation.trajectory_errors import absolute_errors, drift, relative_errors
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import Scan
@@ -40,6 +39,7 @@ from test.bench.peers import ODOMETRY_PEERS
 from test.bench.peers.run import environment, PeerError, run_odometry
 from test.bench.report import Row
 from test.bench.street import Street
+from test.messages.pose_messages import poses_in
 
 STREET_SCANS = 200
 """100 m of the street."""

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 import pytest
 
 from surfel_mapper.errors import PoseError
-from surfel_mapper.messages.poses import poses_in, raw_poses, StampedPose, warn_of_child
+from surfel_mapper.messages.poses import raw_poses, StampedPose, warn_of_child
 from test.bags.recorded import Entries, ODOMETRY, ROS1, ROS2
+from test.messages.pose_messages import poses_in
 
 STAMP_NS = 1_700_000_000_123_456_789
 XYZ = (1.5, -2.25, 0.125)

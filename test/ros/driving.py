@@ -6,8 +6,8 @@ from __future__ import annotations
 
 from surfel_mapper.config import Config
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.pipeline import Mapper
+from test.messages.pose_messages import poses_in
 from test.ros.live import cloud, odometry, room, START_NS
 
 PERIOD_NS = 100_000_000

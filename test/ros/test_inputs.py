@@ -25,11 +25,11 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.messages.images import CameraImage, depth_scan
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.ros.context import FASTDDS_VARIABLES
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.sensors.depth import PinholeCamera
 from surfel_mapper.simulation import Lidar, Simulation, World
+from test.messages.pose_messages import poses_in
 from test.ros.live import cloud, odometry, room, stamp, START_NS, TIMEOUT_S
 
 PERIOD_NS = 100_000_000

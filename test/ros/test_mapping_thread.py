@@ -13,9 +13,10 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from surfel_mapper.compilation import PROGRESS
 from surfel_mapper.config import Config
-from surfel_mapper.messages.poses import poses_in, StampedPose
+from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.mapping_thread import MappingThread, MAX_POSES
+from test.messages.pose_messages import poses_in
 from test.ros.live import cloud, odometry, room, START_NS
 
 PERIOD_NS = 100_000_000

@@ -24,8 +24,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 from surfel_mapper import Mapper, ModelsMirror
 from surfel_mapper.config import Config
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.models.multi_model import MultiModel, Surface
+from test.messages.pose_messages import poses_in
 from test.ros.live import cloud, LATCHED, NODE, odometry, RVIZ, START_NS
 
 ALL_OUTLINES = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)

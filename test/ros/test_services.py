@@ -18,6 +18,7 @@ from surfel_mapper.errors import CloudFormatError, PoseError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball, Box, Prism
 from surfel_mapper.ros.services import prism
+from test.messages.pose_messages import poses_in
 from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
 from test.ros.live import NODE, stamp, START_NS
 
@@ -45,7 +46,6 @@ def feed(peer, num_scans):
 def send_more(peer, twin, first, num_scans):
     """Send further scans to the node and to the twin."""
     from surfel_mapper.messages.pointcloud2 import to_scan
-    from surfel_mapper.messages.poses import poses_in
 
     for points, pose in drive(first + num_scans)[first:]:
         send(peer, [(points, pose)])
