@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-import ctypes
 import gc
 import os
 from pathlib import Path
@@ -45,24 +44,6 @@ def keep_freed_memory() -> None:
     Without glibc this has no effect; thresholds set by the environment stay.
     """
     bytes(LARGEST)
-
-
-M_ARENA_MAX = -8
-"""Number of a parameter of mallopt(3), from malloc.h."""
-
-
-def share_freed_memory() -> None:
-    """
-    Make all threads of this process allocate from one arena of glibc.
-
-    The blocks of a cloud are allocated by the thread that receives it and freed by the one that
-    maps it. With an arena each, memory freed by one is not used again by the other: after two
-    minutes at 20 Hz and 4 MiB the node held 411 MB, with one arena 399. The environment variable
-    MALLOC_ARENA_MAX comes first; without glibc this has no effect.
-    """
-    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
-    if mallopt is not None and 'MALLOC_ARENA_MAX' not in os.environ:
-        mallopt(M_ARENA_MAX, 1)
 
 
 RARELY = 50_000

@@ -18,7 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.memory import keep_freed_memory, share_freed_memory
+from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.ros.context import context, explain, logging_to
 from surfel_mapper.ros.main_thread import Signals
 from surfel_mapper.ros.node import MapperNode
@@ -44,7 +44,6 @@ def run_node(ros_args: Sequence[str], signals: Signals) -> None:
 
     """
     keep_freed_memory()
-    share_freed_memory()
     with context(ros_args):
         node = create_node(ros_args)
         try:
