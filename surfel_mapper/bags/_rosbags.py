@@ -158,11 +158,6 @@ def is_readable(connection: Connection) -> bool:
     return serialization(connection) in ('cdr', 'ros1')
 
 
-def has_legal_names(connection: Connection) -> bool:
-    """Return whether topic and type have names without control characters; else it is damage."""
-    return connection.topic.isprintable() and connection.msgtype.isprintable()
-
-
 def is_latched(connection: Connection) -> bool:
     """Return whether the publisher offered its last messages to late subscribers."""
     from rosbags.interfaces import ConnectionExtRosbag1

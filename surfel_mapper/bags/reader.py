@@ -24,7 +24,6 @@ import tempfile
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from surfel_mapper.bags._rosbags import (
-    has_legal_names,
     is_latched,
     is_readable,
     member_names,
@@ -48,9 +47,6 @@ LIVOX_PARSERS = dict.fromkeys(
     ('livox_ros_driver/msg/CustomMsg', 'livox_ros_driver2/msg/CustomMsg'), parse_livox
 )
 """Decoder of the types of Livox's drivers."""
-
-MAX_NAMES = 12
-"""Number of topics named in a message."""
 
 log = logging.getLogger(__name__)
 
@@ -230,7 +226,6 @@ class BagReader:
             self._storages.append((path, storage))
             if isinstance(storage, StreamedMcap):
                 self.cuts += storage.losses(path)
-            self._note_damaged_names(path, storage)
             journal = path.with_name(f'{path.name}-wal')
             if journal.is_file() and journal.stat().st_size:
                 self.cuts.append(
@@ -256,9 +251,9 @@ class BagReader:
         return self._latched
 
     def _connections(self) -> Iterator[Connection]:
-        """Yield the connections of all files; without those whose names are damaged."""
+        """Yield the connections of all files."""
         for _, storage in self._storages:
-            yield from filter(has_legal_names, storage.connections)
+            yield from storage.connections
 
     def _indexed_topics(self) -> list[Topic]:
         """Return the topics in all files with the counts of the indexes or metadata.yaml."""
@@ -293,7 +288,7 @@ class BagReader:
         stop_ns: int | None,
     ) -> Iterator[BagMessage]:
         """Yield the messages of one file; packed ones unpacked."""
-        wanted = [c for c in storage.connections if is_readable(c) and has_legal_names(c)]
+        wanted = [c for c in storage.connections if is_readable(c)]
         if names is not None:
             wanted = [c for c in wanted if c.topic in names]
         if not wanted:
@@ -343,16 +338,6 @@ class BagReader:
                 self.cuts.append(loss)
                 log.warning(loss)
         return streamed
-
-    def _note_damaged_names(self, path: Path, storage: Storage) -> None:
-        """Add the messages that are skipped because their topic has no legal name to ``cuts``."""
-        damaged = [c for c in storage.connections if not has_legal_names(c)]
-        if damaged:
-            names = ', '.join(repr(c.topic) for c in damaged[:MAX_NAMES])
-            self.cuts.append(
-                f'{path}: {sum(c.msgcount for c in damaged)} messages are skipped, as their topic '
-                f'or type has no legal name: {names}'
-            )
 
     def _check_complete(self, read: Counter[str], names: Collection[str] | None) -> None:
         """Compare the number of messages read of each readable topic with the index."""
