@@ -59,9 +59,9 @@ def main() -> None:
 def show(mirror: MapMirror) -> None:
     """Print figures that a planner may use."""
     surfels = mirror.map.surfels(min_points=5)
-    level = (surfels.planarity > 0.8) & (surfels.normal[:, 2] > 0.9)
+    level = surfels.is_good & (surfels.normal[:, 2] > 0.9)
     print(
-        f'{mirror.stamp_ns / 1e9:.3f} s: {len(surfels)} surfels, {int(level.sum())} flat and '
+        f'{mirror.stamp_ns / 1e9:.3f} s: {len(surfels)} surfels, {int(level.sum())} good and '
         f'level, digest {mirror.map.digest()}',
         flush=True,
     )

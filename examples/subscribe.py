@@ -21,9 +21,9 @@ from surfel_mapper import Surfels
 def show(msg: PointCloud2) -> None:
     """Print figures of a map."""
     surfels = Surfels.from_message(msg)
-    is_level = (surfels.planarity > 0.8) & (surfels.normal[:, 2] > 0.9)
+    is_level = surfels.is_good & (surfels.normal[:, 2] > 0.9)
     heights = surfels.position[is_level, 2]
-    print(f'{len(surfels)} surfels, {len(heights)} flat and level', flush=True)
+    print(f'{len(surfels)} surfels, {len(heights)} good and level', flush=True)
 
 
 parser = argparse.ArgumentParser(description=str(__doc__).strip().partition('\n')[0])

@@ -25,9 +25,9 @@ for scan in street.scans():
     if len(window) > 10:
         surfel_map.remove(window.popleft())  # the exact inverse of that add
 surfels = surfel_map.surfels(min_points=5)
-level = surfels.select((surfels.planarity > 0.8) & (surfels.normal[:, 2] > 0.9))
+level = surfels.select(surfels.is_good & (surfels.normal[:, 2] > 0.9))
 
-print(f'{len(surfels)} surfels, {len(level)} of them flat and level')
+print(f'{len(surfels)} surfels, {len(level)} of them good and level')
 
 # The map is that of the last ten scans alone, to the bit.
 last_ten = SurfelMap(voxel_size_m=0.5)

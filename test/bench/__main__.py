@@ -23,7 +23,10 @@ from test.bench.machine import facts, load
 from test.bench.options import cache_directory, Options
 from test.bench.report import Row, table
 
-BENCHES = ('real', 'start', 'live', 'filters', 'lum', 'registration', 'tsdf', 'models', 'paper')
+BENCHES = (
+    *('real', 'start', 'live', 'filters', 'lum', 'registration', 'tsdf', 'models', 'paper'),
+    'quality',
+)
 """Modules of this folder that have run(options) -> list of rows, in the order to run them."""
 
 

@@ -12,7 +12,7 @@ import pytest
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.messages.pointcloud2 import from_columns
 from test.bench import __main__ as bench
-from test.bench import paper, real
+from test.bench import paper, quality, real
 from test.bench.options import Options
 from test.models.scenes import sheet
 from test.offline.test_depth_folders import tum
@@ -129,3 +129,26 @@ def test_a_number_of_scans_that_is_not_positive_is_refused(capsys):
         bench.main(['--scans', '0'])
     assert exit_info.value.code == 2
     assert '--scans: 0, expected one or more' in capsys.readouterr().err
+
+
+def test_references_tell_one_plane_from_two_and_from_undetermined_ones():
+    rng = np.random.default_rng(3)
+    flat = rng.uniform(0.0, 0.5, (200, 3)) * [1.0, 1.0, 0.0] + rng.normal(0.0, 0.005, (200, 3))
+    wall = np.roll(flat, 1, axis=1)
+    line = np.column_stack([flat[:, 0], rng.normal(0.0, 0.005, (200, 2))])
+    fits = [
+        quality.fitted(points, rng) for points in (flat, np.concatenate([flat, wall[:90]]), line)
+    ]
+
+    for normal, _, _ in fits[:2]:
+        assert abs(normal[2]) > 0.999
+    assert [(is_one, is_sure) for _, is_one, is_sure in fits] == [
+        (True, True),
+        (False, True),
+        (True, False),
+    ]
+
+
+def test_quality_without_recordings_has_no_rows(options, monkeypatch):
+    monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
+    assert bench.run(['quality'], options) == []

@@ -42,7 +42,7 @@ def expected_quality(steps, times, voxel_size_m=0.5):
     e0, e1, e2 = sorted(2 * times * Fraction(step) ** 2 * unit_sq / (n - 1) for step in steps)
     variance = e0 * (n - 1) / (n - 3)
     s = max(variance, NOISE_SQ)
-    sigma_sq = s * sum(e / (e - s) ** 2 for e in (e1, e2)) / (n - 1) if e1 > s else math.inf
+    sigma_sq = 3 * s * sum(e / (e - s) ** 2 for e in (e1, e2)) / (n - 1) if e1 > s else math.inf
     return variance, sigma_sq, 2 * (e1 + e2)
 
 
@@ -189,3 +189,25 @@ def test_impossible_numbers_of_scans_are_refused(numbers):
     with pytest.raises(MapError, match='scans'):
         surfel_map.insert(moments)
     assert surfel_map.num_points == 3
+
+
+def test_a_surfel_is_good_by_thickness_sigma_and_scans():
+    surfel_map = SurfelMap(0.5)
+    rng = np.random.default_rng(2)
+    flat = rng.uniform(0.0, 0.5, (3, 100, 3)) * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.25]
+    kinds = {
+        'plane': flat,
+        'thick': flat + rng.normal(0.0, 0.04, flat.shape) * [0.0, 0.0, 1.0],
+        'line': flat * [1.0, 0.0, 1.0] + [0.0, 0.25, 0.0],
+        'two scans': flat[:2],
+        'two points': flat[:, :1],
+    }
+    for place, scans in enumerate(kinds.values()):
+        for points in scans:
+            surfel_map.add(points + np.array([2.0 * place, 0.0, 0.0]))
+    surfels = surfel_map.surfels()
+
+    good = surfels.select(surfels.is_good)
+
+    assert good.voxel_index[:, 0].tolist() == [0]
+    assert len(surfels) == len(kinds)

@@ -134,4 +134,4 @@ def test_the_mirror_example_has_the_digest_of_the_saved_map(start, tmp_path):
         mirror.terminate()
         mirror.wait(TIMEOUT_S)
     assert saved.num_points > 0
-    assert 'flat and level' in said
+    assert 'good and level' in said

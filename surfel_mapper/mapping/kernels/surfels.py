@@ -47,7 +47,12 @@ EXACT_BITS = 54
 n < 2^(54 - 2 b), with a margin of two."""
 
 NOISE_SQ = 0.01**2
-"""Smallest variance of points about their plane that normal_sigma assumes, m^2."""
+"""Smallest variance of points about their plane that normal_sigma assumes, m^2: also a thin surfel
+has the errors of range and pose that its points share."""
+
+REPEATED = 3.0
+"""Number of points that count as one for normal_sigma, as points side by side share errors: in
+one-plane voxels of a hall it is then within a factor of two of the measured angle."""
 
 RIGHT_ANGLE = math.pi / 2.0
 """Largest normal_sigma, rad: the normal is undetermined."""
@@ -137,7 +142,7 @@ def quality_of(e0, e1, e2, n):
     noise_sq = variance if variance > NOISE_SQ else NOISE_SQ
     first, second = e1 - noise_sq, e2 - noise_sq
     first_sq, second_sq = first * first, second * second
-    spread = noise_sq * (e1 * second_sq + e2 * first_sq)
+    spread = REPEATED * noise_sq * (e1 * second_sq + e2 * first_sq)
     sigma = math.sqrt(spread / ((n - 1.0) * (first_sq * second_sq)))
     sigma = sigma if (first > 0.0) & (sigma < RIGHT_ANGLE) else RIGHT_ANGLE
     sigma = sigma if (freedom > 0.0) & (e2 > 0.0) else math.nan
