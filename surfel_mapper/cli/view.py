@@ -33,7 +33,10 @@ SUMMARY = 'Show maps, clouds, meshes, models, trajectories, bags or a running no
 
 EXAMPLE = 'surfel-mapper view street_surfels/ --color height'
 
-COLOURS = ('normal', 'height', 'planarity', 'intensity', 'rgb', 'age', 'label')
+COLOURS = (
+    *('normal', 'height', 'planarity', 'curvature', 'num_points', 'thickness', 'normal_sigma'),
+    *('radius', 'num_scans', 'size', 'intensity', 'rgb', 'age', 'label'),
+)
 
 LAST_PORT = 65_534
 """Last port of a page: the one after it is the last of TCP."""

@@ -33,7 +33,7 @@ from surfel_mapper.files.triangles import SUFFIXES as TRIANGLES
 from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.discs import DrawnDiscs, RGB
+from surfel_mapper.viz.discs import DrawnDiscs, RGB, SPREAD
 
 Array = npt.NDArray[np.float64]
 
@@ -196,7 +196,7 @@ def normal_names(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[str, ...] | N
 
 def discs_of(position: Array, columns: Mapping[str, npt.NDArray[Any]]) -> DrawnDiscs:
     """
-    Return the discs of surfels of a file or topic, which lack a size.
+    Return the discs of surfels of a file or topic; those without a radius get that of the gaps.
 
     Parameters
     ----------
@@ -213,7 +213,10 @@ def discs_of(position: Array, columns: Mapping[str, npt.NDArray[Any]]) -> DrawnD
     is_known = np.isfinite(position).all(axis=1) & (length > 0.0)
     normal = normal[is_known] / length[is_known, None]
     position = position[is_known]
-    radius_m = np.full(len(position), 0.75 * spacing_m(position))
+    if 'radius' in columns:
+        radius_m = SPREAD * columns['radius'][is_known].astype(np.float64)
+    else:
+        radius_m = np.full(len(position), 0.75 * spacing_m(position))
     values = {name: column for name, column in columns.items() if name not in COORDINATES}
     shown = {name: value[is_known] for name, value in unpacked(values).items()}
     return DrawnDiscs(position, normal, radius_m, shown)

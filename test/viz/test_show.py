@@ -159,7 +159,7 @@ def hidden(tmp_path):
 def test_surfels_of_ply_are_discs_with_their_values(tmp_path, capsys):
     surfel_map = ground_map(UTM)
     surfel_map.save(tmp_path / 'map.ply')
-    found = shown(tmp_path, tmp_path / 'map.ply', '--color', 'planarity')
+    found = shown(tmp_path, tmp_path / 'map.ply', '--color', 'thickness')
 
     places = together(found, '/map/map', 'Points3D:positions')
     origin_m = np.array(found['/map']['origin_m'])
@@ -172,6 +172,9 @@ def test_surfels_of_ply_are_discs_with_their_values(tmp_path, capsys):
     assert np.sort(together(found, '/map/map', 'num_points')).tolist() == sorted(
         surfels.num_points
     )
+    radii = np.sort(together(found, '/map/map', 'Points3D:radii'))
+    expected = np.sort(surfels.radius / surfels.radius.max())
+    np.testing.assert_allclose(radii / radii[-1], expected, rtol=1e-6)
     assert 'without their moments' in capsys.readouterr().out
 
 
