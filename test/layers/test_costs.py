@@ -106,6 +106,19 @@ def test_a_grid_is_due_when_the_map_or_the_cell_of_the_sensor_has_changed():
     assert version(0.01, -0.01) != first
 
 
+@pytest.mark.parametrize(('height_m', 'at_the_edge'), [(0.15, UNKNOWN), (0.75, OBSTACLE)])
+def test_only_flat_surfels_tell_a_slope_and_any_tells_a_step(height_m, at_the_edge):
+    def height(x, y):
+        rough = height_m + 0.06 * (-1.0) ** np.floor(50.0 * x)  # 6 cm off, no plane
+        return np.where(x < 0.0, rough, 0.1)
+
+    grid = grid_of(ground(height))
+
+    assert (grid.cost[:, :7] == UNKNOWN).all()
+    assert (grid.cost[:, 7] == at_the_edge).all()
+    assert (grid.cost[:, 9:] == 0).all()
+
+
 def test_an_empty_map_is_unknown():
     surfels = SurfelMap(H).surfels()
     assert (traversability(surfels, H, (0.0, 0.0), LIMITS).cost == UNKNOWN).all()

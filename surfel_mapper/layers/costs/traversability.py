@@ -6,6 +6,10 @@ A grid of costs of the ground: its slope, and the height of its steps.
 A cell is a column of voxels. Its ground is its lowest surfel and those above it that are too low
 for a robot to pass under. A slope is no step: heights of neighbouring cells are compared on the
 border between them, each continued along its own slope to there.
+
+Only flat surfels (Surfels.is_flat) tell a slope. A cell without one is unknown, unless a step
+makes it an obstacle: heights are right even if a normal is not. The number of scans does not
+matter: a robot may stand still, and a map may be of one merged cloud.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from surfel_mapper.config import GridConfig
 from surfel_mapper.mapping.surfels import Surfels
 
 UNKNOWN = -1
-"""Cost of a cell that was never seen, as nav_msgs/OccupancyGrid has it."""
+"""Cost of a cell without a flat surfel, as nav_msgs/OccupancyGrid has it."""
 
 OBSTACLE = 100
 """Cost of a cell that cannot be driven on."""
@@ -38,7 +42,7 @@ class CostGrid:
     origin : (2,) float64, m
         x and y of the outer corner of the first cell.
     cost : (rows along y, columns along x) int8
-        0 free to 100 obstacle, -1 never seen.
+        0 free to 100 obstacle, -1 unknown.
 
     """
 
@@ -55,6 +59,7 @@ class CellGround:
     top: npt.NDArray[np.int64]
     lowest: npt.NDArray[np.int64]
     upright: npt.NDArray[np.float64]
+    has_slope: npt.NDArray[np.bool_]
 
 
 def traversability(
@@ -77,7 +82,8 @@ def traversability(
     Returns
     -------
     CostGrid
-        The larger of slope and step, in percent of its limit; 100 from the limit on.
+        The larger of slope and step, in percent of its limit; 100 from the limit on. A cell
+        without a flat surfel has only the cost of a step that is an obstacle.
 
     """
     number = max(math.ceil(limits.size_m / voxel_size_m), 1)
@@ -91,14 +97,16 @@ def traversability(
         ground = ground_of(chosen, cell, limits.clearance_m)
         slope_deg = np.degrees(np.arccos(np.minimum(ground.upright, 1.0)))
         step_m = steps(chosen, ground, voxel_size_m, number, limits.max_slope_deg)
-        share = np.maximum(slope_deg / limits.max_slope_deg, step_m / limits.max_step_m)
-        cost[ground.cell] = np.minimum(share * OBSTACLE, OBSTACLE).astype(np.int8)
+        step = step_m / limits.max_step_m
+        share = np.maximum(slope_deg / limits.max_slope_deg, step)
+        known = ground.has_slope | (step >= 1.0)
+        cost[ground.cell[known]] = np.minimum(share[known] * OBSTACLE, OBSTACLE).astype(np.int8)
     origin = first.astype(np.float64) * voxel_size_m
     return CostGrid(voxel_size_m, origin, cost.reshape(number, number))
 
 
 def ground_of(surfels: Surfels, cell: npt.NDArray[np.int64], clearance_m: float) -> CellGround:
-    """Return the ground of every cell: its lowest and its top surfel, and its steepest one."""
+    """Return the ground of every cell: its lowest, top and steepest flat surfel."""
     height = surfels.position[:, 2]
     order = np.lexsort((height, cell))
     starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
@@ -106,12 +114,14 @@ def ground_of(surfels: Surfels, cell: npt.NDArray[np.int64], clearance_m: float)
     bottom = np.repeat(height[lowest], np.diff(starts, append=len(order)))
     is_ground = height[order] <= bottom + clearance_m
     number = np.add.reduceat(is_ground.astype(np.int64), starts)
-    upright = np.where(is_ground, np.abs(surfels.normal[order, 2]), 1.0)
+    is_flat = is_ground & surfels.is_flat[order]
+    upright = np.where(is_flat, np.abs(surfels.normal[order, 2]), 1.0)
     return CellGround(
         cell=cell[lowest],
         top=order[starts + number - 1],
         lowest=lowest,
         upright=np.minimum.reduceat(upright, starts),
+        has_slope=np.logical_or.reduceat(is_flat, starts),
     )
 
 
@@ -124,6 +134,7 @@ def steps(
     normal = surfels.normal[ground.top]
     upright = np.where(normal[:, 2] == 0.0, 1e-9, normal[:, 2])
     slope = np.clip(-normal[:, :2] / upright[:, None], -steepest, steepest)
+    slope[~surfels.is_flat[ground.top]] = 0.0
     rise = ((top - lowest)[:, :2] * slope).sum(axis=1)
     highest = np.abs(top[:, 2] - lowest[:, 2] - rise)
     row_of = np.full(number * number, -1)
