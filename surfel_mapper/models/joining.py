@@ -45,8 +45,11 @@ LEAST_COSINE = 0.5
 FLOOR_VOXELS = 0.02
 """Residuals are not resolved below this, in voxels: exact surfaces would otherwise never join."""
 
-LEAST_TURN_DEG, LEAST_BEND_VOXELS = 15.0, 0.25
-"""A surface that turns or bends less is a plane: tables sag a little."""
+LEAST_TURN_DEG, LEAST_BEND_VOXELS, LEAST_BEND_SIGMAS = 15.0, 0.25, 1.5
+"""
+A surface that turns or bends less is a plane: tables sag a little. Sigmas are those of its
+patches: far walls seem to bend by steps of disparity.
+"""
 
 CURVED_GAIN = 15.0
 """Gain of the criterion by which a curved surface is better than a plane, at least."""
@@ -156,11 +159,11 @@ def described(
     context = *state, chunk_boxes(state[0]), floor
     describe_regions(names, context, regions, limits, normals, figures)
     index = np.searchsorted(names, regions.root).astype(np.int32)
-    gains, turns, bends = (figures[:, :3] > limits).T
-    curved = gains & turns & bends
     points, every = regions.patch_points, len(names) + 1
     squares = np.bincount(index, points * regions.patch_sigma**2, every)[:-1]
     own = np.sqrt(squares / np.bincount(index, points, every)[:-1])
+    curved: npt.NDArray[np.bool_] = (figures[:, :3] > limits).all(axis=1)
+    curved &= figures[:, 2] > LEAST_BEND_SIGMAS * own
     is_worse = figures[:, 3] > np.maximum(MOST_WORSE * own, UNRESOLVED_VOXELS * size_m)
     is_worse &= ~curved & (np.bincount(index, minlength=every)[:-1] > 1)
     return index, normals, curved, is_worse
