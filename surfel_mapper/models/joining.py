@@ -162,8 +162,8 @@ def described(
     points, every = regions.patch_points, len(names) + 1
     squares = np.bincount(index, points * regions.patch_sigma**2, every)[:-1]
     own = np.sqrt(squares / np.bincount(index, points, every)[:-1])
-    curved: npt.NDArray[np.bool_] = (figures[:, :3] > limits).all(axis=1)
-    curved &= figures[:, 2] > LEAST_BEND_SIGMAS * own
+    gains, turns, bends = (figures[:, :3] > limits).T
+    curved = gains & turns & bends & (figures[:, 2] > LEAST_BEND_SIGMAS * own)
     is_worse = figures[:, 3] > np.maximum(MOST_WORSE * own, UNRESOLVED_VOXELS * size_m)
     is_worse &= ~curved & (np.bincount(index, minlength=every)[:-1] > 1)
     return index, normals, curved, is_worse
