@@ -10,6 +10,8 @@ unexport PYTHONDONTWRITEBYTECODE
 
 PYTHON ?= python3
 PYTEST_ARGS ?=
+# --open shows the report of the demo in a browser
+DEMO_ARGS ?=
 TEST_PROCESSES ?= 4
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
@@ -41,7 +43,7 @@ OUSTER_ENV := $(CURDIR)/$(VENV)-ouster
 
 # The environment of the tests does too, and the one of the demo becomes it later.
 demo: $(or $(wildcard $(STAMP)),$(DEMO_STAMP))  ## simulate a street, map it live over DDS and from the bag, compare
-	$(BIN)/python examples/demo.py
+	$(BIN)/python examples/demo.py $(DEMO_ARGS)
 
 # Each process takes the next file of tests, in the order of test/conftest.py, when it is done with
 # one, and has a ROS domain of its own. Four keep two cores busy, as tests of nodes wait for each

@@ -23,6 +23,7 @@ import socket
 import subprocess
 import sys
 import time
+import webbrowser
 
 SETTINGS = Path(os.path.relpath(Path(__file__).with_name('street.yaml')))
 
@@ -46,7 +47,7 @@ def main() -> int:
         )
         say('3. The bag is mapped, without ROS.')
         call('replay', bag, '--config', SETTINGS, '--window', '--output', offline, '--overwrite')
-        print_files(offline)
+        print_files(offline, args.open)
         return 0
     say('2. The node maps the bag while it is played, as it would on a robot.')
     with (
@@ -69,16 +70,19 @@ def main() -> int:
         print('The maps differ.')
         return 1
     print('They are equal to the last bit.')
-    print_files(offline)
+    print_files(offline, args.open)
     return 0
 
 
-def print_files(directory: Path) -> None:
-    """Print the files of a replay that are worth opening."""
+def print_files(directory: Path, is_opened: bool) -> None:
+    """Print the files of a replay that are worth opening, the picture last; open the report."""
+    if is_opened:
+        webbrowser.open((directory / 'report.html').resolve().as_uri())
     print(
-        f'\npicture  {directory / "map.png"}\n'
-        f'map      {directory / "map.ply"} (CloudCompare and MeshLab open it)\n'
-        f'figures  {directory / "summary.json"}'
+        f'\nmap      {directory / "map.ply"} (CloudCompare and MeshLab open it)\n'
+        f'figures  {directory / "summary.json"}\n'
+        f'report   {directory / "report.html"} (--open shows it)\n'
+        f'picture  {directory / "map.png"}'
     )
 
 
@@ -89,6 +93,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument('--scans', type=int, default=100, help='length of the drive')
     parser.add_argument('--beams', type=int, default=64, help='of the lidar')
     parser.add_argument('--columns', type=int, default=1024, help='of the lidar, a turn')
+    parser.add_argument('--open', action='store_true', help='open the report in a browser')
     return parser.parse_args()
 
 

@@ -126,11 +126,17 @@ class DrawnDiscs:
         return DrawnDiscs(self.position[rows], self.normal[rows], self.radius_m[rows], values)
 
     def triangles(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-        """Return corners (6 K, 3), m, and the numbers of those of each triangle (4 K, 3)."""
+        """
+        Return the hexagons about the discs, which leave no gaps between neighbours.
+
+        Their corners are (6 K, 3), m, the numbers of those of each triangle (4 K, 3).
+        """
         normal = self.normal
         beside = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
         along = np.cross(normal, beside)
-        along *= (self.radius_m / np.sqrt((along * along).sum(axis=1)))[:, None]
+        along *= (2.0 / np.sqrt(3.0) * self.radius_m / np.sqrt((along * along).sum(axis=1)))[
+            :, None
+        ]
         across = np.cross(normal, along)
         corners = np.empty((len(self), CORNERS, 3), np.float32)
         for corner, turn in enumerate(np.arange(CORNERS) * (2.0 * np.pi / CORNERS)):

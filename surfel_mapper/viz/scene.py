@@ -3,8 +3,9 @@
 """
 Scene: discs, meshes, lines and poses in rerun, in a window, a browser or an .rrd file.
 
-A disc is a hexagon of a mesh, which rerun shades and draws fast, with a small point at its middle
-that can be picked and has the values of the surfel. Rerun draws in float32, so positions are given
+A disc is a hexagon of a mesh, which rerun shades and draws fast, and is seen from the side of its
+normal only: from above, rooms have no roof. A point of one pixel at its middle, in its colour, can
+be picked and has the values of the surfel. Rerun draws in float32, so positions are given
 in the frame of the map; where that has an origin in the fixed frame, the entity ``map`` states it
 as ``origin_m``, and discs that are picked have the coordinates of the fixed frame, as
 ``fixed_x_m`` and so on.
@@ -41,8 +42,11 @@ Array = npt.NDArray[np.float64]
 PORT = 9876
 """Port of the window, that of rerun; one that is open there already is used."""
 
-PICKED = 0.25
-"""Radius of the point that is picked, relative to that of its disc."""
+PICKED = -0.5
+"""Radius of the point that is picked, which rerun takes as pixels since it is negative."""
+
+AROUND_M = 12.0
+"""Half of the side of the place that is looked at around a sensor, m."""
 
 NORMAL = ('normal_x', 'normal_y', 'normal_z')
 
@@ -84,6 +88,8 @@ class Scene:
         self._rerun = import_rerun()
         self._stream = stream
         self._server = server
+        has_sides = hasattr(self._rerun.components, 'MeshFaceRendering')  # not of old versions
+        self._from_front: dict[str, Any] = {'face_rendering': 'Front'} if has_sides else {}
         stream.log('map', self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     @classmethod
@@ -209,7 +215,12 @@ class Scene:
             overrides=dict.fromkeys(hidden, invisible),
         )
         self._stream.send_blueprint(
-            blueprint.Blueprint(view, blueprint.TimePanel(state='collapsed')),
+            blueprint.Blueprint(
+                view,
+                blueprint.BlueprintPanel(state='collapsed'),
+                blueprint.SelectionPanel(state='collapsed'),
+                blueprint.TimePanel(state='expanded'),
+            ),
             make_active=True,
             make_default=True,
         )
@@ -225,13 +236,14 @@ class Scene:
             vertex_positions=corners,
             triangle_indices=triangles,
             vertex_colors=np.repeat(colours, CORNERS, axis=0),
+            **self._from_front,
         )
         self._stream.log(f'{path}/discs', mesh, static=static)
         values = dict(discs.values)
         values.update(zip(NORMAL, discs.normal.T.astype(np.float32), strict=True))
         if self.origin_m.any():
             values.update(zip(FIXED, (discs.position + self.origin_m).T, strict=True))
-        points = rerun.Points3D(discs.position, radii=PICKED * discs.radius_m, colors=colours)
+        points = rerun.Points3D(discs.position, radii=PICKED, colors=colours)
         self._stream.log(path, points, rerun.AnyValues(**values), static=static)
 
     def clear(self, path: str, *, static: bool = False) -> None:

@@ -22,7 +22,7 @@ from surfel_mapper.mapping.ages import Ages, ages_s
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.messages.model_messages import quaternions
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
-from surfel_mapper.viz.scene import ORANGE, RED, Scene
+from surfel_mapper.viz.scene import AROUND_M, ORANGE, RED, Scene
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
@@ -172,6 +172,8 @@ class Viewer:
         if not self._is_placed:
             self._is_placed = True
             scene.set_origin(shot.origin_m)
+            place = shot.T_map_sensor[:3, 3]
+            scene.look(place - AROUND_M, place + AROUND_M, place)
         scene.set_stamp(shot.stamp_ns)
         scene.pose('map/sensor', shot.T_map_sensor)
         scene.points('map/sensor/scan', shot.points, POINT_RADIUS_M)

@@ -67,10 +67,14 @@ def run_process(name, *arguments, folder):
 def test_the_demo_without_ros_leaves_out_the_node_and_says_so(run, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, 'rclpy', None)
     monkeypatch.setenv('PYTHONPATH', str(ROOT))
-    out = run('demo.py', '--scans', 4, '--beams', 16, '--columns', 256, folder=tmp_path)
+    opened = []
+    monkeypatch.setattr('webbrowser.open', opened.append)
+    small = ('--scans', 4, '--beams', 16, '--columns', 256)
+    out = run('demo.py', *small, '--open', folder=tmp_path)
 
     assert 'The live node is left out: ROS 2 is not installed' in out
-    assert 'demo/offline/map.png' in out
+    assert out.splitlines()[-1] == 'picture  demo/offline/map.png'
+    assert opened == [(tmp_path / 'demo' / 'offline' / 'report.html').as_uri()]
     summary = json.loads((tmp_path / 'demo' / 'offline' / 'summary.json').read_text('utf-8'))
     assert summary['scans']['mapped'] == 4
     assert Image.open(tmp_path / 'demo' / 'offline' / 'map.png').size[0] > 500

@@ -21,20 +21,22 @@ def discs(**values):
     return DrawnDiscs(position, normal, np.array([0.5, 1.0, 2.0]), values)
 
 
-def test_corners_lie_on_a_circle_across_the_normal():
+def test_corners_lie_on_a_circle_about_the_disc_across_the_normal():
     shown = discs()
     corners, triangles = shown.triangles()
     away = corners.reshape(3, CORNERS, 3) - shown.position[:, None]
 
     np.testing.assert_allclose(
-        np.linalg.norm(away, axis=2), [[0.5] * 6, [1.0] * 6, [2.0] * 6], atol=1e-6
+        np.linalg.norm(away, axis=2),
+        2.0 / np.sqrt(3.0) * np.array([[0.5] * 6, [1.0] * 6, [2.0] * 6]),
+        atol=1e-6,
     )
     np.testing.assert_allclose(np.einsum('kci,ki->kc', away, shown.normal), 0.0, atol=1e-6)
     a, b, c = (corners[triangles[:, n]] for n in range(3))
     across = np.cross(b - a, c - a).reshape(3, CORNERS - 2, 3)
     area = 0.5 * np.einsum('kti,ki->k', across, shown.normal)
-    # a hexagon of radius r, turning to the left as seen from its normal
-    np.testing.assert_allclose(area, 1.5 * np.sqrt(3.0) * shown.radius_m**2, rtol=1e-5)
+    # a hexagon about a circle of radius r, turning to the left as seen from its normal
+    np.testing.assert_allclose(area, 2.0 * np.sqrt(3.0) * shown.radius_m**2, rtol=1e-5)
 
 
 def test_surfels_without_a_normal_have_no_disc():

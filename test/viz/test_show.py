@@ -143,6 +143,34 @@ def test_files_of_a_replay_share_the_frame_of_the_map_far_from_zero(tmp_path):
     np.testing.assert_allclose(np.ravel(sensor['Transform3D:translation']), [2.0, 1.0, 0.0])
 
 
+def test_discs_have_no_dot_and_are_seen_from_their_front(tmp_path):
+    ground_map().save(tmp_path / 'map.npz')
+    found = shown(tmp_path, tmp_path / 'map.npz')
+    assert together(found, '/map/', 'Points3D:radii').max() < 0.0  # pixels
+    front = together(found, '/map/', 'Mesh3D:face_rendering')
+    assert set(front.tolist()) == {2}
+
+
+def test_the_panels_are_collapsed_but_that_of_time(tmp_path):
+    from rerun import chunk as reader
+
+    ground_map().save(tmp_path / 'map.npz')
+    shown(tmp_path, tmp_path / 'map.npz')
+    file = reader.RrdReader(str(tmp_path / 'shown.rrd'))
+    (store,) = file.blueprints()
+    states = {}
+    for chunk in file.stream(store=store).to_chunks():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.endswith('PanelBlueprint:state'):
+                states[chunk.entity_path] = batch.column(name)[-1].as_py()[0]
+    assert states == {
+        '/blueprint_panel': 2,  # collapsed
+        '/selection_panel': 2,
+        '/time_panel': 3,  # expanded
+    }
+
+
 def hidden(tmp_path):
     """Return the paths that the blueprint of the recording of a view hides, below its view."""
     from rerun import chunk as reader
