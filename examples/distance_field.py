@@ -26,9 +26,7 @@ def main() -> None:
     parser.add_argument('mesh', type=Path, help='PLY file to write')
     path = parser.parse_args().mesh
     simulation = Simulation(World.street(seed=1, length_m=60.0), Lidar(beams=32, columns=720))
-    field = DistanceField(
-        TsdfConfig(voxel_size_m=0.2, truncation_m=0.6, max_range_m=20.0, distance='to_plane')
-    )
+    field = DistanceField(TsdfConfig(voxel_size_m=0.2, max_range_m=20.0))
     for number in range(10):
         stamp_ns = simulation.stamp_ns(number)
         pose = simulation.drive.T_odom_sensor(stamp_ns)

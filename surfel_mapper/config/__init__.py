@@ -27,7 +27,6 @@ from surfel_mapper.config.layers import (
     ModelsLayerConfig,
     SEMANTICS,
     TsdfConfig,
-    WEIGHT_MODES,
 )
 from surfel_mapper.config.registration import AlignConfig, LoopsConfig, RegistrationConfig
 from surfel_mapper.config.settings import (
@@ -84,7 +83,6 @@ __all__ = [
     'Stage',
     'TsdfConfig',
     'ViewerConfig',
-    'WEIGHT_MODES',
     'WindowConfig',
     'allowed',
     'checked',

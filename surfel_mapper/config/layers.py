@@ -15,15 +15,15 @@ method, so that one number suits a table and a hall.
 from __future__ import annotations
 
 from dataclasses import dataclass
-import math
 from typing import ClassVar
 
 from surfel_mapper.config.settings import setting, Stage
 from surfel_mapper.errors import ConfigError
 
-WEIGHT_MODES = ('constant', 'inverse_square')
-DISTANCES = ('along_ray', 'to_plane')
 SEMANTICS = ('none', 'single')
+
+LIDAR_NOISE_M = 0.02
+"""Standard deviation of the ranges of a lidar, m; data sheets state 0.01 to 0.03."""
 
 MAX_LABEL = (1 << 24) - 1
 """Labels are kept as float32, which holds whole numbers up to here."""
@@ -40,15 +40,6 @@ class TsdfConfig(Stage):
         False,
         'Fuse a scan when it leaves the window, after alignments have moved it, not at once.',
     )
-    sensor_rows: int = setting(
-        0,
-        'Beams of the lidar; 0: estimated from the first scan. Cameras use their camera_info.',
-        low=0,
-        high=4096,
-    )
-    sensor_columns: int = setting(
-        0, 'Azimuth steps of the lidar; 0: estimated from the first scan.', low=0, high=65536
-    )
     sensor_frame: str = setting(
         '',
         'Frame of the optical centre of the lidar, for clouds that are given in another, such as '
@@ -62,10 +53,10 @@ class TsdfConfig(Stage):
     )
     voxel_size_m: float = setting(0.1, 'Edge of a voxel, m.', low=0.001, high=100.0)
     truncation_m: float = setting(
-        0.3,
-        'Distances are kept up to this on both sides of a surface, m; at least two voxels and '
-        'less than half of the thinnest wall.',
-        low=0.002,
+        0.0,
+        'Distances are kept up to this in front of a surface, m; at least two voxels. 0: two '
+        'voxels and three times the noise of a lidar (0.02 m), at most three voxels.',
+        low=0.0,
         high=1000.0,
     )
     max_radius_m: float = setting(
@@ -75,20 +66,12 @@ class TsdfConfig(Stage):
         low=0.0,
         high=1e6,
     )
-    max_age_s: float = setting(
-        0.0, 'Blocks not updated for longer are dropped, s; 0: no such limit.', low=0.0, high=1e9
-    )
-    carve: bool = setting(True, 'Also update the blocks between sensor and surface.')
-    distance: str = setting(
-        'along_ray',
-        'Distance of a voxel from a surface: along_ray; or to_plane, that times the cosine of the '
-        'angle of incidence, which closes the ground far from a lidar.',
-        choices=DISTANCES,
-    )
-    weight_mode: str = setting(
-        'inverse_square',
-        'Weight of a measurement: constant, 1; inverse_square, 1/depth^2.',
-        choices=WEIGHT_MODES,
+    carve_m: float = setting(
+        20.0,
+        'Rays free the space up to this far from the sensor, m; beyond, only surfaces are kept; '
+        '0: no space.',
+        low=0.0,
+        high=1e5,
     )
     forget_s: float = setting(
         10.0,
@@ -106,12 +89,6 @@ class TsdfConfig(Stage):
     )
     label_topic: str = setting(
         '', 'Topic of images of labels, 8 or 16 bits or 32SC1; empty: none.'
-    )
-    image_tolerance_s: float = setting(
-        0.02,
-        'An image belongs to a scan if their stamps differ by no more, s.',
-        low=0.0,
-        high=10.0,
     )
     semantics: str = setting(
         'none',
@@ -139,28 +116,6 @@ class TsdfConfig(Stage):
     voxels_per_side: int = 8
     """Voxels along the edge of a block, a power of two."""
 
-    max_difference_m: float = 0.2
-    """Adaptive: pixels that differ by more are not interpolated, m."""
-
-    min_measurement_weight: float = 1e-4
-    """Least weight of a measurement."""
-
-    max_weight: float = 1e5
-    """Largest weight of a voxel; the smaller, the faster it forgets: a measurement of weight w
-    then counts w / (max_weight + w)."""
-
-    max_ray_offset_voxels: float | None = None
-    """Lidar: if pixels are not interpolated, voxels farther than this from the ray of their
-    nearest pixel are not updated, in voxels; 0: no such limit. None: 0.4 by distance to_plane,
-    else 0.5."""
-
-    mesh_min_weight: float | None = None
-    """The mesh uses voxels of at least this weight. None: 0.2 with constant weights, else 1e-4."""
-
-    mesh_max_step_voxels: float | None = None
-    """The mesh has no faces where distances of neighbours across the surface differ by more, in
-    voxels; 0: no such limit. None: the truncation and 1.25 by distance to_plane, else no limit."""
-
     threads: int = 0
     """Threads; 0: one for each core that the process may use."""
 
@@ -171,8 +126,8 @@ class TsdfConfig(Stage):
             ('voxels_per_side', side & (side - 1) == 0, 'a power of two'),
             (
                 'truncation_m',
-                self.voxel_size_m < self.truncation_m,
-                f'more than {self.voxel_size_m}, a voxel',
+                self.truncation_m == 0.0 or self.voxel_size_m < self.truncation_m,
+                f'0, or more than {self.voxel_size_m}, a voxel',
             ),
             (
                 'max_range_m',
@@ -208,31 +163,19 @@ class TsdfConfig(Stage):
         return self.voxel_size_m * self.voxels_per_side
 
     @property
-    def ray_offset_voxels(self) -> float:
-        """Largest distance of a voxel from the ray of its pixel, in voxels; 0: any."""
-        if self.max_ray_offset_voxels is not None:
-            return self.max_ray_offset_voxels
-        return 0.4 if self.distance == 'to_plane' else 0.5
-
-    @property
-    def least_mesh_weight(self) -> float:
-        """Least weight of a voxel in the mesh; voxels behind a surface have little."""
-        if self.mesh_min_weight is not None:
-            return self.mesh_min_weight
-        return 0.2 if self.weight_mode == 'constant' else 1e-4
+    def tau_m(self) -> float:
+        """The truncation: as set, or chosen by voxel and noise."""
+        size_m = self.voxel_size_m
+        return self.truncation_m or min(2.0 * size_m + 3.0 * LIDAR_NOISE_M, 3.0 * size_m)
 
     @property
     def mesh_max_step_m(self) -> float:
         """
-        Largest difference of the distances of neighbouring voxels in the mesh, m; inf: any.
+        Largest difference of the distances of neighbouring voxels in the mesh, m.
 
-        By distance to_plane it leaves out faces along the shadows of poles and cars.
+        It leaves out faces between free space and the back of a surface, along shadows.
         """
-        if self.mesh_max_step_voxels is not None:
-            return self.mesh_max_step_voxels * self.voxel_size_m or math.inf
-        if self.distance != 'to_plane':
-            return math.inf
-        return self.truncation_m + 1.25 * self.voxel_size_m
+        return self.tau_m + 0.5 * self.voxel_size_m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -78,7 +78,13 @@ def tsdf_content(blocks: BlockMap) -> tuple[dict[str, npt.NDArray[Any]], dict[st
 
 def attributes_of(config: TsdfConfig) -> dict[str, Any]:
     """Return the attributes of the file of a map."""
-    return {'kind': KIND, 'tracking': False, **{name: getattr(config, name) for name in SHAPE}}
+    shape = {name: shape_value(config, name) for name in SHAPE}
+    return {'kind': KIND, 'tracking': False, **shape}
+
+
+def shape_value(config: TsdfConfig, name: str) -> Any:
+    """Return a setting that shapes the arrays; the truncation that holds if none is set."""
+    return config.tau_m if name == 'truncation_m' else getattr(config, name)
 
 
 def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
@@ -103,7 +109,7 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
     if attributes.get('kind') != KIND:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
     for name in SHAPE:
-        value, wanted = attributes.get(name), getattr(config, name)
+        value, wanted = attributes.get(name), shape_value(config, name)
         if value != wanted:
             raise FileFormatError(
                 f'{path}: {name} {value}, expected layers.tsdf.{name} = {wanted}'
@@ -133,7 +139,7 @@ def checked(blocks: BlockMap, arrays: dict[str, npt.NDArray[Any]]) -> Blocks:
     if (keys < 0).any() or len(np.unique(keys)) < count:
         raise ValueError('a block occurs twice, or is out of range')
     distance, weight = arrays['field'][:, 0], arrays['field'][:, 1]
-    limit = np.float32(blocks.config.truncation_m * (1.0 + 1e-6))
+    limit = np.float32(blocks.config.tau_m * (1.0 + 1e-6))
     if not (np.abs(distance) <= limit).all():
         raise ValueError('distances beyond the truncation')
     if not ((weight >= 0.0) & (weight < np.inf)).all():

@@ -24,7 +24,7 @@ from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.channels import quantised
 from surfel_mapper.poses.buffer import TransformBuffer
 from surfel_mapper.scan import Scan
-from surfel_mapper.tsdf.fitting import best_fit, fit_share, fitted_lidar, LEAST_FIT
+from surfel_mapper.tsdf.fitting import best_fit, fit_share, LEAST_FIT
 from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
@@ -85,7 +85,7 @@ class SensorModels:
     Parameters
     ----------
     config : TsdfConfig
-        Rows, columns and ranges of the sensors, as far as configured.
+        Ranges of the sensors, and the frame of the lidar.
     transforms : TransformBuffer, optional
         Tree of frames, in which ``sensor_frame`` is looked up.
 
@@ -138,6 +138,10 @@ class SensorModels:
         _, centered, T_scan_sensor = self._centered
         return centered, T_map_scan if T_scan_sensor is None else T_map_scan @ T_scan_sensor
 
+    def camera_of(self, scan: Scan) -> CameraModel | None:
+        """Return the camera of a scan; None for a cloud of another sensor."""
+        return self._camera(scan.camera) if scan.camera else None
+
     def of(self, scan: Scan) -> CameraModel | LidarModel | None:
         """
         Return the sensor of a scan: its camera, else the lidar of its frame; None if none fits.
@@ -147,23 +151,14 @@ class SensorModels:
         scan : Scan
             In the frame of its sensor, see centered.
 
-        Raises
-        ------
-        CloudFormatError
-            If rows are configured and the points do not span two beams.
-
         """
-        config = self._config
         if scan.camera:
             return self._camera(scan.camera)
         if self._checked[0] is not scan:  # several layers ask for the same scan
             if scan.frame_id not in self.frames and len(self.frames) >= MAX_LIDARS:
                 del self.frames[next(iter(self.frames))]
             frame = self.frames.setdefault(scan.frame_id, FrameModel())
-            if config.sensor_rows:
-                self._check_configured(frame, scan)
-            else:
-                self._check_fitted(frame, scan)
+            self._check_fitted(frame, scan)
             self._checked = scan, frame.model
         return self._checked[1]
 
@@ -217,31 +212,6 @@ class SensorModels:
     def _ranges(self) -> dict[str, Any]:
         return {'min_range_m': self._config.min_range_m, 'max_range_m': self._config.max_range_m}
 
-    def _check_configured(self, frame: FrameModel, scan: Scan) -> None:
-        """Make the configured model once; warn if scans do not fit it."""
-        if frame.model is None:
-            frame.model = self._configured(scan)
-            frame.share = self._share(frame.model, scan)
-            if frame.share < MISFIT:
-                logger.warning(
-                    'layers.tsdf.sensor_rows, sensor_columns: only %.0f %% of the points in %s '
-                    'fit this sensor; expected %.0f %%. Correct them, or leave them out to have '
-                    'the sensor fitted',
-                    *(100.0 * frame.share, scan.frame_id, 100.0 * LEAST_FIT),
-                )
-        else:
-            frame.share = self._share(frame.model, scan)
-
-    def _configured(self, scan: Scan) -> LidarModel:
-        """Return the model of the configured rows and columns, fitted to a scan."""
-        return fitted_lidar(
-            scan.points,
-            scan.columns.get('ring'),
-            rows=self._config.sensor_rows,
-            columns=self._config.sensor_columns,
-            **self._ranges,
-        )
-
     def _check_fitted(self, frame: FrameModel, scan: Scan) -> None:
         """Check the model of a frame on a scan; fit it again if the scan does not fit."""
         if frame.model is not None:
@@ -249,8 +219,8 @@ class SensorModels:
             if frame.share >= MISFIT:
                 return
             logger.warning(
-                'layers.tsdf: only %.0f %% of the points in %s fit the sensor of %d x %d rays; it '
-                'is fitted again',
+                'dynamic.clear: only %.0f %% of the points in %s fit the sensor of %d x %d rays; '
+                'it is fitted again',
                 *(100.0 * frame.share, scan.frame_id, frame.model.rows, frame.model.columns),
             )
             self.num_refits += 1
@@ -263,7 +233,6 @@ class SensorModels:
                 scan.points,
                 scan.columns.get('ring'),
                 self._config.voxel_size_m,
-                columns=self._config.sensor_columns,
                 **self._ranges,
             )
         except CloudFormatError:  # fewer than two beams: nothing to fit
@@ -271,9 +240,9 @@ class SensorModels:
         if frame.model is None:
             if frame.retry == FIRST_RETRY:
                 logger.warning(
-                    'layers.tsdf: no model of a lidar fits the points in %s (%.0f %% of them, '
-                    'expected %.0f %%): they are fused point by point, which is slower. For a '
-                    'single lidar set layers.tsdf.sensor_frame or sensor_rows',
+                    'dynamic.clear: no model of a lidar fits the points in %s (%.0f %% of them, '
+                    'expected %.0f %%): nothing is cleared by them. For a single lidar set '
+                    'layers.tsdf.sensor_frame',
                     *(scan.frame_id, 100.0 * frame.share, 100.0 * LEAST_FIT),
                 )
             frame.due, frame.retry = frame.retry, min(2 * frame.retry, LAST_RETRY)
@@ -292,8 +261,8 @@ def seen_from(T_scan_sensor: Transform, scan: Scan) -> Scan:
 
 
 def without_sensor(config: TsdfConfig) -> TsdfConfig:
-    """Return settings that say nothing about the sensor: any is fitted, about its origin."""
-    return replace(config, sensor_rows=0, sensor_columns=0, sensor_frame='')
+    """Return settings by which the sensor is at the origin of its points."""
+    return replace(config, sensor_frame='')
 
 
 def range_image(

@@ -198,6 +198,13 @@ class BlockArrays:
 MAX_DEPTH = 24
 """Largest depth of the hash table's directory: 2^24 entries, more than 64 million blocks."""
 
+SETTLED, RECHECK = 4, 8
+"""
+A block that was free in SETTLED measurements in a row is fused in one of RECHECK only.
+
+With a lidar of 10 Hz a block between the beams is complete after a second or two.
+"""
+
 MOST_FORGOTTEN = 16
 """A measurement forgets at most 1 / 4 of the half-life: a single false one makes no hole."""
 
@@ -373,6 +380,17 @@ class BlockMap(BlockArrays):
         shares = np.clip(since_s / forget_s, 0.0, 1.0 / MOST_FORGOTTEN)
         return np.asarray(1.0 - 2.0 ** (-4.0 * shares), np.float32)
 
+    def settled(self, rows: Int64) -> npt.NDArray[np.bool_]:
+        """
+        Return which blocks were free in the last measurements and need no fusion now, (K,).
+
+        One in RECHECK of them is fused all the same, in turn, so that voxels between the beams
+        become free too.
+        """
+        settled: npt.NDArray[np.bool_] = self.head[rows, FREE_VISITS] >= SETTLED
+        settled &= (rows + self.version) % RECHECK != 0
+        return settled
+
     def drop_new(self, rows: Int64) -> int:
         """Remove the blocks among rows that were placed but never touched; return their number."""
         rows = rows[rows >= 0]
@@ -388,7 +406,7 @@ class BlockMap(BlockArrays):
         """Return the rows of blocks changed since the flags were cleared."""
         return self.changed_since(self._settled)
 
-    def evict(self, position: npt.ArrayLike, stamp_ns: int) -> Blocks:
+    def evict(self, position: npt.ArrayLike) -> Blocks:
         """
         Remove the blocks outside of the window and return their content.
 
@@ -396,14 +414,11 @@ class BlockMap(BlockArrays):
         ----------
         position : (3,) float
             Centre of the window in the map frame, m.
-        stamp_ns : int
-            Current time, ns.
 
         Returns
         -------
         Blocks
-            Blocks whose centre is farther than max_radius_m or whose last change is older than
-            max_age_s, except those flagged as updated.
+            Blocks whose centre is farther than max_radius_m, except those flagged as updated.
 
         """
         config, rows = self.config, self.rows()
@@ -411,8 +426,6 @@ class BlockMap(BlockArrays):
         if config.max_radius_m > 0.0:
             centres = (self.index(rows) + 0.5) * config.block_size_m
             leaves |= np.linalg.norm(centres - np.asarray(position), axis=1) > config.max_radius_m
-        if config.max_age_s > 0.0:
-            leaves |= stamp_ns - self.head[rows, STAMP] > config.max_age_s * 1e9
         leaves &= self.head[rows, VERSION] <= self._settled
         return self.remove(rows[leaves])
 

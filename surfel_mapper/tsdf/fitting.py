@@ -7,7 +7,7 @@ Candidates for the beams are the median elevations of the rings, the clusters of
 and evenly spaced rows; the steps of azimuth follow from the angles between neighbouring points of
 a beam, so that a partial revolution gives the same model as a full one. ``fit_share`` measures a
 candidate on points: merged clouds, solid-state patterns and clouds given about another origin than
-the optical centre fit no candidate, and are fused point by point instead (point_integrator.py).
+the optical centre fit no candidate, and have no model.
 """
 
 from __future__ import annotations
@@ -92,17 +92,15 @@ class Angles:
         )
 
 
-def fitted_lidar(
+def candidates(
     points: npt.NDArray[Any],
     ring: npt.NDArray[Any] | None = None,
     *,
-    rows: int = 0,
-    columns: int = 0,
     min_range_m: float,
     max_range_m: float,
-) -> LidarModel:
+) -> list[LidarModel]:
     """
-    Return the first candidate for the lidar, with a full circle, that measured these points.
+    Return the candidates for the lidar of a scan, with a full circle, the most certain first.
 
     Parameters
     ----------
@@ -110,8 +108,6 @@ def fitted_lidar(
         In the frame of the sensor, m; nan for no return.
     ring : (N,) int, optional
         Beam number of each point.
-    rows, columns : int
-        Beams and azimuth steps; 0 means fitted.
     min_range_m, max_range_m : float
         As in LidarModel.
 
@@ -121,26 +117,6 @@ def fitted_lidar(
         If the elevations of the points do not span two beams.
 
     """
-    return candidates(
-        points,
-        ring,
-        rows=rows,
-        columns=columns,
-        min_range_m=min_range_m,
-        max_range_m=max_range_m,
-    )[0]
-
-
-def candidates(
-    points: npt.NDArray[Any],
-    ring: npt.NDArray[Any] | None = None,
-    *,
-    rows: int = 0,
-    columns: int = 0,
-    min_range_m: float,
-    max_range_m: float,
-) -> list[LidarModel]:
-    """Return the candidates for a lidar, the most certain first; arguments as fitted_lidar."""
     angles = Angles.of(points, ring)
     elevations = angles.elevation
     if len(elevations) < 2 or np.ptp(elevations) < 1e-3:
@@ -152,14 +128,13 @@ def candidates(
     ranges: dict[str, Any] = {'min_range_m': min_range_m, 'max_range_m': max_range_m}
     models = []
     tables = []
-    if not rows and angles.ring is not None:
+    if angles.ring is not None:
         tables.append(beam_elevations(elevations, angles.ring))
-    if not rows:
-        far = angles.range_m >= np.median(angles.range_m)
-        tables += [clustered_elevations(values) for values in (elevations, elevations[far])]
+    far = angles.range_m >= np.median(angles.range_m)
+    tables += [clustered_elevations(values) for values in (elevations, elevations[far])]
     for beams in tables:
         if 1 < len(beams) <= MAX_ROWS:
-            steps = columns or azimuth_steps(angles, nearest_beam(elevations, beams))
+            steps = azimuth_steps(angles, nearest_beam(elevations, beams))
             models.append(
                 LidarModel(
                     rows=len(beams),
@@ -169,13 +144,12 @@ def candidates(
                     **ranges,
                 )
             )
-    rows = rows or USUAL_ROWS
     low, high = float(elevations.min()), float(elevations.max())
-    even: Float64 = np.asarray(np.linspace(high, low, rows), np.float64)
-    steps = columns or azimuth_steps(angles, nearest_beam(elevations, even))
+    even: Float64 = np.asarray(np.linspace(high, low, USUAL_ROWS), np.float64)
+    steps = azimuth_steps(angles, nearest_beam(elevations, even))
     models.append(
         LidarModel(
-            rows=rows,
+            rows=USUAL_ROWS,
             columns=steps,
             first_azimuth_deg=first_azimuth(angles, steps),
             vertical_fov_deg=high - low,
@@ -198,11 +172,11 @@ def best_fit(
     Parameters
     ----------
     points, ring
-        As fitted_lidar.
+        As candidates.
     voxel_size_m : float
         Edge of a voxel.
     properties
-        Rows, columns and ranges, as fitted_lidar.
+        Ranges, as candidates.
 
     Raises
     ------

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from surfel_mapper.arguments import as_array, as_numbers
 from surfel_mapper.config import TsdfConfig
+from surfel_mapper.config.layers import MAX_LABEL
 from surfel_mapper.errors import CloudFormatError, PoseError
 from surfel_mapper.tsdf.kernels import lookup as kernels
 
@@ -29,8 +30,22 @@ Largest entries of R R^T - I: of rotations taken as they are, and of those taken
 Rotations in text files of public datasets have determinants down to 0.9995.
 """
 
-POWERS = {'constant': 0, 'inverse_square': 1}
-"""Exponent p of each weight mode: weights are proportional to depth^(-2 p)."""
+LEAST_WEIGHT = 1e-4
+"""Least weight of a measurement, and of a voxel in the mesh; at 1 m a measurement has 1."""
+
+MAX_WEIGHT = 1e5
+"""Largest weight of a voxel."""
+
+
+def warn_of_short_truncation(config: TsdfConfig) -> None:
+    """Warn if the truncation leaves holes."""
+    if config.tau_m < 2.0 * config.voxel_size_m:
+        logger.warning(
+            'layers.tsdf.truncation_m: %g m is less than two voxels of %g m; surfaces may have '
+            'holes',
+            config.tau_m,
+            config.voxel_size_m,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,14 +78,14 @@ class Integrated:
 def settings(config: TsdfConfig) -> Float32:
     """Return the settings that any integration needs, in the order of kernels/lookup.py."""
     values = np.zeros(kernels.NUM_SETTINGS, np.float32)
-    values[kernels.TAU] = config.truncation_m
+    values[kernels.TAU] = config.tau_m
     values[kernels.MIN_RANGE] = config.min_range_m
     values[kernels.MAX_RANGE] = config.max_range_m
     values[kernels.DROPOFF] = config.voxel_size_m
-    values[kernels.MIN_WEIGHT] = config.min_measurement_weight
-    values[kernels.MAX_WEIGHT] = config.max_weight
+    values[kernels.MIN_WEIGHT] = LEAST_WEIGHT
+    values[kernels.MAX_WEIGHT] = MAX_WEIGHT
     values[kernels.CONTRADICTS] = 0.5 * config.voxel_size_m
-    values[kernels.LEAST] = max(config.least_mesh_weight, 1e-30)
+    values[kernels.LEAST] = LEAST_WEIGHT
     return values
 
 
@@ -101,6 +116,17 @@ def checked_column(
         expected = f'{kind.__name__} {" or ".join(map(str, shapes))}, one for each point'
         raise CloudFormatError(f'{name}: {array.dtype} {array.shape}, expected {expected}')
     return array
+
+
+def checked_labels(name: str, labels: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    """Return labels as int32; raise CloudFormatError if they are not whole or out of range."""
+    ends = labels.min(initial=-1), labels.max(initial=-1)
+    if labels.dtype.kind not in 'iu' or not -1 <= ends[0] <= ends[1] <= MAX_LABEL:
+        raise CloudFormatError(
+            f'{name}: {labels.dtype} from {ends[0]} to {ends[1]}, expected whole numbers from -1 '
+            f'to {MAX_LABEL}'
+        )
+    return labels.astype(np.int32, copy=False)
 
 
 @cache

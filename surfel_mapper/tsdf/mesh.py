@@ -24,6 +24,7 @@ from surfel_mapper.kernels.layout import KEY
 from surfel_mapper.tsdf.blocks import block_index, BlockMap, copied_rows, UPPER
 from surfel_mapper.tsdf.kernels.blocks import INSIDE
 from surfel_mapper.tsdf.kernels.marching_cubes import describe, find_cases, march
+from surfel_mapper.tsdf.measurements import LEAST_WEIGHT
 from surfel_mapper.tsdf.queries import labels_of
 
 Float32 = npt.NDArray[np.float32]
@@ -256,9 +257,8 @@ class Mesher:
 
     def _marched(self, changes: Changes) -> list[BlockMesh | None]:
         """Run marching cubes over blocks and return their meshes; None without triangles."""
-        config = self._blocks.config
         bits = np.empty((len(changes.field), changes.field.shape[2]), np.uint8)
-        describe(changes.field, config.least_mesh_weight, bits)
+        describe(changes.field, LEAST_WEIGHT, bits)
         meshes: list[BlockMesh | None] = []
         for first in range(0, len(changes.keys), BATCH):
             batch = slice(first, first + BATCH)

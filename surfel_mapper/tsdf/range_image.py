@@ -17,14 +17,10 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.tsdf.kernels import range_image as kernels
-from surfel_mapper.tsdf.sensors import CameraModel, LidarModel, Sensor
+from surfel_mapper.tsdf.measurements import checked_labels
+from surfel_mapper.tsdf.sensors import CameraModel, Sensor
 
 Float32 = npt.NDArray[np.float32]
-
-MAX_LABEL = (1 << 24) - 1
-"""Largest label: labels are stored as float32, exact up to 2^24."""
-
-LEAST_COSINE = float(kernels.LEAST_COSINE)
 
 CLEARING_M = 2e3
 """A clearing pixel holds max_range_m plus this, which is more than any truncation."""
@@ -37,7 +33,7 @@ NO_DEPTH_MM = 65535.0
 @dataclass(frozen=True, kw_only=True)
 class RangeImage:
     """
-    Ranges in the pixels of a sensor, with optional colours, labels, mask and cosines.
+    Ranges in the pixels of a sensor, with optional colours, labels and mask.
 
     Attributes
     ----------
@@ -55,8 +51,6 @@ class RangeImage:
         -1 means unknown.
     mask : (rows, columns or one more) uint8, optional
         1 for pixels that only free space, for example of moving objects.
-    cosine : (rows, columns or one more) float32, optional
-        Cosine of the angle of incidence of each ray.
 
     """
 
@@ -67,7 +61,6 @@ class RangeImage:
     color: npt.NDArray[np.uint8] | None = None
     label: npt.NDArray[np.int32] | None = None
     mask: npt.NDArray[np.uint8] | None = None
-    cosine: Float32 | None = None
 
     def with_images(
         self,
@@ -103,47 +96,10 @@ class RangeImage:
                 raise CloudFormatError(f'color: {more["color"].dtype}, expected uint8')
         if label is not None:
             image = self._fitted('label', np.asarray(label), ())
-            if image.dtype.kind not in 'iu' or not -1 <= image.min() <= image.max() <= MAX_LABEL:
-                raise CloudFormatError(
-                    f'label: {image.dtype} from {image.min()} to {image.max()}, expected whole '
-                    f'numbers from -1 to {MAX_LABEL}'
-                )
-            more['label'] = image.astype(np.int32, copy=False)
+            more['label'] = checked_labels('label', image)
         if mask is not None:
             more['mask'] = (self._fitted('mask', np.asarray(mask), ()) != 0).astype(np.uint8)
         return replace(self, **more)
-
-    def with_cosines(self, reach_m: float) -> RangeImage:
-        """Return a copy with cosines, from slopes between points about reach_m apart."""
-        cosine = np.empty_like(self.range_m)
-        sensor = self.sensor
-        kernels.cosines(
-            self.range_m,
-            sensor.directions,
-            sensor.pitch_rad,
-            reach_m,
-            np.float32(sensor.max_range_m),
-            cosine,
-        )
-        return replace(self, cosine=cosine)
-
-    def thin(self, step_m: float, widest_m: float) -> npt.NDArray[np.bool_]:
-        """
-        Return which pixels of a lidar are on objects narrower than widest_m, (rows, columns).
-
-        These are the runs of pixels of a row, up to step_m apart from one to the next, between
-        farther or unknown ones. Masked pixels do not count, nor do those of cameras, whose ranges
-        are wrong at edges.
-        """
-        sensor = self.sensor
-        thin = np.zeros((sensor.rows, sensor.columns), bool)
-        if isinstance(sensor, LidarModel):
-            level = np.cos(sensor.elevations_rad) * sensor.pitch_rad[1]
-            farthest = np.float32(sensor.max_range_m)
-            kernels.find_thin(self.range_m, level, step_m, widest_m, farthest, thin)
-        if self.mask is not None:
-            thin &= self.mask[:, : sensor.columns] == 0
-        return thin
 
     def _fitted(
         self, name: str, image: npt.NDArray[Any], channels: tuple[int, ...]

@@ -22,21 +22,17 @@ from surfel_mapper.tsdf.kernels.block_marks import (
     look_up_marks,
     mark_rays,
 )
-from surfel_mapper.tsdf.kernels.point_fusion import mark_corners
-from surfel_mapper.tsdf.range_image import LEAST_COSINE, RangeImage
-from surfel_mapper.tsdf.sensors import Sensor
+from surfel_mapper.tsdf.range_image import RangeImage
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-NO_COSINE = np.empty((0, 0), np.float32)
-
 MAX_SIDE = 2048
 """Largest side of the cube about the sensor, blocks: 1 GiB of bits in each row of marks."""
 
-TOUCHED, NEAR, ABOUT = range(3)
-"""Rows of marks: blocks that rays touch, those in the band, those about thin objects."""
+TOUCHED, NEAR = range(2)
+"""Rows of marks: blocks that rays touch, and those in the band."""
 
 NO_BLOCKS: Int64 = np.empty((0, 3), np.int64)
 
@@ -55,14 +51,11 @@ class Selected:
         The blocks, ascending.
     near : (K,) bool
         False for blocks that rays only pass through; True for all if nothing is carved.
-    thin : (L, 3) int64
-        Those of the blocks that hold voxels about points of thin objects.
 
     """
 
     index: Int64
     near: Flags
-    thin: Int64
 
 
 class BlockSelection:
@@ -78,11 +71,9 @@ class BlockSelection:
 
     def __init__(self, config: TsdfConfig) -> None:
         self._config = config
-        self._marks = np.zeros((3, 0), np.int64)
+        self._marks = np.zeros((2, 0), np.int64)
 
-    def blocks(
-        self, image: RangeImage, T_map_sensor: Float64, thin: Float64 | None = None
-    ) -> Selected:
+    def blocks(self, image: RangeImage, T_map_sensor: Float64) -> Selected:
         """
         Return the blocks that a range image updates.
 
@@ -92,8 +83,6 @@ class BlockSelection:
             The measurement.
         T_map_sensor : (4, 4) float64
             Pose of the sensor in the map frame.
-        thin : (P, 3) float64, optional
-            Points of thin objects, map frame, in voxels; the voxels about them are updated too.
 
         Raises
         ------
@@ -104,7 +93,7 @@ class BlockSelection:
         config = self._config
         half = half_side(config, image)
         if half == 0:
-            return Selected(index=NO_BLOCKS, near=np.empty(0, bool), thin=NO_BLOCKS)
+            return Selected(index=NO_BLOCKS, near=np.empty(0, bool))
         side = 2 * half + 1
         if side > MAX_SIDE:
             raise MapLimitError(
@@ -115,42 +104,24 @@ class BlockSelection:
         pose = T_map_sensor[:3] / config.block_size_m
         low = np.floor(pose[:, 3]).astype(np.int64) - half
         marks = self._marked(image, pose, low, side)
-        around = NO_BLOCKS
-        if thin is not None and len(thin):
-            around = self._about(thin, image.sensor, T_map_sensor, low, side)
         index = listed(marks[TOUCHED], low, side)
         near = np.ones(len(index), bool)
-        if config.carve:
+        if config.carve_m > 0.0:
             look_up_marks(marks[NEAR], side, low, index, near)
-        return Selected(index=index, near=near, thin=around)
+        return Selected(index=index, near=near)
 
     def _marked(self, image: RangeImage, pose: Float64, low: Int64, side: int) -> Int64:
-        """Return the marks of blocks that rays touch, and of those in the band, (3, words)."""
+        """Return the marks of blocks that rays touch, and of those in the band, (2, words)."""
         config, num_words = self._config, side**3 // 64 + 1
         if self._marks.shape[1] < num_words:
-            self._marks = np.zeros((3, num_words), np.int64)
+            self._marks = np.zeros((2, num_words), np.int64)
         marks = self._marks[:, :num_words]
         marks[NEAR] = 0
         local = np.column_stack([pose[:, :3], pose[:, 3] - low])
-        cosine = NO_COSINE if image.cosine is None else image.cosine
-        near = marks[NEAR] if config.carve else marks[NEAR, :0]
+        near = marks[NEAR] if config.carve_m > 0.0 else marks[NEAR, :0]
         directions, limits = image.sensor.directions, reach(config, image)
-        mark_rays(image.range_m, cosine, directions, local, limits, side, marks[TOUCHED], near)
+        mark_rays(image.range_m, directions, local, limits, side, marks[TOUCHED], near)
         return marks
-
-    def _about(
-        self, thin: Float64, sensor: Sensor, T_map_sensor: Float64, low: Int64, side: int
-    ) -> Int64:
-        """Mark the blocks of the voxels about points, as touched and near; return them."""
-        config = self._config
-        marks = self._marks[:, : side**3 // 64 + 1]
-        bits = config.voxels_per_side.bit_length() - 1
-        origin = T_map_sensor[:3, 3] / config.voxel_size_m
-        limits = sensor.min_range_m / config.voxel_size_m, sensor.max_range_m / config.voxel_size_m
-        mark_corners(thin, origin, low, side, bits, limits, marks[ABOUT])
-        marks[TOUCHED] |= marks[ABOUT]
-        marks[NEAR] |= marks[ABOUT]
-        return listed(marks[ABOUT], low, side)
 
 
 def listed(marks: Int64, low: Int64, side: int) -> Int64:
@@ -160,17 +131,11 @@ def listed(marks: Int64, low: Int64, side: int) -> Int64:
     return index
 
 
-def reach_behind_m(config: TsdfConfig, image: RangeImage) -> float:
-    """Return the distance behind a surface up to which voxels change, along the ray, m."""
-    longer = 1.0 if image.cosine is None else 1.0 / LEAST_COSINE
-    return config.truncation_m * longer
-
-
 def half_side(config: TsdfConfig, image: RangeImage) -> int:
     """Return the reach of an image in blocks; 0 for an image without ranges."""
     if image.largest_m == 0.0:
         return 0
-    return int((image.largest_m + reach_behind_m(config, image)) / config.block_size_m) + 2
+    return int((image.largest_m + config.tau_m) / config.block_size_m) + 2
 
 
 def reach(config: TsdfConfig, image: RangeImage) -> Float64:
@@ -178,5 +143,5 @@ def reach(config: TsdfConfig, image: RangeImage) -> Float64:
     sensor = image.sensor
     free = [config.block_size_m / 8.0 / pitch for pitch in sensor.pitch_rad]
     band = [SPACING_VOXELS * config.voxel_size_m / pitch for pitch in sensor.pitch_rad]
-    ends = [config.truncation_m, config.truncation_m, sensor.min_range_m, sensor.max_range_m]
-    return np.array([*ends, float(config.carve), *free, *band])
+    ends = [config.tau_m, config.tau_m, sensor.min_range_m, sensor.max_range_m]
+    return np.array([*ends, float(config.carve_m > 0.0), *free, *band])

@@ -132,11 +132,6 @@ class CameraModel:
         )
 
     @property
-    def row_gaps_rad(self) -> Float32:
-        """Empty: the angles between the rows of a camera are not constant."""
-        return np.zeros(0, np.float32)
-
-    @property
     def projection(self) -> tuple[Any, ...]:
         """Kind, parameters and no elevations, the form that kernels take."""
         return self.kind, self.parameters, NO_ELEVATIONS
@@ -245,12 +240,6 @@ class LidarModel:
         top = self.vertical_fov_top_deg
         beams = np.linspace(top, top - self.vertical_fov_deg, self.rows, dtype=np.float64)
         return np.asarray(np.deg2rad(beams), np.float64)
-
-    @cached_property
-    def row_gaps_rad(self) -> Float32:
-        """Angle between each row and the next, (rows - 1,)."""
-        gaps: Float32 = -np.diff(self.elevations_rad).astype(np.float32)
-        return gaps
 
     @cached_property
     def elevations(self) -> Float32:

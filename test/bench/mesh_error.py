@@ -15,6 +15,8 @@ FloatArray = npt.NDArray[np.float64]
 
 MAX_SAMPLES = 400_000
 
+MAX_JUDGES = 40_000
+
 NEAREST = 4
 """Number of nearest samples whose triangles are compared with a true point."""
 
@@ -66,6 +68,54 @@ def mesh_error(
         'accuracy_mm': float(off.mean()) * 1e3,
         'complete_mm': float(missing.mean()) * 1e3,
         'f_score': 2.0 * precision * recall / max(precision + recall, 1e-9),
+    }
+
+
+def point_error(
+    vertices: npt.NDArray[Any],
+    triangles: npt.NDArray[Any],
+    points: FloatArray,
+    voxel_size_m: float,
+) -> dict[str, float]:
+    """
+    Return errors of a mesh by points that were measured, but not fused.
+
+    Parameters
+    ----------
+    vertices, triangles
+        Of the mesh, as mesh_error.
+    points : (N, 3) float64, m
+        The points.
+    voxel_size_m : float
+        Edge of a voxel.
+
+    Returns
+    -------
+    dict
+        median_mm: distance of points from the mesh; recall: share within 1.5 voxels; area_m2: of
+        the mesh; empty: share of it without a point within 1.5 voxels.
+
+    Raises
+    ------
+    RuntimeError
+        If the mesh is empty.
+
+    """
+    if not len(triangles):
+        raise RuntimeError('the mesh is empty')
+    corners = np.asarray(vertices, np.float64)[triangles]
+    rng = np.random.default_rng(0)
+    judges = points[rng.choice(len(points), min(len(points), MAX_JUDGES), replace=False)]
+    off = distances_to_mesh(judges, corners, voxel_size_m)
+    samples, _ = spread_over(corners, voxel_size_m / 3.0)
+    reach_m = 1.5 * voxel_size_m
+    nearest, _ = cKDTree(points).query(samples, distance_upper_bound=reach_m)
+    sides = corners[:, 1:] - corners[:, :1]
+    return {
+        'median_mm': float(np.median(off)) * 1e3,
+        'recall': float((off < reach_m).mean()),
+        'area_m2': float(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum()) / 2.0,
+        'empty': float(np.isinf(nearest).mean()),
     }
 
 

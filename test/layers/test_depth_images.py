@@ -94,7 +94,7 @@ def test_infinite_depth_frees_space_up_to_the_range_and_nan_none():
     depth = np.full((60, 80), np.nan, np.float32)
     depth[:, 40:] = np.inf
     depth[30, 5] = 2.0
-    settings = {'layers.tsdf.carve': True, 'layers.tsdf.max_range_m': 3.0}
+    settings = {'layers.tsdf.carve_m': 20.0, 'layers.tsdf.max_range_m': 3.0}
     mapper = Mapper(
         Config.from_mapping(
             {
@@ -136,7 +136,7 @@ def test_map_sums_the_colours_of_the_image():
 
 
 def test_map_with_colours_drops_depth_images_without():
-    mapper = mapper_with(**{'map.color': True, 'layers.tsdf.image_tolerance_s': 0.01})
+    mapper = mapper_with(**{'map.color': True})
     mapper.add_scan(scan_of(steps_mm()))
     mapper.end_images()
     assert mapped(mapper) == []

@@ -15,13 +15,11 @@ LIDAR = LidarModel(rows=64, columns=360, vertical_fov_deg=60.0)
 SPHERE = 2.0 * LIDAR.directions.reshape(-1, 3)
 
 
-@pytest.mark.parametrize('sensor', [LIDAR, None], ids=['range image', 'point by point'])
-def test_field_of_a_sphere_has_its_distances_gradients_colours_and_labels(sensor):
+def test_field_of_a_sphere_has_its_distances_gradients_colours_and_labels():
     field = DistanceField(CONFIG)
     done = field.add(
         SPHERE,
         np.eye(4),
-        sensor=sensor,
         colors=np.tile(np.array([10, 20, 30], np.uint8), (len(SPHERE), 1)),
         labels=np.full(len(SPHERE), 3),
     )
@@ -49,3 +47,8 @@ def test_depth_image_is_fused_with_its_colours():
     mesh = field.mesh()
     assert np.abs(mesh.vertices[:, 2] - 1.55).max() < 1e-3
     assert (mesh.colors == 77).all()
+
+
+def test_the_model_of_a_lidar_is_refused_because_points_need_none():
+    with pytest.raises(TypeError, match='sensor: a LidarModel, expected a CameraModel'):
+        DistanceField(CONFIG).add(SPHERE, np.eye(4), sensor=LIDAR)

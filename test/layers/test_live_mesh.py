@@ -15,7 +15,7 @@ from surfel_mapper.tsdf.queries import sample
 from test.tsdf.scenes import image_of, sphere, VLP16
 
 VOXEL_M = 0.2
-SETTINGS = dict(voxel_size_m=VOXEL_M, truncation_m=0.6, carve=True, weight_mode='constant')
+SETTINGS = dict(voxel_size_m=VOXEL_M, truncation_m=0.6, carve_m=20.0)
 
 
 def scans(number):

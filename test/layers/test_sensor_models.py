@@ -48,7 +48,7 @@ def test_frame_without_a_model_is_tried_again_and_warned_of_once(caplog):
     with caplog.at_level(logging.WARNING):
         for seed in range(4):
             assert sensors.of(scan_of(scattered(seed))) is None
-    assert caplog.text.count('fused point by point') == 1
+    assert caplog.text.count('no model of a lidar fits') == 1
     found = [sensors.of(scan_of(wall_around(FIRST))) for _ in range(4 * FIRST_RETRY)]
     assert found[-1] is not None
 
@@ -59,12 +59,3 @@ def test_layers_that_share_a_scan_share_its_check():
     due = sensors.frames['lidar'].due
     sensors.of(scan)
     assert sensors.frames['lidar'].due == due
-
-
-def test_configured_rows_are_used_and_checked(caplog):
-    given = SensorModels(config(sensor_rows=64))
-    assert given.of(scan_of(wall_around(FIRST))).rows == 64
-    assert caplog.text == ''
-    wrong = SensorModels(config(sensor_rows=16))
-    assert wrong.of(scan_of(scattered())).rows == 16
-    assert 'fit this sensor' in caplog.text

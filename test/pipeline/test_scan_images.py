@@ -131,7 +131,7 @@ def test_points_of_a_lidar_are_coloured_where_a_camera_sees_them_and_only_there(
     known = color[:, 3] > 0
     assert 0.01 < known.mean() < 0.5
     # No voxel mixes a colour with none: that would be dark.
-    assert color[:, :3].max(axis=1)[known].min() > 150.0
+    assert color[:, :3].sum(axis=1)[known].min() > 150.0
 
 
 def test_a_cloud_with_colours_of_its_own_waits_for_no_image():

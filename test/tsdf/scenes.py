@@ -7,6 +7,7 @@ import numpy as np
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
+from surfel_mapper.tsdf.measurements import LEAST_WEIGHT
 from surfel_mapper.tsdf.range_image import from_ranges
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
@@ -70,7 +71,7 @@ def zero_crossings(blocks):
         part = tuple(slice(b, b + m) for b in block)
         D[part] = blocks.distance[row].reshape(m, m, m).T
         W[part] = blocks.weight[row].reshape(m, m, m).T
-    least = np.float32(config.least_mesh_weight)  # as weights are
+    least = np.float32(LEAST_WEIGHT)  # as weights are
     seen = least <= W
     cube = np.ones(np.array(shape) - 1, bool)
     for corner in np.ndindex(2, 2, 2):

@@ -120,37 +120,22 @@ def left_along_x(blocks):
 
 def test_blocks_leave_whose_centre_is_beyond_the_radius():
     blocks = filled_along_x(max_radius_m=2.2)
-    removed = blocks.evict([0.5, 0.5, 0.5], 0)
+    removed = blocks.evict([0.5, 0.5, 0.5])
     assert left_along_x(blocks) == [-2, -1, 0, 1, 2]
     assert sorted(removed.index[:, 0]) == [-5, -4, -3, 3, 4, 5]
     assert (blocks.find(removed.index) == -1).all()
-    assert len(blocks.evict([0.5, 0.5, 0.5], 0)) == 0
-
-
-def test_blocks_leave_that_have_not_changed_for_long():
-    blocks = filled_along_x(max_age_s=25.0)
-    removed = blocks.evict([0.0, 0.0, 0.0], 100 * 10**9)
-    assert left_along_x(blocks) == [3, 4, 5]
-    assert sorted(removed.stamp_ns // 10**9) == list(range(0, 80, 10))
-
-
-def test_either_limit_removes_and_none_keeps_all():
-    blocks = filled_along_x(max_radius_m=3.2, max_age_s=25.0)
-    blocks.evict([0.5, 0.5, 0.5], 100 * 10**9)
-    assert left_along_x(blocks) == [3]
-    blocks = filled_along_x()
-    assert len(blocks.evict([1e6, 0.0, 0.0], 2**62)) == 0
+    assert len(blocks.evict([0.5, 0.5, 0.5])) == 0
 
 
 def test_blocks_flagged_updated_stay_until_the_flag_is_cleared():
     blocks = filled_along_x(max_radius_m=2.2)
     blocks.touch(blocks.find([[5, 0, 0], [-5, 0, 0]]), 0)
     assert sorted(blocks.index(blocks.updated())[:, 0]) == [-5, 5]
-    blocks.evict([0.5, 0.5, 0.5], 0)
+    blocks.evict([0.5, 0.5, 0.5])
     assert left_along_x(blocks) == [-5, -2, -1, 0, 1, 2, 5]
     blocks.clear_updated()
     assert len(blocks.updated()) == 0
-    assert len(blocks.evict([0.5, 0.5, 0.5], 0)) == 2
+    assert len(blocks.evict([0.5, 0.5, 0.5])) == 2
     assert left_along_x(blocks) == [-2, -1, 0, 1, 2]
 
 
@@ -164,7 +149,7 @@ def drive(max_radius_m):
     for number in range(5):
         result = one.integrate(image, T, number)
         one.blocks.clear_updated()
-        gone = one.blocks.evict(T[:3, 3], number)
+        gone = one.blocks.evict(T[:3, 3])
         if number:
             added, removed = added + result.num_added, removed + len(gone)
     return added, removed

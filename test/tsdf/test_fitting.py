@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.tsdf.fitting import best_fit, fit_share, fitted_lidar, LEAST_FIT
+from surfel_mapper.tsdf.fitting import best_fit, candidates, fit_share, LEAST_FIT
 from surfel_mapper.tsdf.sensors import LidarModel
 
 RANGES = {'min_range_m': 0.5, 'max_range_m': 40.0}
@@ -25,32 +25,18 @@ def points_of(lidar, seed=0, keep=0.8):
 def test_with_rings_every_beam_gets_its_elevation():
     beams = (12.0, 7.5, 4.0, 1.0, -0.5, -3.0, -9.0, -20.0)
     points, ring = points_of(LidarModel(rows=8, columns=256, beam_elevations_deg=beams))
-    found = fitted_lidar(points, ring, **RANGES)
+    found = candidates(points, ring, **RANGES)[0]
     assert (found.rows, found.columns) == (8, 256)
     assert np.abs(np.subtract(found.beam_elevations_deg, beams)).max() <= 1e-4
     assert (found.min_range_m, found.max_range_m) == (0.5, 40.0)
 
 
-def test_without_rings_the_beams_are_evenly_spaced():
-    points, _ = points_of(LidarModel(rows=16, columns=300, vertical_fov_deg=30.0))
-    found = fitted_lidar(points, rows=16, **RANGES)
-    assert (found.rows, found.columns) == (16, 300)
-    assert np.abs(np.degrees(found.elevations_rad) - np.linspace(15.0, -15.0, 16)).max() <= 1e-4
-
-
-def test_given_rows_and_columns_are_not_fitted():
-    points, ring = points_of(LidarModel(rows=16, columns=300, vertical_fov_deg=30.0))
-    found = fitted_lidar(points, ring, rows=32, columns=512, **RANGES)
-    assert (found.rows, found.columns, found.beam_elevations_deg) == (32, 512, ())
-    assert fitted_lidar(points, ring, columns=512, **RANGES).columns == 512
-
-
 def test_rings_of_one_elevation_are_one_beam():
     points, _ = points_of(LidarModel(rows=2, columns=64, vertical_fov_deg=10.0))
-    found = fitted_lidar(points, np.arange(128) // 32, **RANGES)
+    found = candidates(points, np.arange(128) // 32, **RANGES)[0]
     assert found.rows == 2
     # without usable rings the clusters of elevations are the beams
-    assert fitted_lidar(points, np.zeros(128, int), **RANGES).rows == 2
+    assert candidates(points, np.zeros(128, int), **RANGES)[0].rows == 2
 
 
 @pytest.mark.parametrize(
@@ -65,7 +51,7 @@ def test_rings_of_one_elevation_are_one_beam():
 )
 def test_points_without_two_beams_are_refused(points):
     with pytest.raises(CloudFormatError, match='expected those of a lidar with two beams'):
-        fitted_lidar(points, **RANGES)
+        candidates(points, **RANGES)[0]
 
 
 def test_points_overhead_and_of_any_size_do_not_count():
@@ -75,33 +61,32 @@ def test_points_overhead_and_of_any_size_do_not_count():
     odd += [[np.nan, 1.0, 1.0], [np.inf, -np.inf, 1.0]]
     limits = {'min_range_m': 0.5, 'max_range_m': 20.0}
 
-    assert fitted_lidar(np.vstack([points, odd]), **limits) == fitted_lidar(points, **limits)
+    assert candidates(np.vstack([points, odd]), **limits)[0] == candidates(points, **limits)[0]
     with pytest.raises(CloudFormatError, match='two beams or more'):
-        fitted_lidar(np.array(odd), **limits)
+        candidates(np.array(odd), **limits)[0]
 
 
 def test_beams_without_rings_are_the_clusters_of_elevations():
     beams = (12.0, 7.5, 4.0, 1.0, -0.5, -3.0, -9.0, -20.0)
     points, _ = points_of(LidarModel(rows=8, columns=256, beam_elevations_deg=beams))
-    found = fitted_lidar(points, **RANGES)
+    found = candidates(points, **RANGES)[0]
     assert (found.rows, found.columns) == (8, 256)
     assert np.abs(np.subtract(found.beam_elevations_deg, beams)).max() <= 1e-4
 
 
 @pytest.mark.parametrize('share', [-0.4, 0.0, 0.3])
-@pytest.mark.parametrize('rows', [0, 16])
-def test_columns_go_through_the_points(share, rows):
+def test_columns_go_through_the_points(share):
     step = 360.0 / 1024
     first = 180.0 + share * step
     true = LidarModel(
         rows=16, columns=1024, vertical_fov_deg=30.0, first_azimuth_deg=first, max_range_m=40.0
     )
     points, ring = points_of(true)
-    found = fitted_lidar(points, None if rows else ring, rows=rows, **RANGES)
+    found = candidates(points, ring, **RANGES)[0]
     assert found.columns == 1024
     assert found.first_azimuth_deg == pytest.approx(first, abs=1e-3 * step)
     part = np.arctan2(points[:, 1], points[:, 0]) > 2.0
-    found = fitted_lidar(points[part], None if rows else ring[part], rows=rows, **RANGES)
+    found = candidates(points[part], ring[part], **RANGES)[0]
     assert found.first_azimuth_deg == pytest.approx(first, abs=1e-3 * step)
 
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """T5 to T8, T12, T13, T17: one and several integrations; refused input."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,11 +11,9 @@ from scipy.spatial.transform import Rotation
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import ConfigError, MapLimitError, PoseError
 from surfel_mapper.tsdf.measurements import warn_of_skew
-from surfel_mapper.tsdf.sensors import LidarModel
 from test.tsdf.scenes import fused, image_of, integrator, SMALL, zero_crossings
 
 SIZES = dict(voxel_size_m=0.1, truncation_m=0.3)
-LIDAR = LidarModel(rows=32, columns=256, vertical_fov_deg=60.0, max_range_m=10.0)
 
 
 def wall(sensor, range_m, **images):
@@ -29,8 +29,9 @@ def field(one):
 
 
 def test_a_scan_again_changes_nothing_but_the_weight_up_to_its_cap(monkeypatch):
-    monkeypatch.setattr('surfel_mapper.tsdf.integrator.SETTLED', 10**9)  # free blocks too
-    one, cap = integrator(**SIZES, weight_mode='constant', max_weight=4.5), 4.5
+    monkeypatch.setattr('surfel_mapper.tsdf.blocks.SETTLED', 10**9)  # free blocks too
+    monkeypatch.setattr('surfel_mapper.tsdf.measurements.MAX_WEIGHT', 1.2)
+    one, cap = integrator(**SIZES), 1.2
     one.integrate(wall(SMALL, 2.0), np.eye(4))
     first = field(one)
     for count in range(2, 8):
@@ -81,7 +82,9 @@ def test_position_beyond_the_index_range_is_refused_and_the_map_unchanged():
     with pytest.raises(MapLimitError, match='local frame'):
         one.integrate(wall(SMALL, 3.0), far)
     with pytest.raises(MapLimitError, match='larger voxels'):
-        integrator(voxel_size_m=0.001, truncation_m=0.003).integrate(wall(LIDAR, 9.9), np.eye(4))
+        integrator(voxel_size_m=0.001, truncation_m=0.003).integrate(
+            wall(replace(SMALL, max_range_m=10.0), 9.9), np.eye(4)
+        )
     assert one.blocks.num_blocks == 0
     one.integrate(wall(SMALL, 2.0), np.eye(4))
     assert len(zero_crossings(one.blocks)) > 0
@@ -96,7 +99,7 @@ def test_a_short_truncation_is_warned_of(caplog):
     ('settings', 'message'),
     [
         ({'voxels_per_side': 6}, 'voxels_per_side: 6, expected a power of two'),
-        ({'truncation_m': 0.05}, 'truncation_m: 0.05, expected more than 0.1, a voxel'),
+        ({'truncation_m': 0.05}, 'truncation_m: 0.05, expected 0, or more than 0.1, a voxel'),
         ({'dynamic_labels': [1.5]}, 'dynamic_labels: 1.5, expected whole'),
         ({'dynamic_labels': [-1.0]}, 'dynamic_labels: -1.0, expected whole'),
     ],

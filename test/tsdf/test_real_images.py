@@ -44,7 +44,7 @@ def fused(data_folder, numbers):
                 'layers.tsdf.truncation_m': 0.08,
                 'layers.tsdf.min_range_m': 0.4,
                 'layers.tsdf.max_range_m': 4.0,
-                'layers.tsdf.carve': False,
+                'layers.tsdf.carve_m': 0.0,
                 'layers.tsdf.color': True,
                 'layers.tsdf.color_topic': 'color',
             }

@@ -9,6 +9,8 @@ are dictionaries from block to the arrays of its voxels.
 
 import numpy as np
 
+MAX_WEIGHT = 1e5
+
 
 def voxel_centres(config, block):
     """Return the centres of the voxels of a block, (N, 3) m, x fastest."""
@@ -53,16 +55,11 @@ def place_in_image(sensor, p):
     return np.where(seen, u, np.nan), np.where(seen, v, np.nan)
 
 
-def ray(sensor, column, row):
-    """Return the unit vector of one pixel."""
-    return sensor.directions[row, column % sensor.columns].astype(float)
-
-
-def look_up(config, sensor, image, p, u, v):
+def look_up(sensor, image, difference_m, u, v):
     """Return the range at a position, 0 for none, and its pixels as (row, column, share)."""
     u0, v0 = int(np.floor(u)), int(np.floor(v))
     du, dv = u - u0, v - v0
-    columns = sensor.columns + sensor.wraps
+    columns = sensor.columns
     quad = [
         (v0, u0, (1 - du) * (1 - dv)),
         (v0, u0 + 1, du * (1 - dv)),
@@ -74,58 +71,44 @@ def look_up(config, sensor, image, p, u, v):
         q = np.array([float(image[j, i]) for j, i, _ in quad])
         clear = q > sensor.max_range_m
         alike = (q > 0).all() and (clear.all() or not clear.any())
-        if alike and q.max() - q.min() <= config.max_difference_m:
+        if alike and q.max() - q.min() <= difference_m:
             return float(np.dot(q, [share for _, _, share in quad])), quad
     j, i = int(np.floor(v + 0.5)), int(np.floor(u + 0.5))
     if not (0 <= j < sensor.rows and 0 <= i < columns):
         return 0.0, []
-    if not hasattr(sensor, 'fx') and config.ray_offset_voxels > 0:
-        b = ray(sensor, i, j)
-        if np.linalg.norm(p - (p @ b) * b) > config.ray_offset_voxels * config.voxel_size_m:
-            return 0.0, []
     return float(image[j, i]), [(j, i, 1.0)]
 
 
 def weight(config, depth, s):
     """Return the weight of one measurement."""
-    w = 1.0 if config.weight_mode == 'constant' else depth**-2
-    start, tau = config.voxel_size_m, config.truncation_m
+    w, start, tau = depth**-2, config.voxel_size_m, config.tau_m
     if s < -start:
         w *= (tau + s) / (tau - start)
-    return max(w, config.min_measurement_weight)
+    return max(w, 1e-4)
 
 
-def measurements(config, image, T_map_sensor, block):
+def measurements(config, image, T_map_sensor, block, difference_m):
     """Yield voxel, signed distance, weight and pixels for every voxel observed of a block."""
-    sensor, tau = image.sensor, config.truncation_m
+    sensor, tau = image.sensor, config.tau_m
     R, t = T_map_sensor[:3, :3], T_map_sensor[:3, 3]
     points = (voxel_centres(config, block) - t) @ R
     u, v = place_in_image(sensor, points)
     masked = set(config.dynamic_labels)
     for n, p in enumerate(points):
         d = np.linalg.norm(p)
-        longer = 1.0 if image.cosine is None else 1.0 / 0.35
-        farthest = image.largest_m + tau * longer
+        farthest = image.largest_m + tau
         if np.isnan(u[n]) or not sensor.min_range_m <= d <= farthest:
             continue
-        value, pixels = look_up(config, sensor, image.range_m, p, u[n], v[n])
+        value, pixels = look_up(sensor, image.range_m, difference_m, u[n], v[n])
         if value <= 0 or (value > sensor.max_range_m and d > sensor.max_range_m):
             continue
-        s = (value - d) * slant(image, u[n], v[n])
+        s = value - d
         if s < -tau:
             continue
         s = min(s, tau)
         if s < tau and share_of(pixels, image, masked) > 0.5:
             continue
-        depth = p[2] if hasattr(sensor, 'fx') else d
-        yield n, s, weight(config, depth, s), pixels
-
-
-def slant(image, u, v):
-    """Return the cosine at the nearest pixel, 1 without cosines."""
-    if image.cosine is None:
-        return 1.0
-    return float(image.cosine[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))])
+        yield n, s, weight(config, p[2], s), pixels
 
 
 def share_of(pixels, image, masked):
@@ -138,17 +121,17 @@ def share_of(pixels, image, masked):
     return total
 
 
-def integrate(config, blocks, image, T_map_sensor, index):
+def integrate(config, blocks, image, T_map_sensor, index, difference_m=0.2):
     """Fuse an image into the blocks of a dictionary: index to (D, W, C, W of C)."""
     size = config.voxels_per_side**3
     for block in map(tuple, index):
         new = np.zeros(size), np.zeros(size), np.zeros((size, 3)), np.zeros(size)
         D, W, C, W_color = blocks.setdefault(block, new)
-        for n, s, w, pixels in measurements(config, image, T_map_sensor, block):
+        for n, s, w, pixels in measurements(config, image, T_map_sensor, block, difference_m):
             D[n] = (D[n] * W[n] + s * w) / (W[n] + w)
-            W[n] = min(W[n] + w, config.max_weight)
-            if image.color is not None and s < config.truncation_m:
+            W[n] = min(W[n] + w, MAX_WEIGHT)
+            if image.color is not None and s < config.tau_m:
                 c = sum(share * image.color[j, i].astype(float) for j, i, share in pixels)
                 C[n] = (C[n] * W_color[n] + c * w) / (W_color[n] + w)
-                W_color[n] = min(W_color[n] + w, config.max_weight)
+                W_color[n] = min(W_color[n] + w, MAX_WEIGHT)
     return blocks

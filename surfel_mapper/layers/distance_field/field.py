@@ -26,7 +26,7 @@ from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
 from surfel_mapper.tsdf.queries import labels_at, sample, states
 from surfel_mapper.tsdf.range_image import from_depth, from_points
-from surfel_mapper.tsdf.sensors import CameraModel, LidarModel, Sensor
+from surfel_mapper.tsdf.sensors import CameraModel
 
 
 class DistanceField:
@@ -69,6 +69,7 @@ class DistanceField:
         self.blocks = BlockMap(config or TsdfConfig()) if blocks is None else blocks
         self.config = self.blocks.config
         self._mesher = Mesher(self.blocks)
+        self._points, self._images = PointIntegrator(self.blocks), Integrator(self.blocks)
 
     def __repr__(self) -> str:
         """Return voxel size and number of blocks."""
@@ -83,7 +84,7 @@ class DistanceField:
         points: npt.NDArray[Any],
         T_map_sensor: npt.NDArray[np.float64],
         *,
-        sensor: Sensor | None = None,
+        sensor: CameraModel | None = None,
         stamp_ns: int = 0,
         colors: npt.NDArray[np.uint8] | None = None,
         labels: npt.NDArray[Any] | None = None,
@@ -97,9 +98,8 @@ class DistanceField:
             In the frame of the sensor, m; non-finite points are skipped.
         T_map_sensor : (4, 4) float64
             Pose of the sensor in the map frame.
-        sensor : LidarModel or CameraModel, optional
-            Model by which the points become a range image, which is faster; without it they are
-            fused point by point, for any cloud.
+        sensor : CameraModel, optional
+            Camera by which the points become a depth image; clouds of lidars need no model.
         stamp_ns : int
             Stamp of the scan, ns.
         colors : (N, 3 or 4) uint8, optional
@@ -119,15 +119,13 @@ class DistanceField:
         colors = checked_column('colors', colors, np.uint8, ((num, 3), (num, 4)))
         labels = checked_column('labels', labels, np.signedinteger, ((num,),))
         if sensor is None:
-            by_points = PointIntegrator(self.blocks)
-            return by_points.integrate(
-                points, T_map_sensor, as_whole('stamp_ns', stamp_ns), colors=colors, labels=labels
+            stamp_ns = as_whole('stamp_ns', stamp_ns)
+            return self._points.integrate(
+                points, T_map_sensor, stamp_ns, colors=colors, labels=labels
             )
-        check_kind('sensor', sensor, LidarModel, CameraModel)
+        check_kind('sensor', sensor, CameraModel, hint='nothing for the points of a lidar')
         image = from_points(sensor, points, colors=colors, labels=labels)
-        return Integrator(self.blocks).integrate(
-            image, T_map_sensor, as_whole('stamp_ns', stamp_ns)
-        )
+        return self._images.integrate(image, T_map_sensor, as_whole('stamp_ns', stamp_ns))
 
     def add_depth(
         self,
@@ -165,9 +163,7 @@ class DistanceField:
         """
         check_kind('camera', camera, CameraModel)
         image = from_depth(camera, depth).with_images(color=color, label=label)
-        return Integrator(self.blocks).integrate(
-            image, T_map_camera, as_whole('stamp_ns', stamp_ns)
-        )
+        return self._images.integrate(image, T_map_camera, as_whole('stamp_ns', stamp_ns))
 
     def sample(self, points: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """Return the signed distances at (P, 3) points, map frame, (P,) m; nan if unknown."""

@@ -4,8 +4,8 @@
 The truncated signed distance field as a layer: fused from the scans, published as mesh and slice.
 
 A scan is fused at once or, with ``layers.tsdf.when_final``, when it leaves the window and its pose
-is final: fusion cannot be undone. The sensor is the camera that a scan names, else the lidar
-fitted to the first points of its frame; see tsdf/fitting.py.
+is final: fusion cannot be undone. The scan of a depth
+camera is fused as an image, any other as points.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ from surfel_mapper.layers.sensor_models import (
     range_image,
     SensorModels,
     two_beams,
-    without_sensor,
 )
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.window import WindowedScan
@@ -55,10 +54,9 @@ from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.measurements import Integrated
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
-from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
-SPARSE_ROWS = 24
-"""Lidars of fewer fitted beams are fused point by point: their images have gaps."""
+IMAGE_TOLERANCE_S = 0.02
+"""An image belongs to a scan if their stamps differ by no more, s: less than half an image."""
 
 MESHES_KEPT = 8
 """Messages of ~/mesh that its publisher keeps for slow readers: 32 MiB."""
@@ -88,8 +86,8 @@ class TsdfLayer(Layer):
         config = self.config.tsdf
         return Images(
             topics=config.image_topics,
-            tolerance_s=config.image_tolerance_s,
-            setting='layers.tsdf.image_tolerance_s',
+            tolerance_s=IMAGE_TOLERANCE_S,
+            setting='layers.tsdf.color_topic, label_topic',
         )
 
     def clear(self) -> None:
@@ -108,7 +106,7 @@ class TsdfLayer(Layer):
         self._esdf = EuclideanField(self.blocks, max_m=esdf.max_m, radius_m=esdf.radius_m)
         self._position: npt.NDArray[np.float64] = np.zeros(3)
         self._waiting: dict[tuple[str, int], Scan] = {}
-        self._num_scans = self._num_by_points = 0
+        self._num_scans = 0
 
     def follow(self, inserted: InsertedScan) -> list[Integrated]:
         """
@@ -117,7 +115,7 @@ class TsdfLayer(Layer):
         Raises
         ------
         CloudFormatError
-            If the sensor cannot be recognised from the points of a scan.
+            If a column of a scan is of the wrong kind.
         MapLimitError
             If the field cannot hold a scan; it is as before then.
         PoseError
@@ -149,7 +147,7 @@ class TsdfLayer(Layer):
 
         """
         scan, T_map_sensor = self.around.sensors.centered(scan, T_map_sensor)
-        sensor = self._sensor(scan)
+        sensor = self.around.sensors.camera_of(scan)
         self.blocks.clear_updated()
         config = self.config.tsdf
         wanted = {'has_color': config.color, 'has_label': config.semantics != 'none'}
@@ -158,12 +156,11 @@ class TsdfLayer(Layer):
             done = self._point_integrator.integrate(
                 points, T_map_sensor, scan.stamp_ns, **channels
             )
-            self._num_by_points += 1
         else:
             image = range_image(scan, sensor, **wanted)
             done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
         self._position = T_map_sensor[:3, 3].copy()
-        self.blocks.evict(self._position, scan.stamp_ns)
+        self.blocks.evict(self._position)
         self._num_scans += 1
         return done
 
@@ -212,13 +209,14 @@ class TsdfLayer(Layer):
 
     def warm_up(self) -> None:
         """Compile the kernels, for points of either type."""
-        for rows in (2, 0):  # as an image, and point by point
-            tsdf = replace(without_sensor(self.config.tsdf), sensor_rows=rows)
-            config = replace(self.config, tsdf=tsdf)
-            for dtype in (np.float32, np.float64):
-                around = replace(self.around, sensors=SensorModels(tsdf))
-                layer = TsdfLayer(config, around)
-                layer.insert(Scan(points=two_beams(dtype), stamp_ns=0, frame_id=''), np.eye(4))
+        tsdf = replace(self.config.tsdf, sensor_frame='')
+        around = replace(self.around, sensors=SensorModels(tsdf))
+        layer = TsdfLayer(replace(self.config, tsdf=tsdf), around)
+        for dtype in (np.float32, np.float64):
+            for camera in ((), (64.0, 48.0, 60.0, 60.0, 32.0, 24.0)):
+                points = two_beams(dtype)
+                scan = Scan(points=points, stamp_ns=0, frame_id='', camera=camera)
+                layer.insert(scan, np.eye(4))
         layer.mesh()
         list(layer._whole_mesh.messages(Moment()))
         if self.config.esdf.rate_hz:
@@ -232,8 +230,6 @@ class TsdfLayer(Layer):
             'blocks': self.blocks.num_blocks,
             'bytes': self.blocks.nbytes,
             'voxel_size_m': self.config.tsdf.voxel_size_m,
-            'scans_by_points': self._num_by_points,
-            **self.around.sensors.summary(),
         }
 
     def publications(self) -> Sequence[Publication]:
@@ -326,14 +322,6 @@ class TsdfLayer(Layer):
         grid = clearance_slice(self.blocks, heights_m, config.max_m, area, config.radius_m)
         content = (grid.resolution_m, grid.origin, grid.cost)
         return [occupancy_grid(*content, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)]
-
-    def _sensor(self, scan: Scan) -> CameraModel | LidarModel | None:
-        """Return the model of the sensor of a scan; None if it is fused point by point."""
-        sensor = self.around.sensors.of(scan)
-        is_configured = self.config.tsdf.sensor_rows > 0
-        if isinstance(sensor, LidarModel) and not is_configured and sensor.rows < SPARSE_ROWS:
-            return None
-        return sensor
 
     def _settle(self, scans: Iterable[WindowedScan]) -> list[Integrated]:
         """

@@ -64,12 +64,11 @@ def covered(image, row, column, down, across, reach):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def mark_rays(image, cosine, directions, pose, reach, side, marks, near):
+def mark_rays(image, directions, pose, reach, side, marks, near):
     """
     Mark the blocks that rays touch, and those in the band about a surface.
 
     image       (rows, columns or more) float32 m
-    cosine      same shape, or no rows; the band is longer by 1 / cosine
     directions  (rows, columns, 3) float32, unit vectors in the frame of the sensor
     pose        (3, 4) float64, from m in the sensor frame to blocks from the cube's corner
     reach       (NUM_REACH,) float64
@@ -91,9 +90,8 @@ def mark_rays(image, cosine, directions, pose, reach, side, marks, near):
                 continue
             range_m = np.float64(measured)
             clears = range_m > max_range
-            longer = 1.0 / cosine[row, column] if cosine.shape[0] > 0 else 1.0
-            start = range_m - reach[BEFORE] * longer
-            end = range_m + reach[BEHIND] * longer if in_band else start
+            start = range_m - reach[BEFORE]
+            end = range_m + reach[BEHIND] if in_band else start
             if clears:
                 start, end = max_range, max_range
             surface = start if separate and in_band and not clears else np.inf

@@ -15,9 +15,6 @@ negative behind it, and the weight, 0 for voxels never observed.
 A measurement that contradicts a voxel (it differs by half a voxel or more: a wall is gone, or an
 object has come) counts at least the share ``rate``, however heavy the voxel is; colours and
 labels always count that share. 0 never forgets.
-
-Objects thinner than a voxel are lost between voxel centres if only voxels are projected. The
-voxels about their points take distances that were summed point by point (point_fusion.py).
 """
 
 from numba import njit
@@ -34,19 +31,14 @@ from surfel_mapper.tsdf.kernels.channels import (
 )
 from surfel_mapper.tsdf.kernels.lookup import (
     CONTRADICTS,
-    drop_far,
     DROPOFF,
     gather,
-    has_single,
     LEAST,
     locate,
-    MAX_OFFSET,
     MAX_RANGE,
     MAX_WEIGHT,
     MIN_WEIGHT,
     mix,
-    row_gaps,
-    slant,
     TAU,
 )
 
@@ -63,7 +55,11 @@ SOLID = 2
 """Observed voxels whose distance is below the truncation; set if any was fused."""
 INSIDE = 3
 """Observed voxels behind a surface; set if any was fused."""
-NUM_FOUND = 4
+OPPOSED = 4
+"""Measurements of another, farther surface on the other side; of points only."""
+NEAR = 5
+"""Voxels near surfaces; of points only."""
+NUM_FOUND = 6
 
 FLOATS_PER_LINE = 16
 """float32 numbers in a line of the cache."""
@@ -73,40 +69,36 @@ JUMP = np.int32(2**31 - 1)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def integrate_blocks(
-    blocks, offsets, field, sensor, images, sums, settings, power, channels, figures
-):
+def integrate_blocks(blocks, offsets, field, sensor, images, settings, channels, figures):
     """
     Fuse a range image into blocks.
 
-    blocks    (rows, corners, rates, slots) of K blocks: (K,) int64, their rows; (K, 3) float32 m,
+    blocks    (rows, corners, rates) of K blocks: (K,) int64, their rows; (K, 3) float32 m,
               centres of their first voxels in the sensor's frame; (K,) float32, least shares of
-              contradicting measurements, in [0, 1); (K,) int64, slots in sums, -1 for none
+              contradicting measurements, in [0, 1)
     offsets   (3, N) float32 m, from the first voxel to every voxel, x fastest
     field     (R, 2, N) float32, distance and weight of all blocks
-    sensor    (kind, parameters, elevations, gaps), see kernels/projection.py and row_gaps
-    images    (pairs, cosine, color, label, mask): pairs, as gather takes them, and cosine with
-              their BORDER; see subtract, fuse_color, vote_labels, apply_mask; missing images have
+    sensor    (kind, parameters, elevations), see kernels/projection.py
+    images    (pairs, color, label, mask): pairs, as gather takes them, with their BORDER; see
+              fuse_color, vote_labels, apply_mask; missing images have
               no rows
-    sums      (S, N, 3) float32, distances of thin objects, see kernels/point_fusion.py
     settings  (NUM_SETTINGS,) float32
-    power     weights fall by depth^-(2 power): 0 or 1
     channels  (color, votes): rows of all blocks, no rows for channels not kept
     figures   (K, NUM_FOUND) int64, out: see OBSERVED, MOVED, SOLID, INSIDE
     """
     num_voxels = offsets.shape[1]
-    scratch = np.empty((11, num_voxels), np.float32)
+    scratch = np.empty((10, num_voxels), np.float32)
     x, y, z, distance = scratch[0], scratch[1], scratch[2], scratch[3]
     u, v, signed, weight = scratch[4], scratch[5], scratch[6], scratch[7]
-    value, fused, summed = scratch[8], scratch[9], scratch[10]
+    value, fused = scratch[8], scratch[9]
     upper, lower = np.empty(num_voxels, np.int64), np.empty(num_voxels, np.int64)
     pixel = np.empty(num_voxels, np.int32)
     mixed, label = np.empty(num_voxels, np.uint8), np.empty(num_voxels, np.int32)
-    kind, parameters, elevations, gaps = sensor
-    pairs, cosine, color_image, label_image, mask = images
+    kind, parameters, elevations = sensor
+    pairs, color_image, label_image, mask = images
     stride = pairs.shape[1]
     color, votes = channels
-    rows, corners, rates, slots = blocks
+    rows, corners, rates = blocks
     tau, most = settings[TAU], settings[MAX_WEIGHT]
     for b in range(len(rows)):
         row, rate = rows[b], rates[b]
@@ -119,11 +111,7 @@ def integrate_blocks(
         locate(distance, u, v, stride, settings, pixel)
         gather(pairs.ravel(), stride, pixel, upper, lower)
         mix(upper.view(np.float32), lower.view(np.float32), u, v, settings, value)
-        if settings[MAX_OFFSET] > _ZERO and has_single(value):
-            row_gaps(kind, gaps, v, weight)
-            drop_far(x, y, u, v, distance, weight, settings, value)
-        slant(cosine, stride, pixel, u, v, weight)
-        subtract(value, distance, weight, settings, signed)
+        subtract(value, distance, settings, signed)
         count = count_observed(signed)
         if count > 0 and mask.shape[0] > 0:
             flag_mixed(value, mixed)
@@ -131,17 +119,11 @@ def integrate_blocks(
         if count > 0 and label_image.shape[0] > 0:
             flag_mixed(value, mixed)
             vote_labels(label_image, tau, u, v, mixed, signed, label)
-        merged = signed
-        if slots[b] >= 0:
-            merged = summed
-            merged[:] = signed
-            replace_summed(sums[slots[b]], tau, signed, merged)
-            count = count_observed(merged)
         figures[b, OBSERVED] = count
         if count == 0:
             figures[b, MOVED] = 0
             continue
-        weigh(distance if kind > 0 else z, merged, settings, power, weight)
+        weigh(z, signed, settings, weight)
         if label_image.shape[0] > 0 and votes.shape[0] > 0:
             fuse_labels(tau, most, rate, label, signed, weight, votes[row])
         if color.shape[0] > 0 and color_image.shape[0] > 0:
@@ -149,7 +131,7 @@ def integrate_blocks(
             bounds = tau, most, rate
             fuse_color(color_image, bounds, u, v, mixed, signed, weight, color[row])
         mean, total = field[row, 0], field[row, 1]
-        fuse(merged, weight, settings[CONTRADICTS], rate, mean, total, fused)
+        fuse(signed, weight, settings[CONTRADICTS], rate, mean, total, fused)
         figures[b, MOVED] = largest_step(mean, fused, total, weight, settings[LEAST])
         replace(fused, weight, most, mean, total)
         figures[b, SOLID], figures[b, INSIDE] = count_solid(mean, total, tau)
@@ -170,12 +152,12 @@ def shift(values, by, shifted):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def subtract(value, distance, factor, settings, signed):
+def subtract(value, distance, settings, signed):
     """Find the signed distance of every voxel, (N,) float32 m; SKIP if it is not observed."""
     tau, reach = settings[TAU], settings[MAX_RANGE]
     for n in range(len(value)):
         range_m, d = abs(value[n]), distance[n]
-        s = (range_m - d) * factor[n]
+        s = range_m - d
         # A clearing pixel says nothing beyond the range of the sensor.
         observed = (range_m > _ZERO) & (s >= -tau) & ((range_m <= reach) | (d <= reach))
         signed[n] = min(max(s, -tau), tau) if observed else SKIP
@@ -191,22 +173,6 @@ def count_observed(signed):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def replace_summed(sums, tau, signed, merged):
-    """
-    Replace the distances of the voxels that have sums, in a block.
-
-    sums    (N, 3) float32, see kernels/point_fusion.py
-    signed  (N,) float32 m, of the image; voxels that it did not observe become free of colours
-            and labels: tau
-    merged  (N,) float32 m, in and out
-    """
-    for n in range(len(signed)):
-        if sums[n, 2] > _ZERO:
-            merged[n] = sums[n, 0] / sums[n, 1]
-            signed[n] = max(signed[n], tau) if signed[n] == SKIP else signed[n]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
 def flag_mixed(value, mixed):
     """Flag the voxels whose range was interpolated from four pixels."""
     for n in range(len(value)):
@@ -214,19 +180,15 @@ def flag_mixed(value, mixed):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def weigh(depth, signed, settings, power, weight):
+def weigh(depth, signed, settings, weight):
     """
     Compute the weight of every measurement, 0 for voxels not observed.
 
     depth, signed, weight  (N,) float32; weight is written
     """
     least, tau, dropoff = settings[MIN_WEIGHT], settings[TAU], settings[DROPOFF]
-    if power == 0:
-        for n in range(len(weight)):
-            weight[n] = _ONE
-    else:
-        for n in range(len(weight)):
-            weight[n] = _ONE / (depth[n] * depth[n])
+    for n in range(len(weight)):
+        weight[n] = _ONE / (depth[n] * depth[n])
     per_metre = _ONE / (tau - dropoff)
     for n in range(len(weight)):
         s = signed[n]

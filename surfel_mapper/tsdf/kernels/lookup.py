@@ -11,8 +11,6 @@ mean unknown, replaces tests of bounds.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.projection import LIDAR_TABLE, MOST_CORRECTED
-
 # Settings of an integration, float32.
 TAU = 0
 MIN_RANGE = 1
@@ -21,18 +19,15 @@ LIMIT = 3
 """Largest distance of an observed voxel from the sensor, m."""
 MAX_DIFFERENCE = 4
 """Pixels that differ by more are not interpolated, m."""
-MAX_OFFSET = 5
-"""Largest distance from the ray of the nearest pixel, m; 0 means no limit."""
-COLUMN_RAD = 6
-DROPOFF = 7
+DROPOFF = 5
 """Distance behind the surface at which weights begin to fall, m; less than TAU."""
-MIN_WEIGHT = 8
-MAX_WEIGHT = 9
-LEAST = 10
+MIN_WEIGHT = 6
+MAX_WEIGHT = 7
+LEAST = 8
 """Least weight of a voxel in the mesh; positive."""
-CONTRADICTS = 11
+CONTRADICTS = 9
 """Difference from which a measurement contradicts a voxel, m."""
-NUM_SETTINGS = 12
+NUM_SETTINGS = 10
 
 BORDER = ((2, 2), (1, 2))
 """Rows above and below the image, and columns left and right of it, that hold 0."""
@@ -97,83 +92,3 @@ def mix(above, under, u, v, settings, value):
         # Clearing pixels are not interpolated with measurements.
         alike = (high - low <= allowed) & (low > _ZERO) & ((high <= reach) | (low > reach))
         value[n] = upper + dv * (lower - upper) if alike else -nearest
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def row_gaps(kind, gaps, v, gap):
-    """
-    Find the angle between the rows about every voxel, (N,) float32 rad, out.
-
-    If the voxels are between few rows, they are gone through row by row in loops that are
-    vectorised; that is faster than a look-up of each.
-
-    gaps  (rows - 1,) float32 rad, between each row and the next; not used for cameras
-    """
-    if kind != LIDAR_TABLE:
-        for n in range(len(v)):
-            gap[n] = gaps[0]
-        return
-    end = np.int32(len(gaps) - 1)
-    low, high = end, np.int32(0)
-    for n in range(len(v)):
-        row = np.int32(v[n])
-        low = min(low, row)
-        high = max(high, row)
-    first, last = np.int64(max(low, np.int32(0))), np.int64(min(high, end))
-    if last - first > MOST_CORRECTED:
-        for n in range(len(v)):
-            gap[n] = gaps[min(max(np.int64(v[n]), first), last)]
-        return
-    for n in range(len(v)):
-        gap[n] = gaps[first]
-    for row in range(first + 1, last + 1):
-        start, wide = np.float32(row), gaps[row]
-        for n in range(len(v)):
-            gap[n] = wide if v[n] >= start else gap[n]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def has_single(value):
-    """Return whether any range is that of a single pixel."""
-    single = np.int32(0)
-    for n in range(len(value)):
-        single |= np.int32(value[n] < _ZERO)
-    return single != 0
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def drop_far(x, y, u, v, distance, gap, settings, value):
-    """Skip voxels with the range of a single pixel whose ray is too far."""
-    column_rad, most = settings[COLUMN_RAD], settings[MAX_OFFSET] * settings[MAX_OFFSET]
-    for n in range(len(value)):
-        right, below = u[n] + _ONE, v[n] + _ONE
-        du, dv = right - np.float32(np.int32(right)), below - np.float32(np.int32(below))
-        du, dv = min(du, _ONE - du), min(dv, _ONE - dv)
-        across = du * column_rad
-        down = distance[n] * dv * gap[n]
-        far = (x[n] * x[n] + y[n] * y[n]) * (across * across) + down * down > most
-        value[n] = _ZERO if far & (value[n] < _ZERO) else value[n]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def slant(cosine, stride, pixel, u, v, factor):
-    """
-    Find the factor of distances along the ray: 1, or the cosine at the nearest pixel.
-
-    pixel   (N,) int32, in: number of the upper left pixel; out: of the nearest one
-    cosine  (rows, columns) float32 with its border, or no rows
-    factor  (N,) float32, out
-    """
-    if cosine.shape[0] == 0:
-        for n in range(len(factor)):
-            factor[n] = _ONE
-        return
-    step = np.int32(stride)
-    for n in range(len(factor)):
-        right, below = u[n] + _ONE, v[n] + _ONE
-        aside = np.int32(right - np.float32(np.int32(right)) >= _HALF)
-        down = step if below - np.float32(np.int32(below)) >= _HALF else np.int32(0)
-        pixel[n] = pixel[n] + aside + down
-    flat = cosine.ravel()
-    for n in range(len(factor)):
-        factor[n] = flat[np.int64(pixel[n])]

@@ -1,22 +1,28 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Fuse points into voxels one ray at a time, for clouds without a projection model.
+Fuse the cells of a scan into voxels; see kernels/point_cells.py for cells.
 
-The measurements of one scan are first summed by voxel, then each voxel is fused once, so that a
-scan counts as one observation, as in kernels/integration.py. Sums of a voxel:
+Near a surface the distance of a voxel is its distance from the plane of a cell, not the distance
+along the ray: at an angle of incidence of 60 deg the latter is twice as long. A cell observes the
+voxels in a cylinder about its mean: DISC voxels to the sides, in front of the surface up to the
+truncation, and behind it as far as marching cubes needs, no farther: |nx| + |ny| + |nz| voxels.
+So both faces of a wall of two voxels are right, however large the truncation is.
 
-    sums[slot, voxel, 0]  weighted signed distances, m
-    sums[slot, voxel, 1]  weights
-    sums[slot, voxel, 2]  number of rays; negative for rays that only pass through free space
+Free space is known one bit a voxel. Rays are walked from the truncation before the surface towards
+the sensor. A free voxel becomes known as free, and loses a surface behind which it was, but a
+voxel in front of a surface keeps its distance: a ray that passes does not tell how far the next
+surface is. Its weight fades, and with it the surface, unless later scans meet it again. Voxels
+near a surface of the same scan are not freed, so thin objects survive the rays that pass them.
 
-Near a surface a ray observes the eight voxels about each of its samples, not only the voxels it
-crosses: marching cubes needs all eight corners of a cube, which single rays of a sparse cloud
-would never fill. Free rays do not touch voxels that were observed near a surface by the same scan,
-so that thin objects survive the rays that pass beside them.
+The blocks of a scan have numbers of their own, in a table as those of cells. All lengths are in
+voxels except where m is stated; a block has 2^bits voxels a side.
 
-All lengths are in voxels except where m is stated; a block has 2^bits voxels a side.
+Sources: Oleynikova et al. 2017 (voxblox) for merged rays, Pan et al. 2022 (Voxfield) for distances
+from planes, Amanatides and Woo 1987 for the traversal.
 """
+
+import math
 
 from numba import njit
 import numpy as np
@@ -24,274 +30,344 @@ import numpy as np
 from surfel_mapper.kernels.hashing import DEPTH
 from surfel_mapper.tsdf.kernels.block_marks import walk
 from surfel_mapper.tsdf.kernels.channels import vote
-from surfel_mapper.tsdf.kernels.integration import INSIDE, JUMP, MOVED, OBSERVED, SOLID
-from surfel_mapper.tsdf.kernels.lookup import (
-    CONTRADICTS,
-    DROPOFF,
-    LEAST,
-    MAX_RANGE,
-    MAX_WEIGHT,
-    MIN_RANGE,
-    MIN_WEIGHT,
-    TAU,
+from surfel_mapper.tsdf.kernels.integration import (
+    INSIDE,
+    JUMP,
+    MOVED,
+    NEAR,
+    OBSERVED,
+    OPPOSED,
+    prefetch_block,
+    SOLID,
+)
+from surfel_mapper.tsdf.kernels.lookup import CONTRADICTS, LEAST, MAX_WEIGHT, MIN_WEIGHT, TAU
+from surfel_mapper.tsdf.kernels.point_cells import (
+    COSINE,
+    entry_of,
+    number_of,
+    packed,
+    RANGE,
+    WEIGHT,
 )
 from surfel_mapper.tsdf.kernels.queries import find_voxel
 
-CORE = 1.0
-"""Samples up to this far from the surface observe the eight voxels about them, voxels."""
+DISC = 0.85
+"""Voxels up to this far beside the mean of a cell are observed: half the diagonal of a voxel."""
 
-ASIDE = 0.87
-"""Voxels about thin objects are observed up to this far from the ray: half a diagonal."""
+EDGE = 0.8
+"""Share of its weight that a measurement has lost at the edge of the disc."""
 
-STEP = 0.5
-"""Distance of these samples, voxels."""
+LEAST_SHARE = 0.02
+"""Least share of the weight of a cell at the ends of its cylinder."""
 
-MOST_SEEN = 2
-"""A free ray ends after more voxels in a row that were freed before."""
+MOST_FREED = 2
+"""A ray ends after more voxels in a row that other rays of the scan have freed."""
+
+FADING = 4
+"""Weights in front of a surface fade so many times as fast as a distance moves: from MEMORY scans
+at 1 m to the least weight within forget_s."""
+
+MEMORY = 16.0
+"""Largest weight of a voxel, in scans like the last, if surfaces are forgotten."""
 
 
 @njit(cache=True, nogil=True)
-def mark_corners(points, origin, low, side, bits, limits, marks):
-    """
-    Mark the blocks of the voxels about the samples near each point.
+def enter_keys(keys, table):
+    """Enter the keys of blocks into an empty table, numbered in order."""
+    for number in range(len(keys)):
+        entry = entry_of(keys[number], table)
+        table[entry, 0], table[entry, 1] = keys[number], number
 
-    points  (N, 3) float64, map frame
-    origin  (3,) float64, the sensor
-    low     (3,) int64, block at the lower corner of the cube of marks
-    limits  (smallest, largest) range of points that are marked
-    marks   (side^3 / 64,) int64, one bit a block, z fastest
+
+@njit(cache=True, nogil=True)
+def cylinder(cell, tau, low, high):
     """
-    for p in range(len(points)):
-        x, y, z = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]
-        measured = np.sqrt(x * x + y * y + z * z)
-        if not limits[0] <= measured <= limits[1]:
-            continue
-        for sample in range(-2, 3):
-            t = 1.0 + sample * STEP / measured
-            i = np.int64(np.floor(origin[0] + t * x - 0.5))
-            j = np.int64(np.floor(origin[1] + t * y - 0.5))
-            k = np.int64(np.floor(origin[2] + t * z - 0.5))
-            for corner in range(8):
-                a = ((i + (corner & 1)) >> bits) - low[0]
-                b = ((j + (corner >> 1 & 1)) >> bits) - low[1]
-                c = ((k + (corner >> 2)) >> bits) - low[2]
-                cell = (a * side + b) * side + c
-                marks[cell >> 6] |= np.int64(1) << (cell & 63)
+    Find the voxels about the cylinder of a cell.
+
+    cell       (CELL,) float64
+    low, high  (3,) int64, out: first and last index along each axis
+
+    Returns how far behind the surface voxels are observed.
+    """
+    behind = abs(cell[3]) + abs(cell[4]) + abs(cell[5])
+    for axis in range(3):
+        along = cell[3 + axis]
+        aside = DISC * math.sqrt(max(0.0, 1.0 - along * along))
+        first, last = cell[axis] - behind * along, cell[axis] + tau * along
+        low[axis] = np.int64(math.ceil(min(first, last) - aside - 0.5))
+        high[axis] = np.int64(math.floor(max(first, last) + aside - 0.5))
+    return behind
+
+
+@njit(cache=True, nogil=True)
+def list_pairs(cells, start, tau, bits, table, keys, number, pairs, num_pairs):
+    """
+    List the blocks that each cell observes.
+
+    cells      (K, CELL) float64
+    start      the first cell to take
+    table      (T, 2) int64, in and out: numbers of blocks
+    keys       (T / 2,) int64, in and out: of the blocks
+    number     of blocks so far
+    pairs      (P, 2) int32, out: block and cell
+    num_pairs  of pairs so far
+
+    Returns the numbers of blocks and of pairs, and the first cell that is not done: enlarge table
+    and pairs then.
+    """
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for cell in range(start, len(cells)):
+        cylinder(cells[cell], tau, low, high)
+        more = 1
+        for axis in range(3):
+            more *= (high[axis] >> bits) - (low[axis] >> bits) + 1
+        if number + more > len(keys) or num_pairs + more > len(pairs):
+            return number, num_pairs, cell
+        for c in range(low[2] >> bits, (high[2] >> bits) + 1):
+            for b in range(low[1] >> bits, (high[1] >> bits) + 1):
+                for a in range(low[0] >> bits, (high[0] >> bits) + 1):
+                    block, number = number_of(packed(a, b, c), table, keys, number)
+                    pairs[num_pairs, 0], pairs[num_pairs, 1] = block, cell
+                    num_pairs += 1
+    return number, num_pairs, len(cells)
+
+
+@njit(cache=True, nogil=True)
+def group_pairs(pairs, first, grouped):
+    """
+    Group cells by block.
+
+    pairs    (P, 2) int32
+    first    (B + 1,) int64, in: zeros; out: first place of each block in grouped
+    grouped  (P,) int32, out: cells, in order
+    """
+    for p in range(len(pairs)):
+        first[pairs[p, 0] + 1] += 1
+    for block in range(len(first) - 1):
+        first[block + 1] += first[block]
+    for p in range(len(pairs)):
+        block = pairs[p, 0]
+        grouped[first[block]] = pairs[p, 1]
+        first[block] += 1
+    for block in range(len(first) - 1, 0, -1):
+        first[block] = first[block - 1]
+    first[0] = 0
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def begin_walk(origin, along, start, end, index, steps, reached, spacing):
+def free_rays(cells, start, origin, limits, bits, table, keys, number, freed):
     """
-    Prepare the traversal of voxels from origin + start along to origin + end along.
+    Free the voxels between the cells and the sensor.
 
-    origin, along  (3,) float64
-    index          (3,) int64, out: the first voxel
-    steps          (2, 3) int64, out: direction and number of steps along each axis
-    reached        (3,) float64, out: range at which the next voxel along each axis begins
-    spacing        (3,) float64, out: range from voxel to voxel
+    cells   (K, CELL) float64
+    start   the first cell to take
+    origin  (3,) float64, the sensor
+    limits  (near, far, tau): ranges between which voxels are freed, and the truncation
+    table   (T, 2) int64, in and out: numbers of blocks
+    keys    (T / 2,) int64, in and out: of the blocks
+    number  of blocks so far
+    freed   (T / 2, N / 64) int64, in and out: one bit a voxel
 
-    Returns the number of voxels.
+    Returns the number of blocks, and the first cell that is not done: enlarge the table then.
     """
-    number = 1
+    near, far, tau = limits
+    mask, most = (1 << bits) - 1, len(keys)
+    for cell in range(start, len(cells)):
+        row = cells[cell]
+        measured = row[RANGE]
+        end = min(measured - tau / row[COSINE], far)
+        if end <= near:
+            continue
+        x, y, z = row[0] - origin[0], row[1] - origin[1], row[2] - origin[2]
+        x, y, z = x / measured, y / measured, z / measured
+        px, py, pz = origin[0] + end * x, origin[1] + end * y, origin[2] + end * z
+        i, tx, ux, sx, nx = walk(px, -x, 0.0, end - near, 1)
+        j, ty, uy, sy, ny = walk(py, -y, 0.0, end - near, 1)
+        k, tz, uz, sz, nz = walk(pz, -z, 0.0, end - near, 1)
+        if number + (nx + ny + nz) // (1 << bits) + 4 > most:
+            return number, cell
+        num_freed, block = 0, -1
+        a, b, c = i >> bits, j >> bits, (k >> bits) + 1
+        for _ in range(nx + ny + nz + 1):
+            if i >> bits != a or j >> bits != b or k >> bits != c:
+                a, b, c = i >> bits, j >> bits, k >> bits
+                block, number = number_of(packed(a, b, c), table, keys, number)
+            voxel = (i & mask) | (j & mask) << bits | (k & mask) << 2 * bits
+            word, bit = freed[block, voxel >> 6], np.int64(1) << (voxel & 63)
+            num_freed = num_freed + 1 if word & bit else 0
+            if num_freed > MOST_FREED:
+                break
+            freed[block, voxel >> 6] = word | bit
+            if tx <= ty and tx <= tz:
+                i += sx
+                nx -= 1
+                tx = tx + ux if nx > 0 else np.inf
+            elif ty <= tz:
+                j += sy
+                ny -= 1
+                ty = ty + uy if ny > 0 else np.inf
+            else:
+                k += sz
+                nz -= 1
+                tz = tz + uz if nz > 0 else np.inf
+    return number, len(cells)
+
+
+@njit(cache=True, nogil=True)
+def sum_cell(cell, corner, tau, bits, low, high, sums, touched, number):
+    """
+    Sum the distances that a cell gives to the voxels of a block.
+
+    cell     (CELL,) float64
+    corner   (3,) int64, index of the block's first voxel
+    low, high  (3,) int64, written
+    sums     (N, 2) float32, in and out: weighted distances, voxels, and weights
+    touched  (N,) int64, in and out: voxels that have sums
+    number   of these
+
+    Returns the number of these afterwards.
+    """
+    behind = cylinder(cell, tau, low, high)
+    side = 1 << bits
     for axis in range(3):
-        stepping = walk(origin[axis], along[axis], start, end, 1)
-        index[axis], reached[axis], spacing[axis], steps[0, axis], steps[1, axis] = stepping
-        number += steps[1, axis]
+        low[axis] = max(low[axis] - corner[axis], 0)
+        high[axis] = min(high[axis] - corner[axis], side - 1)
+    nx, ny, nz, full = cell[3], cell[4], cell[5], cell[WEIGHT]
+    first_x = corner[0] + 0.5 - cell[0]
+    first_y = corner[1] + 0.5 - cell[1]
+    first_z = corner[2] + 0.5 - cell[2]
+    most, per_square = DISC * DISC, EDGE / (DISC * DISC)
+    before, after = 1.0 / tau, 1.0 / behind
+    for k in range(low[2], high[2] + 1):
+        z = first_z + k
+        for j in range(low[1], high[1] + 1):
+            y = first_y + j
+            row = (j << bits) + (k << 2 * bits)
+            level, square = ny * y + nz * z, y * y + z * z
+            for i in range(low[0], high[0] + 1):
+                x = first_x + i
+                signed = nx * x + level
+                aside = x * x + square - signed * signed
+                if aside > most or signed > tau or signed < -behind:
+                    continue
+                share = 1.0 - (signed * before if signed > 0.0 else -signed * after)
+                weight = full * max(share, LEAST_SHARE) * (1.0 - aside * per_square)
+                if sums[row + i, 1] == 0.0:
+                    touched[number] = row + i
+                    number += 1
+                sums[row + i, 0] += np.float32(weight * signed)
+                sums[row + i, 1] += np.float32(weight)
     return number
 
 
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def next_voxel(index, steps, reached, spacing):
-    """Go to the next voxel of a traversal, see begin_walk."""
-    axis = 0 if reached[0] <= reached[1] and reached[0] <= reached[2] else 2
-    if axis == 2 and reached[1] <= reached[2]:
-        axis = 1
-    index[axis] += steps[0, axis]
-    steps[1, axis] -= 1
-    reached[axis] = reached[axis] + spacing[axis] if steps[1, axis] > 0 else np.inf
-
-
 @njit(cache=True, nogil=True, error_model='numpy')
-def weight_at(depth_m, signed_m, settings, power):
-    """Return the weight of a measurement at a depth and signed distance, m."""
-    weight = 1.0
-    if power > 0:
-        weight /= depth_m * depth_m
-    tau, start = settings[TAU], settings[DROPOFF]
-    if signed_m < -start:
-        weight *= max(tau + signed_m, 0.0) / (tau - start)
-    return max(weight, settings[MIN_WEIGHT])
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def sum_surfaces(points, origin, core_only, voxel_m, bits, settings, power, lookup, slots, sums):
+def fuse_blocks(blocks, cells, origin, settings, voxel_m, bits, field, figures):
     """
-    Sum the measurements within the truncation of each point.
+    Fuse a scan into blocks, each voxel once.
 
-    points    (N, 3) float64, map frame; those out of range or not finite are skipped
+    blocks    (rows, corners, rates, ends, freed): (B,) int64, rows in the map; (B, 3) int64, index
+              of the first voxel; (B,) float32, least share of contradicting measurements; (B, 2)
+              int64, first and last place of its cells in grouped; (B, N / 64) int64, one bit a
+              free voxel, changed
+    cells     (grouped, cells): (P,) int32 and (K, CELL) float64
     origin    (3,) float64, the sensor
-    core_only whether only voxels about the surface are observed, not all up to the truncation
-    voxel_m   float64, edge of a voxel, m
-    settings  (NUM_SETTINGS,) float32, see kernels/lookup.py
-    power     weights fall by depth^-(2 power)
-    lookup    (head, table, state) of the map
-    slots     (R,) int64, slot of each row in sums, -1 for none
-    sums      (K, N, 3) float32, in and out
-
-    Returns the number of points used.
-    """
-    head, table, state = lookup
-    recent, depth = np.array([1 << 40, 0, 0, -1]), state[DEPTH]
-    tau = settings[TAU] / voxel_m
-    near, far = settings[MIN_RANGE] / voxel_m, settings[MAX_RANGE] / voxel_m
-    start_m, least = settings[DROPOFF], settings[MIN_WEIGHT]
-    per_metre = 1.0 / (settings[TAU] - start_m)
-    mask = (1 << bits) - 1
-    index, steps = np.empty(3, np.int64), np.empty((2, 3), np.int64)
-    along, reached, spacing = np.empty(3), np.empty(3), np.empty(3)
-    used = 0
-    for p in range(len(points)):
-        x, y, z = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]
-        measured = np.sqrt(x * x + y * y + z * z)
-        if not near <= measured <= far:
-            continue
-        used += 1
-        x, y, z = x / measured, y / measured, z / measured
-        start, end = max(measured - tau, near), measured + tau
-        if core_only:
-            start = end = measured
-        along[0], along[1], along[2] = x, y, z
-        for _ in range(begin_walk(origin, along, start, end, index, steps, reached, spacing)):
-            i, j, k = index[0], index[1], index[2]
-            u, v, w = i + 0.5 - origin[0], j + 0.5 - origin[1], k + 0.5 - origin[2]
-            signed = measured - (x * u + y * v + z * w)
-            if abs(signed) > CORE:  # nearer voxels follow below
-                row, voxel = find_voxel(i, j, k, bits, recent, head, table, depth)
-                if row >= 0 and slots[row] >= 0 and signed >= -tau:
-                    slot, signed_m = slots[row], min(max(signed, -tau), tau) * voxel_m
-                    weight = weight_at((measured - signed) * voxel_m, signed_m, settings, power)
-                    sums[slot, voxel, 0] += weight * signed_m
-                    sums[slot, voxel, 1] += weight
-                    sums[slot, voxel, 2] += 1.0
-            next_voxel(index, steps, reached, spacing)
-        last_i, last_j, last_k = index[0] - 9, 0, 0
-        full = weight_at(measured * voxel_m, 0.0, settings, power)
-        for sample in range(-2, 3):
-            t = measured + sample * STEP
-            i = np.int64(np.floor(origin[0] + t * x - 0.5))
-            j = np.int64(np.floor(origin[1] + t * y - 0.5))
-            k = np.int64(np.floor(origin[2] + t * z - 0.5))
-            if i == last_i and j == last_j and k == last_k:
-                continue
-            last_i, last_j, last_k = i, j, k
-            u, v, w = i + 0.5 - origin[0], j + 0.5 - origin[1], k + 0.5 - origin[2]
-            first = measured - (x * u + y * v + z * w)
-            row, number = find_voxel(i, j, k, bits, recent, head, table, depth)
-            within = (i & mask) < mask and (j & mask) < mask and (k & mask) < mask
-            for corner in range(8):
-                a, b, c = corner & 1, corner >> 1 & 1, corner >> 2
-                signed = first - (x * a + y * b + z * c)
-                if abs(signed) > tau:
-                    continue
-                if core_only:
-                    ahead = measured - signed
-                    away = (u + a) ** 2 + (v + b) ** 2 + (w + c) ** 2 - ahead * ahead
-                    if away > ASIDE * ASIDE:
-                        continue
-                voxel = number + a + (b << bits) + (c << 2 * bits)
-                if not within:
-                    row, voxel = find_voxel(i + a, j + b, k + c, bits, recent, head, table, depth)
-                if row >= 0 and slots[row] >= 0:
-                    slot, signed_m = slots[row], signed * voxel_m
-                    weight = full
-                    if signed_m < -start_m:
-                        weight *= (settings[TAU] + signed_m) * per_metre
-                    weight = max(weight, least)
-                    sums[slot, voxel, 0] += weight * signed_m
-                    sums[slot, voxel, 1] += weight
-                    sums[slot, voxel, 2] += 1.0
-    return used
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def sum_free(points, origin, voxel_m, bits, settings, power, lookup, slots, sums):
-    """
-    Sum the observations of free space in front of each point; arguments as of sum_surfaces.
-
-    Rays are walked from their end towards the sensor, where they are dense, and stop after
-    MOST_SEEN voxels in a row that earlier rays of the scan have freed, as the fast integrator of
-    voxblox does.
-    """
-    head, table, state = lookup
-    recent, depth = np.array([1 << 40, 0, 0, -1]), state[DEPTH]
-    tau = settings[TAU] / voxel_m
-    near, far = settings[MIN_RANGE] / voxel_m, settings[MAX_RANGE] / voxel_m
-    index, steps = np.empty(3, np.int64), np.empty((2, 3), np.int64)
-    along, ends = np.empty(3), np.empty(3)
-    reached, spacing = np.empty(3), np.empty(3)
-    for p in range(len(points)):
-        x, y, z = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]
-        measured = np.sqrt(x * x + y * y + z * z)
-        if not (near <= measured and measured < 1e9):
-            continue
-        x, y, z = x / measured, y / measured, z / measured
-        end = min(measured - tau, far)
-        if end <= near:
-            continue
-        along[0], along[1], along[2] = -x, -y, -z
-        for axis in range(3):
-            ends[axis] = origin[axis] - end * along[axis]
-        num_freed = 0
-        for _ in range(begin_walk(ends, along, 0.0, end - near, index, steps, reached, spacing)):
-            i, j, k = index[0], index[1], index[2]
-            row, voxel = find_voxel(i, j, k, bits, recent, head, table, depth)
-            if row >= 0 and slots[row] >= 0 and sums[slots[row], voxel, 2] <= 0.0:
-                num_freed = num_freed + 1 if sums[slots[row], voxel, 2] < 0.0 else 0
-                if num_freed > MOST_SEEN:
-                    break
-                u, v, w = i + 0.5 - origin[0], j + 0.5 - origin[1], k + 0.5 - origin[2]
-                ahead_m = max((x * u + y * v + z * w) * voxel_m, settings[MIN_RANGE])
-                weight = weight_at(ahead_m, settings[TAU], settings, power)
-                sums[slots[row], voxel, 0] += weight * settings[TAU]
-                sums[slots[row], voxel, 1] += weight
-                sums[slots[row], voxel, 2] -= 1.0
-            next_voxel(index, steps, reached, spacing)
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def fuse_sums(rows, sums, rates, settings, field, figures):
-    """
-    Fuse the summed measurements of a scan into blocks: each voxel once, with its mean weight.
-
-    rows      (K,) int64
-    sums      (K, N, 3) float32
-    rates     (K,) float32, least share of contradicting measurements
     settings  (NUM_SETTINGS,) float32, see kernels/lookup.py
     field     (R, 2, N) float32
-    figures   (K, NUM_FOUND) int64, out: as of integrate_blocks
+    figures   (B, NUM_FOUND) int64, in and out: as of integrate_blocks; INSIDE is that so far,
+              SOLID 0 if nothing changed
     """
-    tau, least = settings[TAU], settings[LEAST]
-    for slot in range(len(rows)):
-        row = rows[slot]
-        figures[slot] = 0
-        for voxel in range(sums.shape[1]):
-            mean, total = field[row, 0, voxel], field[row, 1, voxel]
-            if sums[slot, voxel, 2] != 0.0:
-                value = sums[slot, voxel, 0] / sums[slot, voxel, 1]
-                weight = sums[slot, voxel, 1] / abs(sums[slot, voxel, 2])
-                gain = weight / (total + weight)
-                if abs(value - mean) >= settings[CONTRADICTS]:
-                    gain = max(gain, rates[slot])
-                fused = mean + (value - mean) * gain
-                flips = (fused < 0.0) != (mean < 0.0) or total < least <= total + weight
-                moved = JUMP if flips else np.int64(abs(fused - mean) * 1e6)
-                figures[slot, MOVED] = max(figures[slot, MOVED], moved)
-                figures[slot, OBSERVED] += 1
-                mean, total = fused, min(total + weight, settings[MAX_WEIGHT])
-                field[row, 0, voxel], field[row, 1, voxel] = mean, total
-            if total > 0.0:
-                figures[slot, SOLID] += mean < tau
-                figures[slot, INSIDE] += mean < 0.0
+    rows, corners, rates, ends, freed = blocks
+    grouped, cells = cells
+    num_voxels, tau = field.shape[2], settings[TAU] / voxel_m
+    sums, touched = np.zeros((num_voxels, 2), np.float32), np.empty(num_voxels, np.int64)
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    flat, block_size = field.ravel(), 2 * num_voxels
+    for b in range(len(rows)):
+        if b + 1 < len(rows):
+            prefetch_block(flat, block_size * rows[b + 1], block_size)
+        mean, total = field[rows[b], 0], field[rows[b], 1]
+        number = 0
+        for place in range(ends[b, 0], ends[b, 1]):
+            cell = cells[grouped[place]]
+            number = sum_cell(cell, corners[b], tau, bits, low, high, sums, touched, number)
+        figures[b, OBSERVED], figures[b, MOVED], figures[b, SOLID] = number, 0, number
+        figures[b, NEAR] = number
+        for voxel in touched[:number]:
+            freed[b, voxel >> 6] &= ~(np.int64(1) << (voxel & 63))
+            value, weight = sums[voxel, 0] / sums[voxel, 1] * np.float32(voxel_m), sums[voxel, 1]
+            sums[voxel] = 0.0
+            most = max(total[voxel], np.float32(MEMORY) * weight)
+            most = min(settings[MAX_WEIGHT], most if rates[b] > 0.0 else np.float32(np.inf))
+            weight = max(weight, settings[MIN_WEIGHT])
+            last, so_far = mean[voxel], total[voxel]
+            opposed = (value < 0.0) != (last < 0.0) and last < settings[TAU] and so_far > 0.0
+            if opposed and abs(value) > abs(last) and abs(value - last) > settings[CONTRADICTS]:
+                figures[b, OPPOSED] += 1
+                total[voxel] = max(so_far * (np.float32(1.0) - rates[b]), settings[MIN_WEIGHT])
+                if total[voxel] > np.float32(0.25) * weight:
+                    continue
+            moved = mean[voxel] + (value - mean[voxel]) * (weight / (total[voxel] + weight))
+            weight = min(total[voxel] + weight, most)
+            replace(voxel, moved, weight, settings[LEAST], mean, total, figures[b])
+        for word in range(freed.shape[1]):
+            free_voxels(
+                freed[b, word],
+                64 * word,
+                corners[b],
+                origin,
+                settings,
+                voxel_m,
+                bits,
+                rates[b],
+                mean,
+                total,
+                figures[b],
+            )
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def free_voxels(word, start, corner, origin, settings, voxel_m, bits, rate, mean, total, figures):
+    """
+    Fuse that rays have crossed voxels.
+
+    word         int64, one bit for each of 64 voxels
+    start        the first of these voxels
+    mean, total  (N,) float32, in and out: distances and weights of the block
+    figures      (NUM_FOUND,) int64, in and out
+    """
+    tau_m, least, mask = settings[TAU], settings[MIN_WEIGHT], (1 << bits) - 1
+    keeps = np.float32(1.0) - rate
+    for n in range(64 if word else 0):
+        if word >> n & 1 == 0:
+            continue
+        voxel = start + n
+        figures[OBSERVED] += 1
+        weight = total[voxel]
+        if weight == 0.0:
+            replace(voxel, tau_m, least, settings[LEAST], mean, total, figures)
+        elif mean[voxel] < tau_m:
+            x = corner[0] + (voxel & mask) + 0.5 - origin[0]
+            y = corner[1] + (voxel >> bits & mask) + 0.5 - origin[1]
+            z = corner[2] + (voxel >> 2 * bits) + 0.5 - origin[2]
+            new = np.float32(1.0 / ((x * x + y * y + z * z) * voxel_m * voxel_m))
+            faded, moved = max(weight * keeps**FADING, least), mean[voxel]
+            if moved < 0.0:
+                moved += (tau_m - moved) * max(new / (weight + new), rate)
+            elif faded == least and rate > 0.0:
+                moved = tau_m
+            replace(voxel, moved, faded, settings[LEAST], mean, total, figures)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def replace(voxel, moved, weight, least, mean, total, figures):
+    """Write distance and weight of a voxel; note whether triangles change."""
+    last = mean[voxel]
+    flips = (moved < 0.0) != (last < 0.0) or total[voxel] < least <= weight
+    step = np.int64(JUMP) if flips else np.int64(abs(moved - last) * 1e6)
+    figures[MOVED] = max(figures[MOVED], step)
+    figures[SOLID] = 1
+    figures[INSIDE] += np.int64(moved < 0.0) - np.int64(last < 0.0)
+    mean[voxel], total[voxel] = moved, weight
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

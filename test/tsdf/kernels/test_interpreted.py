@@ -11,18 +11,18 @@ from surfel_mapper.config import TsdfConfig
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
+from surfel_mapper.tsdf.point_integrator import PointIntegrator
 from surfel_mapper.tsdf.queries import sample, states
-from surfel_mapper.tsdf.range_image import from_depth, from_points
-from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
+from surfel_mapper.tsdf.range_image import from_depth
+from surfel_mapper.tsdf.sensors import CameraModel
 
 rng = np.random.default_rng(1)
 camera = CameraModel(columns=24, rows=18, fx=20.0, fy=20.0, cx=12.0, cy=9.0, max_range_m=4.0)
-lidar = LidarModel(rows=5, columns=40, beam_elevations_deg=(20.0, 8.0, 0.0, -6.0, -21.0))
 found = []
-for distance in ('along_ray', 'to_plane'):
+for carve_m in (20.0, 0.0):
     config = TsdfConfig(
         voxel_size_m=0.3, truncation_m=0.7, voxels_per_side=4, color=True,
-        semantics='single', dynamic_labels=[1.0], threads=1, max_radius_m=4.0, distance=distance,
+        semantics='single', dynamic_labels=[1.0], threads=1, max_radius_m=4.0, carve_m=carve_m,
     )
     one = Integrator(BlockMap(config))
     depth = 2.0 + 0.1 * rng.standard_normal((18, 24))
@@ -35,11 +35,15 @@ for distance in ('along_ray', 'to_plane'):
     )
     points = rng.normal(size=(200, 3)) * [2.0, 2.0, 0.5]
     points[::50] = np.nan
-    for number, one_image in enumerate((image, from_points(lidar, points), image)):
+    by_points = PointIntegrator(one.blocks)
+    for number in range(3):
         pose = pose_matrix([0.2 * number, -4.0, 1.0], [0.5, -0.5, 0.5, 0.5])
-        print(one.integrate(one_image, pose, number))
+        if number == 1:
+            print(by_points.integrate(points, pose, number))
+        else:
+            print(one.integrate(image, pose, number))
         one.blocks.clear_updated()
-        print(len(one.blocks.evict(pose[:3, 3], number)))
+        print(len(one.blocks.evict(pose[:3, 3])))
     blocks = one.blocks
     places = rng.normal(size=(50, 3)) + [0.0, -2.0, 1.0]
     sampled = sample(blocks, places)
