@@ -25,7 +25,7 @@ from test.bench.report import Row, table
 
 BENCHES = (
     *('real', 'start', 'live', 'filters', 'lum', 'registration', 'tsdf', 'models', 'paper'),
-    'quality',
+    *('quality', 'adaptive'),
 )
 """Modules of this folder that have run(options) -> list of rows, in the order to run them."""
 

@@ -55,6 +55,22 @@ def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_
     assert all(row['x_numpy'] > 0.0 and row['first_x'] > 0.0 for row in rows)
 
 
+def test_adaptive_surfels_give_rows_of_scans_and_the_job(options, monkeypatch, tmp_path):
+    monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
+    assert [row['every'] for row in bench.run(['adaptive'], options)] == [1, 10]
+
+    folder = tmp_path / 'data' / 'scans'
+    folder.mkdir(parents=True)
+    points = np.random.default_rng(1).uniform(-4.0, 4.0, (60_000, 5)).astype(np.float32)
+    points[:, 2] = 0.06
+    points.tofile(folder / 'nuscenes_hdl32_1532402927647951.pcd.bin')
+    monkeypatch.setenv('SURFEL_MAPPER_TEST_DATA', str(tmp_path))
+    row, *_ = bench.run(['adaptive'], options)
+    assert row['surfels'] == 16  # a floor of 8 m in cells of 2 m
+    assert row['median_deg'] == pytest.approx(0.0, abs=1e-3)
+    assert row['off_%'] == 0.0
+
+
 def test_the_table_of_the_paper_has_rows_for_frames_of_the_user(options, monkeypatch, tmp_path):
     monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
     assert bench.run(['paper'], options) == []
