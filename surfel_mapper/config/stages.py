@@ -61,8 +61,9 @@ class MapConfig(Stage):
     )
     max_bytes: int = setting(
         -1,
-        'The oldest scans are evicted while map and window need more bytes; -1: half of the '
-        'memory of the machine, if the window has a limit; 0: no such limit.',
+        'The oldest scans are evicted while map and window need more bytes, and the farthest '
+        'blocks of the distance field while it needs more than they leave; -1: half of the '
+        'memory of the machine, for scans if the window has a limit; 0: no such limit.',
         low=-1,
         high=2**62,
         live=True,

@@ -208,6 +208,12 @@ With a lidar of 10 Hz a block between the beams is complete after a second or tw
 MOST_FORGOTTEN = 16
 """A measurement forgets at most 1 / 4 of the half-life: a single false one makes no hole."""
 
+ROOM_KEPT = 0.9
+"""Share of the limit that is filled after blocks have left, so that they leave once in a while."""
+
+HASH_BYTES = 32
+"""Bytes of the hash table for a block, at most: an entry of 8 in segments filled to a half."""
+
 PART = 1024
 """Blocks whose voxel centres are computed at a time: 12 MB."""
 
@@ -233,12 +239,18 @@ class BlockMap(BlockArrays):
         The settings.
     version : int
         Number of changes so far.
+    max_bytes : int
+        Limit of ``nbytes``; 0: none.
+    num_evicted : int
+        Number of blocks that left because of it.
 
     """
 
     def __init__(self, config: TsdfConfig) -> None:
         super().__init__(config)
         self.version = 0
+        self.max_bytes = 0
+        self.num_evicted = 0
         self._settled = 0
         self._hash = HashTable(MAX_DEPTH)
         self._state = self._hash.state
@@ -324,6 +336,47 @@ class BlockMap(BlockArrays):
                     self.drop_new(rows[:done])
                     raise
         return rows
+
+    def admit(self, index: Int64, position: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """
+        Make room for the blocks of a scan within ``max_bytes``; the farthest blocks leave.
+
+        Parameters
+        ----------
+        index : (K, 3) int64
+            The blocks, each once; those in the map too.
+        position : (3,) float
+            Place of the sensor in the map frame, m.
+
+        Returns
+        -------
+        (K,) bool
+            The blocks that fit. Others are farther from the sensor than all that stay.
+
+        """
+        fit = np.ones(len(index), bool)
+        allowed = self.max_bytes // self.block_bytes
+        num_new = int((self.find(index) < 0).sum())
+        if not self.max_bytes or self.num_blocks + num_new <= allowed:
+            return fit
+        rows, place = self.rows(), np.asarray(position, np.float64) / self.config.block_size_m
+        apart, away = (
+            np.linalg.norm(blocks + 0.5 - place, axis=1) for blocks in (self.index(rows), index)
+        )
+        every = np.concatenate([apart, away[self.find(index) < 0]])
+        number = int(ROOM_KEPT * allowed)
+        reach = np.partition(every, number)[number] if number < len(every) else np.inf
+        leaving = rows[apart >= reach]
+        self.num_evicted += len(leaving)
+        for first in range(0, len(leaving), PART):
+            self.remove(leaving[first : first + PART])
+        fit &= away < reach
+        return fit
+
+    @property
+    def block_bytes(self) -> int:
+        """Bytes of a block, with its part of the hash table."""
+        return self._row_bytes + HASH_BYTES
 
     def touch(self, rows: Int64, stamp_ns: int) -> None:
         """Mark blocks as changed in any way at a stamp; increments the version."""

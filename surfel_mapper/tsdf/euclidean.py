@@ -85,6 +85,11 @@ class EuclideanField:
         self._observed: Flags = np.empty((0, 0, 0), bool)
         self._state: tuple[float, ...] = ()
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes used by the distances."""
+        return self._squared.nbytes + self._observed.nbytes
+
     def update(self, center: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """
         Compute the distances of the present map.

@@ -113,12 +113,13 @@ class Integrator:
         T = checked_pose(T_map_sensor)
         self._warn_of_radius(image.sensor)
         image = self._labelled(image)
-        selected = self._selection.blocks(image, T)
-        index, blocks = selected.index, self.blocks
+        blocks, selected = self.blocks, self._selection.blocks(image, T)
+        fit = blocks.admit(selected.index, T[:3, 3])
+        index, near = selected.index[fit], selected.near[fit]
         num_before = blocks.num_blocks
         rows = blocks.place(index)
         try:
-            skipped = ~selected.near & blocks.settled(rows)
+            skipped = ~near & blocks.settled(rows)
             blocks.head[rows[skipped], STAMP] = stamp_ns
             fused = ~skipped
             figures = self._fuse(image, T, stamp_ns, index[fused], rows[fused])

@@ -90,6 +90,11 @@ class BlockMesh(Mesh):
     edges: Int32
 
 
+def size_of(mesh: BlockMesh | None) -> int:
+    """Return the bytes of a mesh; 0 without one."""
+    return sum(array.nbytes for array in vars(mesh).values()) if mesh is not None else 0
+
+
 @dataclass(frozen=True, kw_only=True)
 class Changes:
     """
@@ -144,6 +149,7 @@ class Mesher:
         self._version = -1
         self._keys: set[int] = set()
         self._meshes: dict[int, BlockMesh] = {}
+        self._nbytes = 0
 
     def update(self) -> int:
         """
@@ -208,14 +214,21 @@ class Mesher:
 
     def apply(self, changes: Changes) -> set[int]:
         """Make the triangles of changed blocks; return the keys of blocks with new triangles."""
-        touched = {key for key in changes.emptied if self._meshes.pop(key, None) is not None}
-        for key, mesh in zip(changes.keys.tolist(), self._marched(changes), strict=True):
+        touched = set()
+        meshes = zip(changes.keys.tolist(), self._marched(changes), strict=True)
+        for key, mesh in (*((key, None) for key in changes.emptied), *meshes):
+            last = self._meshes.pop(key, None)
             if mesh is not None:
                 self._meshes[key] = mesh
+            if mesh is not None or last is not None:
                 touched.add(key)
-            elif self._meshes.pop(key, None) is not None:
-                touched.add(key)
+            self._nbytes += size_of(mesh) - size_of(last)
         return touched
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes used by the triangles."""
+        return self._nbytes
 
     def mesh(self) -> BlockMesh:
         """Return the triangles of all blocks with welded vertices."""

@@ -99,8 +99,8 @@ class ScanBlocks:
     ----------
     index : (B, 3) int64
         Block indices.
-    first : (B + 1,) int64
-        First place of each block in grouped.
+    ends : (B, 2) int64
+        First and last place of each block in grouped.
     grouped : (P,) int32
         Surface cells of each block.
     freed : (B, words) int64
@@ -109,9 +109,20 @@ class ScanBlocks:
     """
 
     index: Int64
-    first: Int64
+    ends: Int64
     grouped: npt.NDArray[np.int32]
     freed: Int64
+
+    def only(self, kept: npt.NDArray[np.bool_]) -> ScanBlocks:
+        """Return some of the blocks."""
+        if kept.all():
+            return self
+        return ScanBlocks(
+            index=self.index[kept],
+            ends=self.ends[kept],
+            grouped=self.grouped,
+            freed=self.freed[kept],
+        )
 
 
 class PointIntegrator:
@@ -219,6 +230,12 @@ class PointIntegrator:
             )
         return np.asarray(corner, np.int64)
 
+    def _position(self, frame: tuple[Float64, Int64]) -> Float64:
+        """Return the place of the sensor in the map frame, m."""
+        config, (origin, corner) = self.blocks.config, frame
+        position: Float64 = (origin + corner * config.voxels_per_side) * config.voxel_size_m
+        return position
+
     def _cells(self, scaled: Float64, solid: npt.NDArray[np.bool_], origin: Float64) -> ScanCells:
         """Return the points by voxel; free rays end at the range up to which they free."""
         config = self.blocks.config
@@ -276,7 +293,8 @@ class PointIntegrator:
         first, grouped = np.zeros(number + 1, np.int64), np.empty(num_pairs, np.int32)
         kernels.group_pairs(pairs[:num_pairs], first, grouped)
         index = block_index(keys[:number]) + corner
-        return ScanBlocks(index=index, first=first, grouped=grouped, freed=freed[:number])
+        ends = np.column_stack([first[:-1], first[1:]])
+        return ScanBlocks(index=index, ends=ends, grouped=grouped, freed=freed[:number])
 
     def _fuse(
         self,
@@ -288,11 +306,12 @@ class PointIntegrator:
     ) -> Integrated:
         """Fuse a scan into its blocks."""
         blocks = self.blocks
+        scan = scan.only(blocks.admit(scan.index, self._position(frame)))
         num_before = blocks.num_blocks
         rows = blocks.place(scan.index)
         try:
             rates = blocks.forgetting_rates(rows, stamp_ns)
-            skipped = (np.diff(scan.first) == 0) & blocks.settled(rows)
+            skipped = (scan.ends[:, 0] == scan.ends[:, 1]) & blocks.settled(rows)
             blocks.head[rows[skipped], STAMP] = stamp_ns
             fused = np.flatnonzero(~skipped)
             figures = self._figures(scan, cells, frame, (rows, rates, fused))
@@ -326,8 +345,7 @@ class PointIntegrator:
         corners = (scan.index[fused] - corner) * config.voxels_per_side
         figures = np.zeros((len(fused), NUM_FOUND), np.int64)
         figures[:, INSIDE] = self.blocks.head[rows[fused], BEHIND]
-        ends = np.column_stack([scan.first[:-1], scan.first[1:]])[fused]
-        per_block = rows[fused], corners, rates[fused], ends, scan.freed[fused]
+        per_block = rows[fused], corners, rates[fused], scan.ends[fused], scan.freed[fused]
         common = settings(config), config.voxel_size_m, self._bits, self.blocks.field
 
         def fuse(chunk: slice) -> None:

@@ -141,6 +141,22 @@ def test_blocks_out_of_reach_leave():
     assert np.abs(radii(mesh, (100.0, 0.0, 0.0)) - RADIUS_M).max() <= 0.05
 
 
+def test_the_memory_of_a_drive_is_bounded_and_the_surroundings_are_right(caplog):
+    small = {'map.max_bytes': 24 << 20, 'layers.tsdf.carve_m': 20.0, 'window.max_scans': 2}
+    mapper = mapper_with(**small, **{'layers.tsdf.voxel_size_m': 0.1})
+    for number in range(1, 12):
+        insert(mapper, number, (10.0 * number, 0.0, 0.0))
+    summary = mapper.tsdf.summary()
+    assert summary['bytes'] <= 24 << 20
+    assert summary['blocks_evicted'] > 0
+    assert 'map.max_bytes' in caplog.text
+    near = [v for v in mapper.tsdf.mesh().vertices if v[0] > 107.0]
+    assert len(near) > 1000
+    assert (
+        np.abs(np.linalg.norm(near - np.array([110.0, 0.0, 0.0]), axis=1) - RADIUS_M).max() < 0.1
+    )
+
+
 def test_colours_and_labels_of_points_enter():
     rgb = np.full(len(RING), (200 << 16) | (100 << 8) | 50, np.uint32)
     label = np.full(len(RING), 7, np.int32)

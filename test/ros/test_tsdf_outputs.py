@@ -32,7 +32,6 @@ SETTINGS = {
     'layers.tsdf.mesh_rate_hz': 10.0,
     'layers.tsdf.slice_rate_hz': 10.0,
     'layers.tsdf.slice_height_m': 0.5,
-    'layers.tsdf.sensor_columns': 360,
 }
 
 MESHES = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)

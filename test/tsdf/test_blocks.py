@@ -163,3 +163,24 @@ def test_blocks_do_not_come_and_go_where_the_radius_holds_all_that_is_seen(caplo
     assert [record.message.split(':')[0] for record in caplog.records] == [
         'layers.tsdf.max_radius_m'
     ]
+
+
+def test_beyond_the_limit_the_farthest_blocks_leave():
+    blocks = filled_along_x()  # -5 to 5
+    blocks.max_bytes = 10 * blocks.block_bytes
+    scan = np.array([[0, 0, 0], [0, 1, 0], [0, 2, 0], [0, 20, 0]])
+    fit = blocks.admit(scan, [0.5, 0.5, 0.5])
+    assert fit.tolist() == [True, True, True, False]
+    blocks.place(scan[fit])
+    assert left_along_x(blocks) == sorted([*range(-3, 4), 0, 0])
+    assert blocks.num_evicted == 4
+    assert blocks.num_blocks * blocks.block_bytes <= blocks.max_bytes
+
+
+def test_within_the_limit_all_blocks_stay():
+    blocks = filled_along_x()
+    for max_bytes in (0, 12 * blocks.block_bytes):
+        blocks.max_bytes = max_bytes
+        assert blocks.admit(np.array([[0, 9, 0]]), np.zeros(3)).all()
+        assert len(blocks.rows()) == 11
+    assert blocks.num_evicted == 0

@@ -231,6 +231,30 @@ def test_rays_beside_a_thin_pole_do_not_erase_it():
     assert (nearest < VOXEL_M).mean() > 0.95
 
 
+def test_a_scan_beyond_the_limit_is_right_within_the_radius_that_fits():
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(4000, 3))
+    points *= rng.uniform(1.0, 49.0, (4000, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    whole, limited = (
+        integrator(voxel_size_m=0.1, max_range_m=50.0),
+        integrator(voxel_size_m=0.1, max_range_m=50.0),
+    )
+    whole.integrate(points, np.eye(4))
+    limited.blocks.max_bytes = 40 << 20
+    limited.integrate(points, np.eye(4))
+    assert limited.blocks.nbytes <= 41 << 20 < whole.blocks.nbytes
+    rows, copies = (
+        whole.blocks.rows(),
+        limited.blocks.find(whole.blocks.index(whole.blocks.rows())),
+    )
+    apart_m = np.linalg.norm((whole.blocks.index(rows) + 0.5) * 0.8, axis=1)
+    inner = apart_m < apart_m[copies < 0].min()
+    assert inner.sum() > 5000
+    np.testing.assert_array_equal(
+        limited.blocks.field[copies[inner]], whole.blocks.field[rows[inner]]
+    )
+
+
 def test_points_that_are_no_measurements_change_nothing():
     points = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [0.1, 0.1, 0.0]])
     blocks = fused(points)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 import itertools
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ from surfel_mapper.layers.sensor_models import (
 )
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.memory import machine_bytes
 from surfel_mapper.messages.grids import occupancy_grid
 from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
 from surfel_mapper.scan import Scan
@@ -55,11 +57,22 @@ from surfel_mapper.tsdf.measurements import Integrated
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
 
+logger = logging.getLogger(__name__)
+
 IMAGE_TOLERANCE_S = 0.02
 """An image belongs to a scan if their stamps differ by no more, s: less than half an image."""
 
+LEAST_BYTES = 16 << 20
+"""Memory that the field has at least: 20 m about the sensor at 0.25 m."""
+
 MESHES_KEPT = 8
 """Messages of ~/mesh that its publisher keeps for slow readers: 32 MiB."""
+
+
+def limit_bytes(config: Config) -> int:
+    """Return the bytes that ``map.max_bytes`` allows; 0: no limit."""
+    wanted = config.map.max_bytes
+    return machine_bytes() // 2 if wanted < 0 else wanted
 
 
 class TsdfLayer(Layer):
@@ -107,6 +120,7 @@ class TsdfLayer(Layer):
         self._position: npt.NDArray[np.float64] = np.zeros(3)
         self._waiting: dict[tuple[str, int], Scan] = {}
         self._num_scans = 0
+        self._has_evicted = False
 
     def follow(self, inserted: InsertedScan) -> list[Integrated]:
         """
@@ -147,6 +161,7 @@ class TsdfLayer(Layer):
 
         """
         scan, T_map_sensor = self.around.sensors.centered(scan, T_map_sensor)
+        self._limit()
         sensor = self.around.sensors.camera_of(scan)
         self.blocks.clear_updated()
         config = self.config.tsdf
@@ -163,6 +178,25 @@ class TsdfLayer(Layer):
         self.blocks.evict(self._position)
         self._num_scans += 1
         return done
+
+    def _limit(self) -> None:
+        """Limit the field to the part of ``map.max_bytes`` that nothing else uses."""
+        limit = limit_bytes(self.config)
+        if not limit:
+            self.blocks.max_bytes = 0
+            return
+        meshes = self._mesher.nbytes + self._live_mesh.nbytes + self._whole_mesh.nbytes
+        used = self.around.surfel_map.nbytes + self.around.window.nbytes
+        free = limit - used - meshes - self._esdf.nbytes
+        self.blocks.max_bytes = max(free, LEAST_BYTES)
+        if self.blocks.num_evicted and not self._has_evicted:
+            self._has_evicted = True
+            logger.warning(
+                'layers.tsdf: the farthest of %d blocks leave, because map.max_bytes of %d is '
+                'reached',
+                self.blocks.num_blocks,
+                limit,
+            )
 
     @property
     def field(self) -> DistanceField:
@@ -229,6 +263,7 @@ class TsdfLayer(Layer):
             'waiting': len(self._waiting),
             'blocks': self.blocks.num_blocks,
             'bytes': self.blocks.nbytes,
+            'blocks_evicted': self.blocks.num_evicted,
             'voxel_size_m': self.config.tsdf.voxel_size_m,
         }
 

@@ -93,6 +93,11 @@ class LiveMesh:
         self._numbers: dict[Tile, int] = {}
         self._is_known = False
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes used by the triangles."""
+        return self._mesher.nbytes
+
     def prepare(self) -> bool:
         """Copy some of the changed blocks; return True once all are; called by the map's owner."""
         return self._changed.copy_next()
@@ -156,6 +161,11 @@ class WholeMesh:
     def __init__(self, blocks: BlockMap) -> None:
         self._mesher = Mesher(blocks, visible_only=True)
         self._changed = ChangedBlocks(self._mesher)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes used by the triangles."""
+        return self._mesher.nbytes
 
     def prepare(self) -> bool:
         """Copy some of the changed blocks; return True once all are; called by the map's owner."""
