@@ -24,8 +24,8 @@ from test.bench.options import cache_directory, Options
 from test.bench.report import Row, table
 
 BENCHES = (
-    *('real', 'start', 'live', 'filters', 'lum', 'registration', 'tsdf', 'models', 'paper'),
-    *('quality', 'adaptive'),
+    *('real', 'start', 'live', 'robot', 'filters', 'lum', 'registration', 'tsdf', 'models'),
+    *('paper', 'quality', 'adaptive'),
 )
 """Modules of this folder that have run(options) -> list of rows, in the order to run them."""
 

@@ -221,7 +221,8 @@ def listening() -> Iterator[Any]:
     class Listener:
         """Records arrivals of changes by stamp."""
 
-        def __init__(self, listen_until: Listen) -> None:
+        def __init__(self, node: Any, listen_until: Listen) -> None:
+            self.node = node
             self.arrivals: dict[int, int] = {}
             self.listen_until = listen_until
 
@@ -231,7 +232,7 @@ def listening() -> Iterator[Any]:
 
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     with spinning() as (node, listen_until):
-        listener = Listener(listen_until)
+        listener = Listener(node, listen_until)
         node.create_subscription(PointCloud2, '/surfel_mapper/changed', listener.on_changed, 50)
         node.create_subscription(PointCloud2, '/surfel_mapper/normals', lambda _: None, latched)
         yield listener

@@ -38,6 +38,12 @@ AFTER_S = 5.0
 """Unread messages vanish with their publisher, and none learns what its reader has read."""
 
 
+K = [525.0, 0.0, 319.5, 0.0, 525.0, 239.5, 0.0, 0.0, 1.0]
+"""Calibration of the depth camera."""
+
+P = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
+
+
 def main(arguments):
     """Publish clouds at a rate, and write their stamps to a file as JSON; or the odometry."""
     import rclpy
@@ -56,16 +62,15 @@ def main(arguments):
 
 def publish_clouds(node, street, settings):
     """Publish the clouds of a drive; return their stamps."""
-    from sensor_msgs.msg import PointCloud2
-
     from surfel_mapper.memory import keep_freed_memory
 
     keep_freed_memory()
-    clouds = [ros_cloud(street.message(number)) for number in range(settings['scans'])]
-    publisher = node.create_publisher(PointCloud2, 'points', 10)
+    publishers, clouds = sensors(node, street, settings)
     with odometry_process(settings) as odometry:
-        wait_for_reader(publisher)
-        assert odometry.stdout.readline() == 'ready\n'
+        for publisher in publishers:
+            wait_for_reader(publisher)
+        while (line := odometry.stdout.readline()) != 'ready\n':  # Fast DDS warns there too
+            assert line, 'the odometry has ended'
         start_ns = time.time_ns() + round(2.0 * LEAD_S * 1e9)
         print(start_ns, file=odometry.stdin, flush=True)
         stamps = []
@@ -73,11 +78,40 @@ def publish_clouds(node, street, settings):
             stamp_ns = start_ns + round(number / settings['rate_hz'] * 1e9)
             cloud = clouds[round(place(stamp_ns - start_ns, settings))]
             cloud.header.stamp.sec, cloud.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+            if len(publishers) > 1:
+                cloud.header.frame_id = f'lidar_{number % len(publishers)}'
             sleep_until(stamp_ns)
-            publisher.publish(cloud)
+            publishers[number % len(publishers)].publish(cloud)
             stamps.append(stamp_ns)
         time.sleep(AFTER_S)
     return stamps
+
+
+def sensors(node, street, settings):
+    """Return the publishers of the sensors, which take turns, and their messages."""
+    from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+    topics = settings.get('topics', ['points'])
+    if topics == ['depth/image']:
+        info = CameraInfo(height=480, width=640, k=K, p=P)
+        info.header.frame_id = 'camera'
+        calibration = node.create_publisher(CameraInfo, 'depth/camera_info', 10)
+        publisher = node.create_publisher(Image, topics[0], 10)
+        wait_for_reader(calibration)
+        calibration.publish(info)
+        return [publisher], [depth_image(Image, number) for number in range(settings['scans'])]
+    clouds = [ros_cloud(street.message(number)) for number in range(settings['scans'])]
+    return [node.create_publisher(PointCloud2, topic, 10) for topic in topics], clouds
+
+
+def depth_image(kind, number):
+    """Return an image of 640 x 480 of a wavy wall, 2 to 4 m away, in mm."""
+    row, column = np.mgrid[:480, :640]
+    depth = 3000.0 + 1000.0 * np.sin(0.02 * row + 0.013 * column + 0.1 * number)
+    content = array('B', depth.astype('<u2').tobytes())
+    message = kind(height=480, width=640, encoding='16UC1', step=1280, data=content)
+    message.header.frame_id = 'camera'
+    return message
 
 
 def publish_odometry(node, street, settings):

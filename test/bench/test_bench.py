@@ -12,7 +12,7 @@ import pytest
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.messages.pointcloud2 import from_columns
 from test.bench import __main__ as bench
-from test.bench import paper, quality, real
+from test.bench import paper, quality, real, robot
 from test.bench.options import Options
 from test.models.scenes import sheet
 from test.offline.test_depth_folders import tum
@@ -168,3 +168,13 @@ def test_references_tell_one_plane_from_two_and_from_undetermined_ones():
 def test_quality_without_recordings_has_no_rows(options, monkeypatch):
     monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
     assert bench.run(['quality'], options) == []
+
+
+def test_the_floor_of_the_robot_is_measured_over_dds(options, monkeypatch):
+    pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+    monkeypatch.setattr(robot, 'FLOORS', robot.FLOORS[:1])
+    monkeypatch.setattr(robot, 'CASES', ())
+    (row,) = bench.run(['robot'], options)
+    cells = [row[name] for name in ('case', 'hz', 'clouds', 'dropped')]
+    assert cells == ['bare subscriber', '10', 9, 0]
+    assert 0.0 < row['p50_ms'] <= row['p99_ms']
