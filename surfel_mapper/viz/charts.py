@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Plots of the report as SVG: lines over time, histograms, and bars with names.
+Plots of the report as SVG: lines over time and histograms.
 
 matplotlib draws them. Text stays text, and the colours are CSS variables of the page
 (page/report.css), so that plots follow its light or dark style: each element is drawn in a
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from html import escape
 import io
 import itertools
 import re
@@ -22,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import escaped
+from surfel_mapper.viz.markup import as_html
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,9 +31,6 @@ Array = npt.NDArray[np.float64]
 
 WIDTH, HEIGHT = 520, 220
 """Size of a plot in the units of its viewBox, px when not scaled."""
-
-ROW_HEIGHT = 24
-"""Height of a named bar, px."""
 
 POINTS = 400
 """Most points of a line; longer lines are reduced to the median of each stretch."""
@@ -101,14 +98,13 @@ def lines(x: Array, series: Mapping[str, Array], x_label: str, y_label: str) -> 
     if not drawn:
         return NO_DATA
     top = max(highest(y[np.isfinite(y)]) for _, y in drawn.values())
-    with _axes(HEIGHT, with_numbers=True) as (figure, axes):
+    with _axes() as (figure, axes):
         for number, (name, (xs, values)) in enumerate(drawn.items()):
             color = LINES[number % len(LINES)]
             axes.plot(xs, values, color=color, linewidth=1.6, label=_visible(name))
         axes.set(ylim=(0.0, top * 1.2 or 1.0), xlabel=x_label, ylabel=y_label)
         if x[-1] > x[0]:
             axes.set_xlim(x[0], x[-1])
-        _label_numbers(axes)
         axes.legend(loc='upper left', ncols=5, columnspacing=1.2)
         return _svg(figure, f'{y_label} by {x_label}')
 
@@ -125,7 +121,7 @@ def histogram(values: Array, low: float, high: float, x_label: str, y_label: str
     starts, ends, bottom, top = edges[:-1], edges[1:], np.zeros(NUM_BINS), counts
     corners = [(starts, bottom), (starts, top), (ends, top), (ends, bottom)]
     bars = list(np.transpose(corners, (2, 0, 1)))
-    with _axes(HEIGHT, with_numbers=True) as (figure, axes):
+    with _axes() as (figure, axes):
         # two thirds of the time of as many single bars
         axes.add_collection(PolyCollection(bars, color=BAR, linewidth=0.0))
         axes.set(
@@ -134,26 +130,7 @@ def histogram(values: Array, low: float, high: float, x_label: str, y_label: str
             xlabel=x_label,
             ylabel=y_label,
         )
-        _label_numbers(axes)
         return _svg(figure, f'{y_label} by {x_label}')
-
-
-def named_bars(counts: Mapping[str, int]) -> str:
-    """Return a horizontal bar for each name, labelled with its count."""
-    if not counts:
-        return NO_DATA
-    with _axes(ROW_HEIGHT * len(counts) + 10) as (figure, axes):
-        rows = np.arange(len(counts))
-        bars = axes.barh(rows, list(counts.values()), 0.65, color=BAR)
-        axes.bar_label(bars, labels=[f'{count:,}' for count in counts.values()], padding=4)
-        axes.set_yticks(rows, [escaped(name) for name in counts])
-        axes.set_ylim(len(counts) - 0.5, -0.5)
-        axes.set_xlim(0.0, 1.15 * max(*counts.values(), 1))
-        axes.set_axisbelow(True)
-        axes.grid(visible=False)
-        axes.xaxis.set_visible(False)
-        axes.spines['bottom'].set_visible(False)
-        return _svg(figure, ', '.join(f'{name}: {count}' for name, count in counts.items()))
 
 
 def thinned(x: Array, y: Array) -> tuple[Array, Array]:
@@ -183,38 +160,30 @@ def short(value: float) -> str:
 
 
 @contextmanager
-def _axes(height: float, *, with_numbers: bool = False) -> Iterator[tuple[Figure, Axes]]:
+def _axes() -> Iterator[tuple[Figure, Axes]]:
     """
     Make a figure with one pair of axes in the style of the page.
 
-    Labels that are numbers have fixed margins: to measure every label takes twice the time.
+    Labels are short numbers in fixed margins: to measure every label takes twice the time.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH / 72.0, height / 72.0), dpi=72)
-        if with_numbers:
-            box = (LEFT, BOTTOM, WIDTH - LEFT - RIGHT, height - BOTTOM - TOP)
-            axes = figure.add_axes(tuple(np.divide(box, (WIDTH, height, WIDTH, height))))
-        else:
-            figure.set_layout_engine('constrained')
-            axes = figure.add_subplot()
+        figure = Figure(figsize=(WIDTH / 72.0, HEIGHT / 72.0), dpi=72)
+        box = (LEFT, BOTTOM, WIDTH - LEFT - RIGHT, HEIGHT - BOTTOM - TOP)
+        axes = figure.add_axes(tuple(np.divide(box, (WIDTH, HEIGHT, WIDTH, HEIGHT))))
         axes.grid(visible=True, axis='y')
         axes.set_axisbelow(True)
+        axes.locator_params(nbins=6)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(lambda value, _: short(value))
         yield figure, axes
 
 
 def _visible(name: str) -> str:
     """Return a name as text that is drawn; matplotlib hides those that begin with _."""
     return f'\u200b{escaped(name)}' if name.startswith('_') else escaped(name)
-
-
-def _label_numbers(axes: Axes) -> None:
-    """Label the ticks of both axes with short numbers."""
-    axes.locator_params(nbins=6)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(lambda value, _: short(value))
 
 
 def _svg(figure: Figure, about: str) -> str:
@@ -230,8 +199,3 @@ def _svg(figure: Figure, about: str) -> str:
         text = text.replace(color, variable)
     label = as_html(about)
     return text.replace('<svg', f'<svg role="img" aria-label="{label}"', 1)
-
-
-def as_html(text: object) -> str:
-    """Return text for a page: control characters, tags and quotes are escaped."""
-    return escape(escaped(str(text)))

@@ -26,14 +26,13 @@ from surfel_mapper.layers.drawings import (
     PointsPicture,
     Section,
     ShapesPanel,
-    Table,
 )
 from surfel_mapper.models.shapes import CORNERS, FACES
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
-from surfel_mapper.viz.charts import as_html
 from surfel_mapper.viz.discs import as_bytes, DrawnDiscs
+from surfel_mapper.viz.markup import as_html, html_figures, html_table
 from surfel_mapper.viz.mesh import MAX_TRIANGLES
-from surfel_mapper.viz.rendering import Camera, rendered
+from surfel_mapper.viz.rendering import Camera, rendered, round_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -179,8 +178,7 @@ def sides_of(panel: ShapesPanel, R: Array) -> tuple[Array, Array]:
 def draw_scale(ax: Axes, low: Array, high: Array) -> None:
     """Draw a bar of 1, 2 or 5 times a power of ten metres in the lower left corner."""
     width, height = high - low
-    power = 10.0 ** np.floor(np.log10(BAR_SHARE * width))
-    length_m = max(step * power for step in (1, 2, 5) if step * power <= BAR_SHARE * width)
+    length_m = round_length(BAR_SHARE * width)
     x, y = low[0] + 0.03 * width, low[1] + 0.04 * height
     ax.plot([x, x + length_m], [y, y], color='black', linewidth=3.0, solid_capstyle='butt')
     text = f'{length_m:g} m' if length_m >= 1.0 else f'{100.0 * length_m:g} cm'
@@ -271,36 +269,14 @@ def section_html(section: Section, picture: str | Path | None = None) -> str:
         The picture of the section, a PNG file.
 
     """
-    cells = ''.join(
-        f'<div><dt>{as_html(k)}</dt><dd>{as_html(v)}</dd></div>'
-        for k, v in section.figures.items()
-    )
-    elements = [f'<h2>{as_html(section.title)}</h2>']
-    if cells:
-        elements.append(f'<dl class="figures">{cells}</dl>')
+    elements = [f'<h2>{as_html(section.title)}</h2>', html_figures(section.figures)]
     if picture is not None:
         png = base64.b64encode(Path(picture).read_bytes()).decode()
         alt = f'picture: {as_html(section.title)}'
         elements.append(f'<img class="wide" alt="{alt}" src="data:image/png;base64,{png}">')
     if section.table is not None:
-        elements.append(table_html(section.table))
+        table = section.table
+        elements.append(html_table(table.titles, table.rows, table.num_texts, table.colors))
     if section.note:
         elements.append(f'<p class="none">{as_html(section.note)}</p>')
     return ''.join(elements)
-
-
-def table_html(table: Table) -> str:
-    """Return a table as HTML, with a swatch of colour before each row."""
-    num_texts = table.num_texts
-
-    def cells(tag: str, values: Sequence[str]) -> str:
-        texts = ''.join(f'<{tag}>{as_html(value)}</{tag}>' for value in values[:num_texts])
-        numbers = (f'<{tag} class="number">{as_html(v)}</{tag}>' for v in values[num_texts:])
-        return texts + ''.join(numbers)
-
-    rows = []
-    for values, color in zip(table.rows, np.asarray(table.colors), strict=True):
-        red, green, blue = np.rint(255.0 * color[:3]).astype(int)
-        swatch = f'<td class="swatch" style="background: rgb({red} {green} {blue})"></td>'
-        rows.append(f'<tr>{swatch}{cells("td", values)}</tr>')
-    return f'<table><tr><th></th>{cells("th", table.titles)}</tr>{"".join(rows)}</table>'

@@ -22,7 +22,7 @@ from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs, label_of, shaded
 from surfel_mapper.viz.framing import best_direction, ceiling_m, ground_m, mass_box, upright
-from surfel_mapper.viz.rendering import Camera, fitted, rendered
+from surfel_mapper.viz.rendering import Camera, fitted, rendered, round_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,10 +56,6 @@ BALL_PX, BAR_PX = 80, (220, 14)
 RED, GREEN, GRID, INK = '#d62728', '#2ca02c', '#dcdfe2', '#4a5054'
 LINE, LINE_ALPHA, IN_FRONT_M = 0.25, 0.25, 0.3
 """Grey and opacity of the lines of the ground; what is higher by more than this hides them, m."""
-
-
-STEPS = np.array([1.0, 2.0, 5.0])
-"""Digits of round lengths."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -362,13 +358,6 @@ def draw_legend(figure: Figure, scene: MapScene, camera: Camera, colouring: Colo
         figure.colorbar(values, cax=ax, orientation='horizontal')
         ax.tick_params(labelsize=TEXT_PT, colors=INK)
         ax.locator_params(nbins=4)
-
-
-def round_length(most: float) -> float:
-    """Return the largest of 1, 2, 5, 10, 20, ... that is at most a length."""
-    power = 10.0 ** np.floor(np.log10(most))
-    digits = STEPS[STEPS * power <= most * (1.0 + 1e-9)]
-    return float(power * digits[-1])
 
 
 def digits_of(camera: Camera, origin_m: Array) -> int:

@@ -172,3 +172,10 @@ def facing_discs(camera: Camera, discs: DrawnDiscs) -> tuple[npt.NDArray[np.int6
     drawn[:, 4] = scale
     drawn[:, 5:] = normal
     return rows, drawn
+
+
+def round_length(most: float) -> float:
+    """Return the largest of 1, 2, 5, 10, 20, ... that is at most a length."""
+    power = 10.0 ** np.floor(np.log10(most))
+    digits = [step for step in (1, 2, 5) if step * power <= most * (1.0 + 1e-9)]
+    return float(power * digits[-1])

@@ -27,8 +27,9 @@ from surfel_mapper.counters import decimals, STAGES
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.charts import as_html, histogram, lines, named_bars, short
+from surfel_mapper.viz.charts import histogram, lines, short
 from surfel_mapper.viz.history import History
+from surfel_mapper.viz.markup import as_html, html_figures, html_table
 from surfel_mapper.viz.turning_view import turning_view
 
 POLICY = (
@@ -177,27 +178,25 @@ def figures(summary: Mapping[str, Any], history: History, surfels: Surfels) -> s
         shown['recorded'] = f'{summary["recorded_s"]:.1f} s'
     if 'total' in summary['milliseconds']:
         shown['time a scan (median)'] = f'{summary["milliseconds"]["total"]["median"]:.1f} ms'
-    cells = ''.join(f'<div><dt>{k}</dt><dd>{as_html(v)}</dd></div>' for k, v in shown.items())
-    return f'<dl class="figures">{cells}</dl>'
+    return html_figures(shown)
 
 
 def tracking_table(registration: Mapping[str, Any]) -> str:
     """Return the scans of doubtful poses by reason and the parts that stayed apart, as HTML."""
     if 'tracking' not in registration:
         return ''
-    states = ''.join(
-        f'<tr><td>{as_html(STATES.get(state, state))}</td><td class="number">{spent["scans"]}</td>'
-        f'<td class="number">{spent["seconds"]:.1f}</td></tr>'
+    rows = [
+        (STATES.get(state, state), spent['scans'], f'{spent["seconds"]:.1f}')
         for state, spent in registration['tracking'].items()
         if spent['scans']
-    )
+    ]
     paragraphs = ''.join(
         f'<p>apart_{number}: {track["scans"]} scans from {track["first_s"]:.3f} to '
         f'{track["last_s"]:.3f} s have no certain place on the map: {as_html(track["reason"])}</p>'
         for number, track in enumerate(registration['apart'], start=1)
     )
-    head = '<tr><th>scans</th><th class="number">number</th><th class="number">s</th></tr>'
-    table = f'<table>{head}{states}</table>' if states else '<p class="none">None.</p>'
+    none = '<p class="none">None.</p>'
+    table = html_table(('scans', 'number', 's'), rows) if rows else none
     return f'<h2>Scans of doubtful pose</h2>{table}{paragraphs}'
 
 
@@ -221,8 +220,6 @@ def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str
         'Slope of the surfels': histogram(
             slope, 0.0, 90.0, 'angle of the normal to the vertical (deg)', 'surfels'
         ),
-        'Scans by outcome': named_bars(fates(summary)),
-        'Points left out': named_bars(named(summary.get('points_left_out', {}))),
     }
     if history.dropped.any():
         charts['Scans dropped so far'] = lines(seconds, dropped, 'time (s)', 'scans')
@@ -231,15 +228,23 @@ def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str
         for name, chart in charts.items()
         if chart
     )
-    return f'<h2>Figures</h2><div class="plots">{shown}</div>'
+    counts_by_name = {**fates(summary), **points_left_out(summary)}
+    table = html_table((), [(name, f'{count:,}') for name, count in counts_by_name.items()])
+    return f'<h2>Figures</h2><div class="plots">{shown}</div>{table}'
+
+
+def points_left_out(summary: Mapping[str, Any]) -> dict[str, int]:
+    """Return the number of points left out, by cause."""
+    causes = named(summary.get('points_left_out', {}))
+    return {f'points left out: {cause}': number for cause, number in causes.items()}
 
 
 def fates(summary: Mapping[str, Any]) -> dict[str, int]:
     """Return the number of scans mapped, and of others by cause."""
     scans = summary['scans']
-    gated = {'left out by the motion gate': scans['gated']} if scans['gated'] else {}
-    dropped = {f'dropped: {cause}': n for cause, n in named(scans['dropped']).items()}
-    return {'mapped': scans['mapped'], **gated, **dropped}
+    gated = {'scans left out, too near to the last': scans['gated']} if scans['gated'] else {}
+    dropped = {f'scans dropped: {cause}': n for cause, n in named(scans['dropped']).items()}
+    return {'scans mapped': scans['mapped'], **gated, **dropped}
 
 
 def named(counts: Mapping[str, int]) -> dict[str, int]:
@@ -251,38 +256,27 @@ def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
     """Return a table of pose errors; an empty string if the true poses are unknown."""
     if errors is None:
         return ''
-    rows = ''
+    kinds = ('rmse', 'mean', 'median', 'max')
+    rows = []
     for kind in ('absolute', 'relative'):
         for name, unit, factor in (('translation_m', 'mm', 1e3), ('rotation_deg', 'deg', 1.0)):
             error = errors[kind][name]
-            cells = ''.join(
-                f'<td class="number">{decimals(error[figure], factor)}</td>'
-                for figure in ('rmse', 'mean', 'median', 'max')
-            )
-            rows += f'<tr><td>{kind}, {unit}</td>{cells}</tr>'
-    head = ''.join(f'<th class="number">{name}</th>' for name in ('rmse', 'mean', 'median', 'max'))
+            numbers = [decimals(error[figure], factor) for figure in kinds]
+            rows.append([f'{kind}, {unit}', *numbers])
     drift_m, drift_deg = errors['drift_m_per_100m'], errors['drift_deg_per_100m']
     drift = (
         f'{errors["num_poses"]} poses compared; drift {decimals(drift_m)} m and '
         f'{decimals(drift_deg)} deg in 100 m.'
     )
-    return (
-        f'<h2>Errors of the poses</h2><table><tr><th></th>{head}</tr>{rows}</table>'
-        f'<p>{as_html(drift)}</p>'
-    )
+    table = html_table(('', *kinds), rows)
+    return f'<h2>Errors of the poses</h2>{table}<p>{as_html(drift)}</p>'
 
 
 def times_table(summary: Mapping[str, Any]) -> str:
     """Return a table of the median and 99th percentile of every stage."""
-    rows = ''.join(
-        f'<tr><td>{as_html(stage)}</td><td class="number">{times["median"]:.2f}</td>'
-        f'<td class="number">{times["p99"]:.2f}</td></tr>'
-        for stage, times in sorted(
-            summary['milliseconds'].items(), key=lambda item: stage_order(item[0])
-        )
-    )
-    head = '<tr><th>stage</th><th class="number">median</th><th class="number">p99</th></tr>'
-    return f'<table>{head}{rows}</table>'
+    stages = sorted(summary['milliseconds'].items(), key=lambda item: stage_order(item[0]))
+    rows = [(stage, f'{ms["median"]:.2f}', f'{ms["p99"]:.2f}') for stage, ms in stages]
+    return html_table(('stage', 'median', 'p99'), rows)
 
 
 def stage_order(stage: str) -> int:
@@ -299,11 +293,8 @@ def settings_table(settings: Mapping[str, Any], chosen: Sequence[str] | None = N
     usual = {name: value for name, value in settings.items() if name not in ours}
 
     def table(values: Mapping[str, Any]) -> str:
-        rows = ''.join(
-            f'<tr><td>{as_html(name)}</td><td>{as_html(json.dumps(value, default=str))}</td></tr>'
-            for name, value in values.items()
-        )
-        return f'<table>{rows}</table>'
+        rows = [(name, json.dumps(value, default=str)) for name, value in values.items()]
+        return html_table((), rows, num_texts=2)
 
     changed = table(ours) if ours else '<p class="none">No setting was changed.</p>'
     return (

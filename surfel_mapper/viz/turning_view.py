@@ -12,9 +12,11 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 import io
 import json
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -59,15 +61,9 @@ def turning_view(
     """
     layers = {name: mesh for name, mesh in layers.items() if len(mesh)}
     shown = within_sight(surfels)
-    note = (
-        '<span class="keys">Drag or arrows turn, with shift they move; wheel, + and - zoom, '
-        '0 resets, F is full screen. A click shows the values of a surfel.</span>'
-        '<span class="touch">A finger turns, two move and zoom; a tap shows the values of a '
-        'surfel.</span> The slider shows the surfels that the sensor passed nearest up to a time.'
-    )
-    mixed = np.random.default_rng(0).permutation(
-        len(shown)
-    )  # while the view moves, only the first are drawn
+    note = ''
+    # while the view moves, only the first are drawn
+    mixed = np.random.default_rng(0).permutation(len(shown))
     shown = shown.select(mixed[: most_shown(layers)])
     if len(shown) < len(mixed):
         note += f' {len(shown):,} of {summary["surfels"]:,} surfels are shown.'
@@ -88,28 +84,9 @@ def turning_view(
     if picture is not None:
         png = base64.b64encode(small_png(picture)).decode()
         fallback = f'<img alt="the map, drawn" src="data:image/png;base64,{png}">'
-    return (
-        '<h2>The map</h2><div class="view" id="view"><div class="tools">'
-        f'{choice}<label>colour <select id="colouring"></select></label>'
-        '<label>discs <input type="range" id="discs" min="0.4" max="2" step="0.1" value="1">'
-        '</label>'
-        '<label><input type="checkbox" id="hide" checked> hide surfels that face away</label>'
-        '<label id="drive">time <input type="range" id="time" min="0" max="255" value="255"> '
-        '<output id="seconds"></output></label>'
-        '<span><button data-yaw="-90" data-pitch="89">top</button>'
-        '<button data-yaw="-90" data-pitch="0">front</button>'
-        '<button data-yaw="0" data-pitch="0">side</button><button id="reset">reset</button></span>'
-        '<span><button id="measure" aria-pressed="false">measure</button>'
-        '<button id="full">full screen</button></span></div><div class="stage">'
-        '<canvas id="surfels" tabindex="0" role="application" aria-describedby="help" '
-        'aria-label="The map in three dimensions"></canvas>'
-        f'<div id="picture" hidden>{fallback}</div>'
-        '<div class="length" aria-hidden="true">'
-        '<span id="bar"></span><span id="metres"></span></div>'
-        '<output class="values" id="values" aria-live="polite" hidden></output>'
-        '<div class="scale"><b id="unit"></b><span id="least"></span><span class="ramp"></span>'
-        f'<span id="most"></span></div></div></div><p class="none" id="help">{note}</p>'
-        f'<script type="application/json" id="map">{data}</script>'
+    template = (files('surfel_mapper.viz') / 'page' / 'view.html').read_text(encoding='utf-8')
+    return Template(template.strip()).substitute(
+        choice=choice, fallback=fallback, note=note, data=data
     )
 
 

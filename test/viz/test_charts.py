@@ -12,7 +12,6 @@ from surfel_mapper.viz.charts import (
     HEIGHT,
     histogram,
     lines,
-    named_bars,
     NO_DATA,
     NUM_BINS,
     WIDTH,
@@ -67,7 +66,6 @@ def test_few_values_are_drawn_and_no_values_are_reported(values):
     svg = lines(x, {'a': np.array(values)}, 's', 'n')
     assert svg == NO_DATA if not np.isfinite(values).any() else line_of(svg)
     assert histogram(np.array([]), 0.0, 1.0, 'x', 'n') == NO_DATA
-    assert named_bars({}) == NO_DATA
 
 
 def test_histogram_counts_every_finite_value():
@@ -81,18 +79,11 @@ def test_histogram_counts_every_finite_value():
     np.testing.assert_allclose(heights / heights.max(), expected / expected.max(), atol=1e-3)
 
 
-def test_bars_are_as_long_as_their_numbers():
-    ten, five, none = lengths(named_bars({'a': 10, 'b': 5, 'c': 0}), 0)
-    assert ten == pytest.approx(2 * five, rel=1e-3)
-    assert none == 0.0
-
-
 def test_text_is_escaped_everywhere():
     one = np.ones(3)
     for svg in (
         lines(np.arange(3.0), {NASTY: one}, NASTY, NASTY),
         histogram(one, 0.0, 1.0, NASTY, NASTY),
-        named_bars({NASTY: 1}),
     ):
         ElementTree.fromstring(svg)
         assert '<script' not in svg

@@ -16,7 +16,6 @@ from surfel_mapper.viz.picture import (
     ground_lines,
     left_out,
     MapScene,
-    round_length,
     square_m,
 )
 
@@ -213,12 +212,6 @@ def test_a_map_of_few_surfels_is_a_picture(tmp_path, num):
     few = sheet(0.0, 1.0, 1.0).select(np.arange(num))
 
     assert drawn(tmp_path, few, trajectory=np.zeros((num, 3))).min() < 0.5
-
-
-def test_round_lengths_are_at_most_the_given_one():
-    lengths = [0.013, 0.1, 0.3, 1.0, 4.9, 5.0, 77.0, 1999.0]
-    expected = [0.01, 0.1, 0.2, 1.0, 2.0, 5.0, 50.0, 1000.0]
-    assert [round_length(length) for length in lengths] == pytest.approx(expected)
 
 
 def test_the_same_map_gives_the_same_file(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.viz.discs import DrawnDiscs
-from surfel_mapper.viz.rendering import Camera, CLOSING, direction, fitted, rendered
+from surfel_mapper.viz.rendering import Camera, CLOSING, direction, fitted, rendered, round_length
 from test.viz.test_picture import sheet
 
 RED, BLUE = np.array([[200, 0, 0], [0, 0, 200]], np.uint8)
@@ -101,3 +101,9 @@ def test_no_discs_are_an_empty_image():
     image, _ = rendered(Camera(DOWN, np.zeros(2), 8, 6, 1.0), none, np.empty((0, 3), np.uint8))
     assert image.shape == (6, 8, 4)
     assert not image.any()
+
+
+def test_round_lengths_are_at_most_the_given_one():
+    lengths = [0.013, 0.1, 0.3, 1.0, 4.9, 5.0, 77.0, 1999.0]
+    expected = [0.01, 0.1, 0.2, 1.0, 2.0, 5.0, 50.0, 1000.0]
+    assert [round_length(length) for length in lengths] == pytest.approx(expected)
