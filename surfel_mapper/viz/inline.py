@@ -51,7 +51,7 @@ def show(
     shown: SurfelMap | Surfels, *, min_points: int = 5, place: npt.ArrayLike | None = None
 ) -> InlineView:
     """
-    Return an interactive 3D view for a notebook, of at most 60,000 surfels (1.7 MB).
+    Return an interactive 3D view for a notebook, of at most 50,000 surfels (1.7 MB).
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ from surfel_mapper.viz.mesh import MAX_TRIANGLES, mesh_data
 
 Array = npt.NDArray[np.float64]
 
-MAX_SHOWN, BESIDE_MESHES = 60_000, 35_000
+MAX_SHOWN, BESIDE_MESHES = 50_000, 28_000
 """Limits of the surfels shown, alone and if there are meshes; see ``detail.drawn_surfels``."""
 
 SURFEL = np.dtype(
@@ -107,7 +107,7 @@ def small_png(picture: str | Path) -> bytes:
 
     content = io.BytesIO()
     with Image.open(picture) as image:
-        image.convert('RGB').reduce(2).save(content, 'PNG', compress_level=3)
+        image.convert('RGB').reduce(2).quantize(64, dither=Image.Dither.NONE).save(content, 'PNG')
     return content.getvalue()
 
 

@@ -3,6 +3,7 @@
 """A report is one self-contained page with the map, and escapes all names from bags."""
 
 import base64
+import dataclasses
 from html.parser import HTMLParser
 import json
 
@@ -13,6 +14,7 @@ from scipy.spatial import cKDTree
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.viz.discs import RGB
 from surfel_mapper.viz.report import write_report
 from surfel_mapper.viz.turning_view import column_data, MAX_SHOWN, nearest_pose, SURFEL
 from test.viz.test_history import mapped
@@ -132,11 +134,14 @@ def test_names_of_a_bag_are_text_and_nothing_else(tmp_path):
 
 
 def test_large_map_is_subsampled_and_the_page_says_so(tmp_path):
-    surfels = plane(330)
+    surfels, rng = plane(330), np.random.default_rng(1)
+    channels = {name: rng.uniform(0, 255, len(surfels)) for name in ('intensity', *RGB)}
+    surfels = dataclasses.replace(surfels, channels=channels)
     parsed = report(tmp_path, surfels, surfels=len(surfels))
 
     assert len(shown(parsed)[1]) == MAX_SHOWN < len(surfels)
-    assert any('60,000 of 108,900 surfels are shown' in text for *_, text in parsed.text)
+    assert (tmp_path / 'report.html').stat().st_size < 1_900_000  # the picture is to come
+    assert any('50,000 of 108,900 surfels are shown' in text for *_, text in parsed.text)
 
 
 @pytest.mark.parametrize('num', [0, 1])
