@@ -41,9 +41,6 @@ ARRAYS = {
 CHANNELS = ('field', 'color', 'votes')
 """The arrays of voxels; those that a map does not have are without rows."""
 
-NO_STAMPS: npt.NDArray[np.int64] = np.empty((0, 2, 512), np.int64)
-"""Array of files of version 1 that has no rows any more."""
-
 
 def save_tsdf(path: str | Path, blocks: BlockMap, *, compress: bool = False) -> None:
     """
@@ -73,13 +70,13 @@ def tsdf_content(blocks: BlockMap) -> tuple[dict[str, npt.NDArray[Any]], dict[st
     rows = rows[np.argsort(block_keys(blocks.index(rows)))]
     content = blocks.copied(rows)
     arrays = {name: getattr(content, name) for name in ARRAYS}
-    return {**arrays, 'stamps': NO_STAMPS}, attributes_of(blocks.config)
+    return arrays, attributes_of(blocks.config)
 
 
 def attributes_of(config: TsdfConfig) -> dict[str, Any]:
     """Return the attributes of the file of a map."""
     shape = {name: shape_value(config, name) for name in SHAPE}
-    return {'kind': KIND, 'tracking': False, **shape}
+    return {'kind': KIND, **shape}
 
 
 def shape_value(config: TsdfConfig, name: str) -> Any:
@@ -124,8 +121,7 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
 def checked(blocks: BlockMap, arrays: dict[str, npt.NDArray[Any]]) -> Blocks:
     """Return the content of a file; raise ValueError if it is impossible."""
     count = len(arrays['index'])
-    if len(arrays.pop('stamps', NO_STAMPS)):
-        raise ValueError('stamps of voxels, which are not kept any more')
+    arrays.pop('stamps', None)  # none, in files of earlier versions
     if unknown := sorted({*arrays} - {*ARRAYS}):
         raise ValueError(f'unknown arrays {unknown}')
     for name, dtype in ARRAYS.items():

@@ -83,6 +83,8 @@ class Integrator:
         image: RangeImage,
         T_map_sensor: Float64,
         stamp_ns: int = 0,
+        *,
+        allocate_blocks: bool = True,
     ) -> Integrated:
         """
         Fuse a range image into the map.
@@ -95,6 +97,8 @@ class Integrator:
             Pose of the sensor in the map frame.
         stamp_ns : int
             Stamp of the measurement, ns.
+        allocate_blocks : bool
+            False: only blocks of the map are updated.
 
         Returns
         -------
@@ -114,7 +118,10 @@ class Integrator:
         self._warn_of_radius(image.sensor)
         image = self._labelled(image)
         blocks, selected = self.blocks, self._selection.blocks(image, T)
-        fit = blocks.admit(selected.index, T[:3, 3])
+        if allocate_blocks:
+            fit = blocks.admit(selected.index, T[:3, 3])
+        else:
+            fit = blocks.find(selected.index) >= 0
         index, near = selected.index[fit], selected.near[fit]
         num_before = blocks.num_blocks
         rows = blocks.place(index)

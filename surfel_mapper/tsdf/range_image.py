@@ -110,7 +110,13 @@ class RangeImage:
         return repeated(image) if self.sensor.wraps else np.ascontiguousarray(image)
 
 
-def from_depth(sensor: CameraModel, depth: npt.NDArray[Any]) -> RangeImage:
+def from_depth(
+    sensor: CameraModel,
+    depth: npt.NDArray[Any],
+    *,
+    scale: float | None = None,
+    unknown: float | None = None,
+) -> RangeImage:
     """
     Return the range image of a depth image.
 
@@ -121,6 +127,10 @@ def from_depth(sensor: CameraModel, depth: npt.NDArray[Any]) -> RangeImage:
     depth : (rows, columns) float32, float64 or uint16
         Depth along z. Floats are in m; 0, negative and nan mean unknown, inf free up to
         max_range_m. uint16 is in mm; 0 and 65535, which Kinects write, mean unknown.
+    scale : float, optional
+        Metres of one unit; 1 for floats and 0.001 for uint16 by default.
+    unknown : float, optional
+        A depth, in the units of the image, that means unknown; 65535 for uint16 by default.
 
     Raises
     ------
@@ -136,10 +146,14 @@ def from_depth(sensor: CameraModel, depth: npt.NDArray[Any]) -> RangeImage:
     native_type = depth.dtype.newbyteorder('=')
     if native_type not in (np.float32, np.float64, np.uint16):
         raise CloudFormatError(f'depth: {depth.dtype}, expected float32, float64 or uint16')
-    scale = 1e-3 if native_type == np.uint16 else 1.0
+    if scale is None:
+        scale = 1e-3 if native_type == np.uint16 else 1.0
+    if not 0.0 < scale < np.inf:
+        raise CloudFormatError(f'scale: {scale}, expected a positive number of metres')
     image = np.empty((sensor.rows, sensor.columns), np.float32)
     native = np.ascontiguousarray(depth, native_type)
     absent = NO_DEPTH_MM if native_type == np.uint16 else np.nan
+    absent = absent if unknown is None else float(unknown)
     largest, used = kernels.from_depth(
         native, np.float32(scale), absent, sensor.ray_length, limits(sensor), image
     )

@@ -114,7 +114,6 @@ def with_value(place, value):
         changed('field', lambda a: a[:, :, :-1]),
         changed('color', with_value((0, 0, 0), np.nan)),
         changed('votes', lambda a: a[:0]),
-        changed('stamps', lambda a: np.zeros((1, 2, 512), np.int64)),
         lambda arrays: arrays.pop('stamp_ns'),
     ],
 )
