@@ -251,7 +251,7 @@ class ModelsConfig(Stage):
         20, 'Planes and surfaces of fewer points become Gaussians.', low=1, high=100_000
     )
     plane_pitch_voxels: float = setting(
-        3.0, 'Edge of the cells of the outline of a plane, in voxels.', low=2.5, high=100.0
+        3.0, 'Edge of the cells of the outline of a sparse plane, in voxels.', low=2.5, high=100.0
     )
     min_density_radius: float = setting(
         2.0, 'Least density of a flat cluster; a full sheet has 2.', low=0.1, high=3.0

@@ -35,6 +35,7 @@ from surfel_mapper.models.coarse_growth import (
     grow_coarse,
     SPARSE_SHARE,
 )
+from surfel_mapper.models.coverage import covered
 from surfel_mapper.models.growth import (
     grow,
     Grown,
@@ -121,6 +122,8 @@ def fit(
     laps.append(clock())
     grows = not is_paper(config) and config.kinds == 'all' and len(thinned.means) > 0
     model = (fit_points if grows else fit_means)(thinned, config, view, laps)
+    if grows:
+        model = covered(model, points.reshape(-1, 3), view)
     laps.append(clock())
     names = ('thin', 'cluster', 'merge', 'fit') if len(laps) == 5 else STAGES
     times = [1e3 * (end - start) for start, end in pairwise(laps)]

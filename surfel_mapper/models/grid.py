@@ -99,6 +99,14 @@ class Grid:
         return float(len(self.samples(step_m)) * step_m**2)
 
 
+def rim_of(filled: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Return the filled cells (Nx, Ny) with an empty 4-neighbour."""
+    wide = np.pad(filled, 1)
+    inner = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
+    rim: npt.NDArray[np.bool_] = filled & ~inner
+    return rim
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
     """

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError, ModelError
 from surfel_mapper.models.bspline import HeightField
-from surfel_mapper.models.grid import Grid
+from surfel_mapper.models.grid import Grid, rim_of
 from surfel_mapper.models.primitives import Gaussians, Plane, Surface
 
 Array = npt.NDArray[np.float64]
@@ -284,14 +284,6 @@ def turns(patches: Sequence[Plane]) -> Indices:
     first = np.take_along_axis(steps, (steps != 0.0).argmax(axis=1)[:, None], axis=1)
     rounded: Indices = (steps * np.sign(first)).astype(np.int64)
     return rounded
-
-
-def rim_of(filled: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Return the filled cells (Nx, Ny) with an empty 4-neighbour."""
-    wide = np.pad(filled, 1)
-    inner = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
-    rim: npt.NDArray[np.bool_] = filled & ~inner
-    return rim
 
 
 def needed_cuts(cuts: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:

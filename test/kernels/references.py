@@ -42,6 +42,7 @@ REFERENCES = {
     'messages/kernels/triangles.py': 'messages/test_surfel_markers.py',
     'models/kernels/bisection.py': 'models/kernels/test_bisection.py',
     'models/kernels/charts.py': 'models/test_fitting.py',
+    'models/kernels/coverage.py': 'models/test_coverage.py',
     'models/kernels/frames.py': 'models/kernels/test_frames.py',
     'models/kernels/gaussian_mixture.py': 'models/kernels/test_bisection.py',
     'models/kernels/joining.py': 'models/test_fitting.py',
