@@ -276,25 +276,77 @@ def owner_models(
     ids[order] = np.arange(len(order))
     # multi-valued surfaces and free groups are Gaussians; groups are negative owners
     is_free = np.append(ids, -1)[np.maximum(growth.owners, -1)] < 0
-    names, inverse, counts = np.unique(
-        growth.owners[is_free], return_inverse=True, return_counts=True
-    )
+    names, group = np.unique(growth.owners[is_free], return_inverse=True)
     low = min(int(growth.owners.min(initial=0)), 0)
     table = np.empty(number - low, np.int32)
     table[-low:] = ids
     table[names - low] = len(kept) + np.arange(len(names))
+    label = table[growth.owner - low]
+    own = label >= len(kept)
+    group, label[own] = narrow_groups(
+        (growth.means[is_free], group),
+        (voxels.points[own], label[own].astype(np.int64) - len(kept)),
+        WIDE_VOXELS * config.voxel_size_m,
+    )
+    label[own] += len(kept)
     labels = np.full(thinned.num_points, -1, np.int32)
-    labels[voxels.rows] = table[growth.owner - low]
-    mean, covariance = group_moments(growth.means[is_free], inverse, counts)
+    labels[voxels.rows] = label
+    counts = np.bincount(group)
+    mean, covariance = group_moments(growth.means[is_free], group, counts)
     return MultiModel(
         planes=kept[:num_planes],
         surfaces=surfaces,
-        gaussians=Gaussians(len(kept) + np.arange(len(names)), counts, mean, covariance),
+        gaussians=Gaussians(len(kept) + np.arange(len(counts)), counts, mean, covariance),
         labels=labels,
         voxel_size_m=config.voxel_size_m,
         num_thinned=len(growth.means),
         noise=(config.noise_m, config.noise_per_range_sq),
     )
+
+
+WIDE_VOXELS, LEAST_WIDE = 1.5, 4
+"""Gaussians of as many points whose largest sigma exceeds that number of voxels are divided."""
+
+
+def narrow_groups(
+    means: tuple[Array, Indices], points: tuple[npt.NDArray[Any], Indices], wide_m: float
+) -> tuple[Indices, Indices]:
+    """
+    Divide wide groups of points at their mean, across their longest axis.
+
+    What is left of a cluster beside its patches may surround them: a Gaussian of it fills the
+    space between.
+
+    Parameters
+    ----------
+    means : (M, 3) float64, m, and (M,) int64
+        Points of the thinned cloud, and their groups.
+    points : (N, 3) float, m, and (N,) int64
+        All points, and their groups.
+    wide_m : float
+        Largest sigma of a group of LEAST_WIDE points, m.
+
+    Returns
+    -------
+    (M,) int64, (N,) int64
+        Groups of both.
+
+    """
+    (xyz, group), (every, of_point) = means, points
+    while len(group):
+        counts = np.bincount(group)
+        mean, covariance = group_moments(xyz, group, counts)
+        values, vectors = np.linalg.eigh(covariance)
+        is_wide = (counts >= LEAST_WIDE) & (values[:, 2] > wide_m**2)
+        if not is_wide.any():
+            break
+        axis = np.where(is_wide[:, None], vectors[:, :, 2], 0.0)
+        number = len(counts) + np.cumsum(is_wide) - 1
+        beyond = ((xyz - mean[group]) * axis[group]).sum(axis=1) > 0.0
+        group = np.where(beyond, number[group], group)
+        beyond = ((every - mean[of_point]) * axis[of_point]).sum(axis=1) > 0.0
+        of_point = np.where(beyond, number[of_point], of_point)
+    return group, of_point
 
 
 def group_moments(points: Array, group: Indices, counts: Indices) -> tuple[Array, Array]:

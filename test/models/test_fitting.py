@@ -15,7 +15,7 @@ from surfel_mapper.errors import ConfigError, ModelError
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models import evaluate, fit
-from surfel_mapper.models.fitting import surfel_points
+from surfel_mapper.models.fitting import narrow_groups, surfel_points
 from surfel_mapper.models.segmentation import folded, merge_clusters, segment_cloud
 from surfel_mapper.models.thinning import thin
 from test.bench import tabletop
@@ -356,3 +356,42 @@ def test_other_units_are_warned_about(caplog):
     assert not caplog.records
     fit(100.0 * points)
     assert 'millimetres or centimetres?' in caplog.text
+
+
+def test_wide_groups_are_divided_where_they_have_gaps():
+    rng = np.random.default_rng(0)
+    ends = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.9]])
+    points = np.concatenate([rng.normal(end, 0.01, (20, 3)) for end in ends])
+    triple = np.array([[5.0, 0.0, 0.0], [6.0, 0.0, 0.0], [7.0, 0.0, 0.0]])  # too few to divide
+    every = np.concatenate([points, triple])
+    group = np.repeat([0, 1], [60, 3])
+    means, all_points = narrow_groups((every, group), (every[::-1], group[::-1]), 0.06)
+    assert (means == all_points[::-1]).all()
+    names = [set(means[a:b].tolist()) for a, b in ((0, 20), (20, 40), (40, 60), (60, 63))]
+    assert [len(name) for name in names] == [1, 1, 1, 1]
+    assert set.union(*names) == {0, 1, 2, 3}
+
+
+def test_no_gaussian_fills_the_space_between_its_points():
+    """Poles before a wall were one Gaussian of 11 voxels, as growth left them together."""
+    wall = sheet(3.0, 2.0, 0.01, (1.0, 0.0, 0.0), (3.0, 0.0, 0.0), sigma=0.002)
+    rng = np.random.default_rng(0)
+    strays = np.concatenate([rng.normal(at, 0.02, (30, 3)) for at in POLES])
+    points = np.concatenate([wall, strays]).astype(np.float32)
+    model = fit(points, ModelsConfig(voxel_size_m=A))
+    gaussians = model.gaussians
+    sigma = np.sqrt(np.linalg.eigvalsh(gaussians.covariance)[:, 2])
+    assert (sigma[gaussians.num_points >= 4] <= 1.5 * A * (1 + 1e-9)).all()
+    assert len(gaussians) > 1
+    assert model.num_thinned == sum(
+        [patch.num_points for patch in model.patches] + gaussians.num_points.tolist()
+    )
+    labels = model.labels[len(wall) :]
+    assert np.isin(labels, gaussians.id).mean() > 0.9
+    on = labels >= gaussians.id.min()
+    away = strays[on] - gaussians.mean[labels[on] - gaussians.id.min()]
+    assert np.linalg.norm(away, axis=1).max() < 8 * A
+
+
+POLES = [(2.0, y, z) for y in (-0.4, 0.0, 0.4) for z in (-0.3, 0.3)]
+"""Places of small clusters before a wall."""
