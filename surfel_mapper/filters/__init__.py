@@ -7,11 +7,12 @@ Filters that clean and thin scans before they are mapped, and chains of them.
     >>> VoxelGrid(size_x_m=0.1, size_y_m=0.1, size_z_m=0.1).apply(points).points
     >>> Chain.from_yaml('[range_limit: {min_m: 0.5}, voxel_grid]').apply(points)
 
-Each name is loaded when first asked for: a node without filters starts without their kernels.
+Filters are loaded when a name is first asked for: a node without any starts without their kernels.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from importlib import import_module
 from typing import Any, TYPE_CHECKING
 
@@ -31,44 +32,34 @@ if TYPE_CHECKING:
     from surfel_mapper.filters.shapes import *  # noqa: F403
     from surfel_mapper.filters.tensor_voting import *  # noqa: F403
 
-_HOMES = {
-    name: module
-    for module, names in {
-        'base': 'as_scan Filter finite FiniteFilter generator parameter select with_columns '
-        'with_points',
-        'boxes': 'Ellipsoids SamplingSurfaceNormal',
-        'chain': 'Chain Step',
-        'descriptors': 'AddDescriptor CutAtDescriptorThreshold IncidenceAngle LabelMask '
-        'ObservationDirection OrientNormals Sphericality TimeSlice',
-        'gestalt': 'Gestalt',
-        'grids': 'OctreeGrid VoxelGrid',
-        'ground': 'Ground',
-        'limits': 'AngleLimit BodyBox BoundingBox DistanceLimit FieldOfView Identity MaxDist '
-        'MinDist RangeLimit RemoveNaN',
-        'neighbours': 'RadiusOutliers StatisticalOutliers',
-        'registry': 'all_filters find register',
-        'sampling': 'CovarianceSampling FarthestPointSampling FixStepSampling MaxDensity '
-        'MaxPointCount MaxQuantileOnAxis NormalSpace RandomSampling',
-        'sensor_models': 'RemoveSensorBias Shadow SimpleSensorNoise',
-        'shapes': 'SurfaceNormal',
-        'tensor_voting': 'Saliency SpectralDecomposition',
-    }.items()
-    for name in names.split()
+_HELPERS = {
+    'base': 'as_scan Filter finite FiniteFilter generator parameter select with_columns '
+    'with_points',
+    'chain': 'Chain Step',
+    'registry': 'all_filters find register',
 }
-"""The module that each public name comes from."""
+"""Public names besides the filters, by module."""
 
-__all__ = sorted(_HOMES)
+
+@cache
+def _public() -> dict[str, Any]:
+    """Return the public names and their values: the registered filters, and the helpers."""
+    names = {cls.__name__: cls for cls in import_module(f'{__name__}.registry').built_in()}
+    for module, helpers in _HELPERS.items():
+        home = import_module(f'{__name__}.{module}')
+        names.update((name, getattr(home, name)) for name in helpers.split())
+    return names
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name from its module when it is first asked for (PEP 562)."""
-    if name not in _HOMES:
+    """Load the filters when a public name is first asked for (PEP 562)."""
+    if name == '__all__':
+        return sorted(_public())
+    if name.startswith('_') or name not in _public():
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    value = getattr(import_module(f'{__name__}.{_HOMES[name]}'), name)
-    globals()[name] = value
-    return value
+    return globals().setdefault(name, _public()[name])
 
 
 def __dir__() -> list[str]:
-    """Return the public names, loaded or not."""
-    return sorted({*globals(), *__all__})
+    """Return the public names."""
+    return sorted({*globals(), *_public()})

@@ -95,6 +95,13 @@ def load_built_in() -> None:
         import_module(f'surfel_mapper.filters.{module.name}')
 
 
+def built_in() -> list[type[Filter]]:
+    """Return the filters of this package, sorted by name."""
+    load_built_in()
+    own = {cls for cls in _FILTERS.values() if cls.__module__.startswith(f'{GROUP}.')}
+    return sorted(own, key=lambda cls: cls.name)
+
+
 def find(name: str) -> type[Filter]:
     """
     Return the filter class of a name, ours or libpointmatcher's.
