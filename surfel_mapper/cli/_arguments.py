@@ -49,37 +49,30 @@ def positive_int(text: str) -> int:
     return int(text)
 
 
-def finite(text: str) -> float:
-    """Return a finite number."""
+def checked(text: str, is_valid: Callable[[float], bool], expected: str) -> float:
+    """Return a number that meets a condition."""
     try:
         value = real(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f'{text!r}, expected a finite number')
+    if not is_valid(value):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected {expected}')
     return value
+
+
+def finite(text: str) -> float:
+    """Return a finite number."""
+    return checked(text, math.isfinite, 'a finite number')
 
 
 def positive_float(text: str) -> float:
     """Return a finite positive number."""
-    try:
-        value = real(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text!r}, expected a positive number')
-    return value
+    return checked(text, lambda value: 0.0 < value < math.inf, 'a positive number')
 
 
 def seconds(text: str) -> float:
     """Return a finite number of zero or more."""
-    try:
-        value = real(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text!r}, expected seconds, zero or more')
-    return value
+    return checked(text, lambda value: 0.0 <= value < math.inf, 'seconds, zero or more')
 
 
 def add_bin_columns(parser: argparse._ActionsContainer) -> None:
