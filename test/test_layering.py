@@ -23,7 +23,7 @@ PACKAGE = ROOT / 'surfel_mapper'
 
 LEVELS = (
     {'compilation', 'errors', 'memory'},
-    {'arguments', 'budget', 'kernels', 'map_formats'},
+    {'arguments', 'budget', 'kernels', 'libraries', 'map_formats'},
     {'config', 'counters', 'geometry', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},

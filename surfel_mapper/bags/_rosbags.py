@@ -17,7 +17,7 @@ from typing import Any, Literal, TYPE_CHECKING
 
 from surfel_mapper.bags.paths import is_ros1
 from surfel_mapper.bags.topics import SAME_AS
-from surfel_mapper.errors import DependencyError
+from surfel_mapper.libraries import library
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection as Connection
@@ -38,16 +38,9 @@ BAG_VERSION: Literal[9] = 9
 """Version of metadata.yaml that rosbag2 of Jazzy writes."""
 
 
-def import_rosbags() -> Any:
-    """Return rosbags."""
-    try:
-        import rosbags.rosbag2
-    except ImportError as error:
-        raise DependencyError(
-            f'rosbags cannot be loaded ({error}). It knows the types of the messages in bags; '
-            'install it with `pip install rosbags`'
-        ) from error
-    return rosbags
+def import_rosbags() -> None:
+    """Load rosbags, or raise DependencyError."""
+    library('rosbags.rosbag2', 'knows the types of the messages in bags', 'rosbags')
 
 
 def open_indexed(path: Path) -> Rosbag1 | Rosbag2 | None:

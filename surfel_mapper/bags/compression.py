@@ -13,7 +13,8 @@ import shutil
 import sys
 from typing import Any
 
-from surfel_mapper.errors import BagError, DependencyError
+from surfel_mapper.errors import BagError
+from surfel_mapper.libraries import library
 
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """How a zstd frame begins; no CDR message does."""
@@ -45,14 +46,5 @@ def unpack_file(path: Path, target: Path) -> bool:
 
 def import_zstd() -> Any:
     """Return the module for zstd: Python's own from 3.14 on, before that its backport."""
-    try:
-        if sys.version_info >= (3, 14):
-            from compression import zstd
-        else:
-            from backports import zstd
-    except ImportError as error:
-        raise DependencyError(
-            f'backports.zstd cannot be loaded ({error}). It unpacks compressed bags; install it '
-            'with `pip install backports.zstd`'
-        ) from error
-    return zstd
+    name = 'compression.zstd' if sys.version_info >= (3, 14) else 'backports.zstd'
+    return library(name, 'unpacks compressed bags', 'backports.zstd')

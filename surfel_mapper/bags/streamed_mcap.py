@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.bags._rosbags import ros2_connection
-from surfel_mapper.errors import DependencyError
+from surfel_mapper.libraries import library
 
 if TYPE_CHECKING:
     from mcap.records import Message
@@ -56,7 +56,7 @@ class StreamedMcap:
     """
 
     def __init__(self, path: Path) -> None:
-        import_mcap()
+        library('mcap', 'reads mcap files that have no index', 'mcap')
         self.cut_at: int | None = None
         self.skipped_at: list[int] = []
         self.skip_reason = ''
@@ -183,18 +183,6 @@ class StreamedMcap:
             qos=channel.metadata.get('offered_qos_profiles', ''),
             definition=definition,
         )._replace(msgcount=self._counts[key])
-
-
-def import_mcap() -> Any:
-    """Return the mcap package."""
-    try:
-        import mcap
-    except ImportError as error:
-        raise DependencyError(
-            f'mcap cannot be loaded ({error}). It reads mcap files that have no index; install it '
-            'with `pip install mcap`'
-        ) from error
-    return mcap
 
 
 def opened(record: Any) -> list[Any]:

@@ -9,7 +9,6 @@ E57 has several scans, each with its pose: ``read_e57`` returns all in the frame
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 import os
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.point_columns import Columns, NORMALS, RGB
+from surfel_mapper.libraries import library
 
 E57_COLUMNS = {
     **{f'cartesian{axis.upper()}': axis for axis in 'xyz'},
@@ -31,15 +31,9 @@ TAIL_BYTES = 1 << 16
 """End of an OBJ file in which faces are looked for, bytes."""
 
 
-def library(path: str | Path, name: str, extra: str) -> Any:
-    """Return a module, or raise DependencyError with the command to install it."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise DependencyError(
-            f'{path}: {name} cannot be loaded ({error}). It reads {Path(path).suffix}; install it '
-            f"with `pip install 'surfel_mapper[{extra}]'`, or convert the file to .ply or .pcd"
-        ) from error
+def decoder(name: str, path: str | Path, extra: str) -> Any:
+    """Return the module that reads a file, of an extra of this package; see library."""
+    return library(name, f'reads {Path(path).suffix}', f"'surfel_mapper[{extra}]'")
 
 
 def decoded(path: Path, read: Callable[[], Columns]) -> Columns:
@@ -62,7 +56,7 @@ def decoded(path: Path, read: Callable[[], Columns]) -> Columns:
 def read_e57(path: str | Path, number: int | None = None) -> Columns:
     """Return the points of all scans of an E57 file, or of one, in its frame; see decoded."""
     path = Path(path)
-    pye57 = library(path, 'pye57', 'clouds')
+    pye57 = decoder('pye57', path, 'clouds')
 
     def read() -> Columns:
         with pye57.E57(str(path)) as file:
@@ -84,7 +78,7 @@ def e57_scan(file: Any, number: int) -> Columns:
 
 def e57_poses(path: Path) -> npt.NDArray[np.float64]:
     """Return the poses of the scanner, T_file_scanner (S, 4, 4); see decoded."""
-    pye57 = library(path, 'pye57', 'clouds')
+    pye57 = decoder('pye57', path, 'clouds')
     poses: list[npt.NDArray[np.float64]] = []
 
     def read() -> Columns:
@@ -104,10 +98,10 @@ def read_vtk(path: str | Path) -> Columns:
     """Return the points of a VTK file, legacy or XML, and their scalars; see decoded."""
     path = Path(path)
     is_legacy = path.suffix.lower() == '.vtk'
-    module = library(path, f'vtkmodules.vtkIO{"Legacy" if is_legacy else "XML"}', 'clouds')
-    numpy_of = library(path, 'vtkmodules.util.numpy_support', 'clouds').vtk_to_numpy
-    library(path, 'vtkmodules.vtkCommonCore', 'clouds').vtkObject.GlobalWarningDisplayOff()
-    library(path, 'vtkmodules.vtkCommonDataModel', 'clouds')
+    module = decoder(f'vtkmodules.vtkIO{"Legacy" if is_legacy else "XML"}', path, 'clouds')
+    numpy_of = decoder('vtkmodules.util.numpy_support', path, 'clouds').vtk_to_numpy
+    decoder('vtkmodules.vtkCommonCore', path, 'clouds').vtkObject.GlobalWarningDisplayOff()
+    decoder('vtkmodules.vtkCommonDataModel', path, 'clouds')
 
     def read() -> Columns:
         names = {'.vtk': 'vtkGenericDataObjectReader', '.vtp': 'vtkXMLPolyDataReader'}
@@ -152,7 +146,7 @@ def has_faces(path: Path) -> bool:
 def read_obj(path: str | Path) -> Columns:
     """Return the vertices of an OBJ file without faces, and their colours; see decoded."""
     path = Path(path)
-    trimesh = library(path, 'trimesh', 'meshes')
+    trimesh = decoder('trimesh', path, 'meshes')
 
     def read() -> Columns:
         cloud = trimesh.load(path, process=False)
@@ -169,7 +163,7 @@ def read_obj(path: str | Path) -> Columns:
 def read_feather(path: str | Path) -> Columns:
     """Return the columns of a feather file, float16 as float32; see decoded."""
     path = Path(path)
-    feather = library(path, 'pyarrow.feather', 'formats')
+    feather = decoder('pyarrow.feather', path, 'formats')
 
     def read() -> Columns:
         table = feather.read_table(str(path))

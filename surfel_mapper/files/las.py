@@ -18,9 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.point_columns import Columns, RGB
+from surfel_mapper.libraries import library
 from surfel_mapper.mapping.surfels import quality_columns
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def read_points(path: str | Path) -> Columns:
         If laspy is not installed.
 
     """
-    laspy = import_laspy(path)
+    laspy = import_laspy()
     try:
         backend = laspy.LazBackend.Lazrs
         with open_regular(path) as file, laspy.open(file, laz_backend=backend) as reader:
@@ -175,7 +176,7 @@ def write_surfels(
         If laspy is not installed.
 
     """
-    laspy = import_laspy(path)
+    laspy = import_laspy()
     has_colour = 'red' in surfels.channels
     header = laspy.LasHeader(point_format=7 if has_colour else 6, version='1.4')
     position = surfels.position + np.asarray(origin_m, np.float64)
@@ -205,13 +206,6 @@ def write_surfels(
         file.write(content.getvalue())
 
 
-def import_laspy(path: str | Path) -> Any:
-    """Return the module laspy, or raise DependencyError with the command to install it."""
-    try:
-        import laspy
-    except ImportError as error:
-        raise DependencyError(
-            f'{path}: laspy cannot be loaded ({error}). It reads and writes LAS and LAZ; install '
-            "it with `pip install 'surfel_mapper[las]'`"
-        ) from error
-    return laspy
+def import_laspy() -> Any:
+    """Return the module laspy, or raise DependencyError."""
+    return library('laspy', 'reads and writes LAS and LAZ', "'surfel_mapper[las]'")

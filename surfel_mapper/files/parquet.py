@@ -22,9 +22,10 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.map_state import checked_moments, NO_ORIGIN
+from surfel_mapper.libraries import library
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -263,13 +264,6 @@ def moment_columns(table: Any, surfel_map: SurfelMap) -> Columns:
 
 
 def import_pyarrow() -> tuple[Any, Any]:
-    """Return pyarrow and its Parquet part."""
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError as error:
-        raise DependencyError(
-            f'pyarrow cannot be loaded ({error}). It reads and writes Parquet; install it with '
-            "`pip install 'surfel_mapper[formats]'` or `pip install pyarrow`"
-        ) from error
-    return pyarrow, parquet
+    """Return pyarrow and its Parquet part, or raise DependencyError."""
+    purpose, package = 'reads and writes Parquet', "'surfel_mapper[formats]'"
+    return library('pyarrow', purpose, package), library('pyarrow.parquet', purpose, package)

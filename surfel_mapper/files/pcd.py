@@ -29,10 +29,11 @@ import numpy.typing as npt
 
 from surfel_mapper.arguments import MAX_SQUARE_ERROR
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import check_names, replace_file
 from surfel_mapper.files.point_columns import Columns, RGB
 from surfel_mapper.files.text_table import read_table
+from surfel_mapper.libraries import library
 from surfel_mapper.mapping.surfels import file_positions, packed_rgb, surfel_columns
 
 if TYPE_CHECKING:
@@ -256,13 +257,7 @@ def binary_table(
 
 def compressed_columns(path: str | Path, header: PcdHeader, file: BinaryIO) -> Columns:
     """Return the fields of the points of a compressed file, which is stored field by field."""
-    try:
-        import lzf
-    except ImportError as error:
-        raise DependencyError(
-            f'{path}: lzf cannot be loaded ({error}). It unpacks compressed PCD files; install it '
-            "with `pip install 'surfel_mapper[formats]'` or `pip install python-neo-lzf`"
-        ) from error
+    lzf = library('lzf', 'unpacks compressed PCD files', "'surfel_mapper[formats]'")
     sizes = file.read(8)
     packed_size, size = struct.unpack('<II', sizes.ljust(8, b'\0'))
     packed = file.read(packed_size)

@@ -14,8 +14,9 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.libraries import library
 
 if TYPE_CHECKING:
     from surfel_mapper.tsdf.mesh import Mesh
@@ -93,13 +94,7 @@ def write_scene(path: Path, scene: Any) -> None:
 
 
 def import_trimesh() -> Any:
-    """Return the module trimesh, or raise DependencyError with the command to install it."""
-    try:
-        import trimesh
-        import trimesh.path
-    except ImportError as error:
-        raise DependencyError(
-            f'trimesh cannot be loaded ({error}). It reads and writes OBJ, STL and glTF; install '
-            "it with `pip install 'surfel_mapper[meshes]'` or `pip install trimesh`"
-        ) from error
-    return trimesh
+    """Return the module trimesh, or raise DependencyError."""
+    purpose, package = 'reads and writes OBJ, STL and glTF', "'surfel_mapper[meshes]'"
+    library('trimesh.path', purpose, package)
+    return library('trimesh', purpose, package)

@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from surfel_mapper import libraries
 from surfel_mapper.errors import DependencyError, FileFormatError
-from surfel_mapper.files import foreign_points
 from surfel_mapper.files.scan_files import read_scan, scan_files
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test import extras
@@ -304,6 +304,6 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path, monkeypatch, suffix
     def refuse(name):
         raise ImportError(f'No module named {name!r}')
 
-    monkeypatch.setattr(foreign_points, 'import_module', refuse)
+    monkeypatch.setattr(libraries, 'import_module', refuse)
     with pytest.raises(DependencyError, match=r"pip install 'surfel_mapper\[(clouds|meshes|form)"):
         read_scan(tmp_path / f'a{suffix}')
