@@ -4,7 +4,8 @@
 The view of a map that shows most of it: level on the ground, without a ceiling, without outliers.
 
 A lidar sees single surfaces far beyond the mapped place. A box of all surfels would make the place
-itself a spot in an empty picture, so the sparse rims are cut off.
+itself a spot in an empty picture, so the sparse rims are cut off. The mass of a disc is its
+radius: by areas a few large discs far away would count as much as the place.
 """
 
 from __future__ import annotations
@@ -123,11 +124,12 @@ def best_direction(level: DrawnDiscs, lowest: float, highest: float) -> Array:
     for yaw in wall_yaw(level) + YAWS:
         R = direction(yaw, PITCH)
         facing = level.normal @ R[2]
-        area = np.where(facing > 0.0, level.radius_m**2 * facing, 0.0)
-        low, high = mass_box(level.position @ R[:2].T, area)
+        mass = np.where(facing > 0.0, level.radius_m * facing, 0.0)
+        low, high = mass_box(level.position @ R[:2].T, mass)
         across, along = high - low
         width = max(across, along / highest)
-        filled = area.sum() / (width * max(along, width * lowest))
+        area = (level.radius_m * mass).sum()
+        filled = area / (width * max(along, width * lowest))
         if filled > most:
             best, most = R, filled
     return best

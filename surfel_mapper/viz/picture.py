@@ -114,7 +114,7 @@ class MapScene:
         facing = self.discs.normal @ R_view_map[2]
         rows = facing > 0.0
         at = self.discs.position[rows] @ R_view_map[:2].T
-        low, high = mass_box(at, self.discs.radius_m[rows] ** 2 * facing[rows])
+        low, high = mass_box(at, self.discs.radius_m[rows] * facing[rows])
         way = self.trajectory @ R_view_map[:2].T
         if len(way):
             lower, higher = np.minimum(low, way.min(axis=0)), np.maximum(high, way.max(axis=0))

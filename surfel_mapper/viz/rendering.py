@@ -23,8 +23,8 @@ Array = npt.NDArray[np.float64]
 EDGE_ON = 0.18
 """Thickness of a disc seen edge-on, relative to its radius."""
 
-CLOSING = 1.15
-"""Radius of a disc relative to that of ``DrawnDiscs``: closes gaps of voxels that are cut."""
+CLOSING = 0.15
+"""Added to the radius of a disc, relative to the median: closes gaps where voxels cut a wall."""
 
 THINNEST_PX = 0.7
 """Smallest radius of a drawn disc, so that it covers a pixel."""
@@ -168,7 +168,10 @@ def facing_discs(camera: Camera, discs: DrawnDiscs) -> tuple[npt.NDArray[np.int6
     drawn[:, 0] = middle[0] + (seen[:, 0] - camera.centre_m[0]) * scale
     drawn[:, 1] = middle[1] - (seen[:, 1] - camera.centre_m[1]) * scale
     drawn[:, 2] = -seen[:, 2]
-    drawn[:, 3] = np.maximum(CLOSING * discs.radius_m[rows], FINER * THINNEST_PX / scale)
+    radius_m = discs.radius_m[rows]
+    least = np.median(radius_m) if len(rows) else 0.0
+    larger = radius_m + CLOSING * np.minimum(radius_m, least)
+    drawn[:, 3] = np.maximum(larger, FINER * THINNEST_PX / scale)
     drawn[:, 4] = scale
     drawn[:, 5:] = normal
     return rows, drawn

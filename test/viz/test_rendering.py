@@ -37,7 +37,7 @@ def test_a_disc_covers_its_circle_at_its_depth():
 
     image, depth = rendered(camera, disc((1.0, 0.5, 3.0), radius_m=1.0), RED[None])
 
-    assert image[..., 3].sum() == pytest.approx(np.pi * (10.0 * CLOSING) ** 2, rel=0.02)
+    assert image[..., 3].sum() == pytest.approx(np.pi * (10.0 * (1.0 + CLOSING)) ** 2, rel=0.02)
     rows, columns = np.nonzero(image[..., 3] == 1.0)
     assert (rows.mean(), columns.mean()) == pytest.approx((29.5 - 5.0, 39.5 + 10.0), abs=0.5)
     assert (depth[rows, columns] == -3.0).all()
@@ -79,7 +79,7 @@ def test_an_eye_sees_a_disc_as_large_as_its_distance_says():
         eye = np.array([0.0, 0.0, distance])
         camera = Camera(DOWN, np.zeros(2), 100, 100, 100.0, eye)
         image, depth = rendered(camera, disc((0, 0, 0), radius_m=1.0), RED[None])
-        radius_px = CLOSING * 100.0 / distance
+        radius_px = (1.0 + CLOSING) * 100.0 / distance
         assert image[..., 3].sum() == pytest.approx(np.pi * radius_px**2, rel=0.03)
         assert depth[50, 50] == pytest.approx(distance)
 
