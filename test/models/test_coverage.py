@@ -65,6 +65,18 @@ def test_a_dense_plane_covers_its_points_and_not_its_hole():
     assert plane.grid.area_m2(4) == pytest.approx(area_m2, abs=0.5 * SIZE_M * boundary_m)
 
 
+def test_boundary_cells_are_those_with_an_empty_neighbour():
+    rng = np.random.default_rng(0)
+    points = sheet(1.0, 1.0, 0.004)
+    points = points[np.linalg.norm(points[:, :2] - rng.uniform(-0.2, 0.2, 2), axis=1) > 0.15]
+    for plane in fit(points.astype(np.float32), CONFIG, VIEW).planes:
+        filled = {tuple(cell) for cell in np.argwhere(plane.grid.filled).tolist()}
+        steps = ((1, 0), (-1, 0), (0, 1), (0, -1))
+        rim = {(x, y) for x, y in filled if any((x + i, y + j) not in filled for i, j in steps)}
+        assert {tuple(cell) for cell in np.argwhere(plane.grid.rim).tolist()} == rim
+        assert len(rim) > 50
+
+
 def test_few_points_beyond_the_boundary_cover_nothing():
     points = sheet(2.0, 2.0, 0.005, sigma=0.001)
     strays = np.random.default_rng(0).uniform([1.03, -1.0, 0.0], [1.1, 1.0, 0.0], (40, 3))
