@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from surfel_mapper import Config, Mapper
+from surfel_mapper.cluster.map_reduce import map_bags
+from surfel_mapper.cluster.shards import cut
+from surfel_mapper.cluster.workers import Workers
 from surfel_mapper.errors import BagError
 from surfel_mapper.messages.images import CameraImage, depth_scan
 from surfel_mapper.offline.recording import open_recording
@@ -203,3 +206,19 @@ def test_one_of_several_topics_of_depth_images_has_to_be_named(tmp_path):
         replayed(bag, {})
     _, recording = replayed(bag, {}, topics=(TOPIC,))
     assert recording.topics == [TOPIC]
+
+
+def test_shards_of_depth_images_make_the_map_of_one_go(tmp_path):
+    entries = Entries()
+    camera_info(entries, START_NS)
+    for number in range(20):
+        image(entries, number)
+    bag = write_rosbag2(tmp_path / 'depth', entries)
+    expected, _ = replayed(bag, {**SETTINGS, 'window.max_scans': 0})
+
+    shards = cut(Request(path=bag), Config.from_mapping(SETTINGS), 0.5)
+
+    assert len(shards) > 2
+    mapped = map_bags([shards], Workers())
+    assert mapped.mapper.map == expected.map
+    assert mapped.counts['scans']['mapped'] == 20
