@@ -37,10 +37,11 @@ def in_order(places):
     return places[np.lexsort(np.round(places, 4).T)]
 
 
-def surfels_after(num_scans):
+def surfels_after(num_scans, *, adaptive=False):
     """Return the positions of the surfels of a mapper without ROS, those with a normal."""
     _, mapper = mapped(drive(num_scans))
-    return DrawnDiscs.of(mapper.map.surfels(mapper.config.map.min_points)).position
+    surfels = mapper.map.adaptive if adaptive else mapper.map.surfels
+    return DrawnDiscs.of(surfels(mapper.config.map.min_points)).position
 
 
 @contextmanager
@@ -92,7 +93,7 @@ def test_a_node_serves_a_page_of_its_map(start, peer, tmp_path):
         peer.advertise('/odom', '/points')
         send(peer, drive(NUM_SCANS))
         peer.spin_until(lambda: len(changed) == NUM_SCANS)
-        expected = [surfels_after(number + 1) for number in range(NUM_SCANS)]
+        expected = [surfels_after(number + 1, adaptive=True) for number in range(NUM_SCANS)]
         deadline = time.monotonic() + TIMEOUT_S
         while os.path.getsize(file) < 40 * len(expected[0]):  # a map: 12 bytes for a position
             assert time.monotonic() < deadline
