@@ -139,6 +139,8 @@ class MapPart:
         As given.
     reason : str
         Why its first scan was not mapped.
+    follows_part : bool
+        The scans before it were those of another part.
 
     """
 
@@ -159,6 +161,7 @@ class MapPart:
         self._T_map_part: Transform | None = None
         self._num_agreeing = 0
         self._refusal = ''
+        self.follows_part = False
         self.scans: list[WaitingScan] = []
         self.tracker = Tracker(registration, np.eye(4))
 

@@ -386,12 +386,14 @@ class RegisteredPoses:
         """
         End a part that a scan does not fit; the scan is tracked on the map or begins the next.
 
-        A single scan that fits nothing is no loss: the next one may continue the track.
+        A single scan that fits nothing is no loss: the next one may continue the track, unless
+        the single one came after a part of several.
         """
         self.finish()
-        if len(map_part.scans) > 1:
+        if len(map_part.scans) > 1 or map_part.follows_part:
             guess = compose(map_part.guess, map_part.tracker.predict(sighting.stamp_ns))
-            self._begin_part(sighting, guess, twist, map_part.limits, map_part.reason)
+            limits, reason = map_part.limits, map_part.reason
+            self._begin_part(sighting, guess, twist, limits, reason).follows_part = True
             return []
         return self._track(sighting, surfel_map, T_map_fixed)
 

@@ -164,6 +164,22 @@ def in_hall(number, pose):
     return Scan(points=points, stamp_ns=number * STEP_NS, frame_id='lidar')
 
 
+def test_a_scan_after_a_part_and_a_lone_scan_has_to_be_confirmed():
+    mapper = mapper_with()
+    feed(mapper, [scan_at(number) for number in range(4)])
+    steps = [se3_exp(np.array([0.1 * n, 0.02 * n, 0.0, 0.0, 0.0, 0.01 * n])) for n in range(3)]
+    part = [in_hall(4 + n, step) for n, step in enumerate(steps)]
+    lone = scan_at(7, np.eye(4), faces=CORRIDOR, reach_m=20.0)
+
+    assert feed(mapper, [*part, lone, scan_at(8)]) == []
+    updates = feed(mapper, [scan_at(number) for number in range(9, 14)])
+
+    assert [update.stamp_ns // STEP_NS for update in updates] == [*range(8, 14)]
+    for update in updates:
+        expected = compose(inverse(TRUE), pose_at(update.stamp_ns // STEP_NS))
+        np.testing.assert_allclose(update.T_map_sensor, expected, atol=5e-3)
+
+
 def test_scans_of_another_place_stay_apart_and_are_named():
     mapper = mapper_with()
     feed(mapper, [scan_at(number) for number in range(4)])
