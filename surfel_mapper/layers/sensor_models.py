@@ -79,8 +79,6 @@ class SensorModels:
     ----------
     frames : dict of str to FrameModel
         The state of each frame with a lidar.
-    num_refits : int
-        Number of times that a model was replaced.
 
     Parameters
     ----------
@@ -95,7 +93,6 @@ class SensorModels:
         self._config = config
         self._transforms = transforms
         self.frames: dict[str, FrameModel] = {}
-        self.num_refits = 0
         self._cameras: dict[tuple[float, ...], CameraModel] = {}
         self._checked: tuple[Scan | None, LidarModel | None] = (None, None)
         self._centered: tuple[Scan, Scan, Transform | None] | None = None
@@ -184,18 +181,6 @@ class SensorModels:
         except PoseError as error:
             raise PoseError(f'layers.tsdf.sensor_frame: {error}') from error
 
-    def summary(self) -> dict[str, Any]:
-        """Return the model and the share of fitting points of each frame, and the refits."""
-        models = {name: frame.model for name, frame in self.frames.items()}
-        return {
-            'sensor_refits': self.num_refits,
-            'sensors': {
-                name: 'none' if model is None else f'{model.rows} x {model.columns}'
-                for name, model in models.items()
-            },
-            'sensor_fit': {name: round(frame.share, 3) for name, frame in self.frames.items()},
-        }
-
     def _camera(self, numbers: tuple[float, ...]) -> CameraModel:
         """Return the model of a camera, whose tables of rays are made once."""
         if numbers not in self._cameras:
@@ -223,7 +208,6 @@ class SensorModels:
                 'it is fitted again',
                 *(100.0 * frame.share, scan.frame_id, frame.model.rows, frame.model.columns),
             )
-            self.num_refits += 1
             frame.model, frame.due, frame.retry = None, 0, FIRST_RETRY
         if frame.due > 0:
             frame.due -= 1

@@ -19,8 +19,7 @@ removed block is reused; free rows are zero except for their head.
 
 ``version`` counts the changes of the map. To follow them, keep the last version seen and ask
 ``changed_since`` for the rows, or ``moved_since`` for those whose triangles moved by more than
-VISIBLE_VOXELS since, or changed in number. Blocks changed after the last ``clear_updated`` are
-flagged as updated and are not evicted.
+VISIBLE_VOXELS since, or changed in number.
 """
 
 from __future__ import annotations
@@ -50,6 +49,8 @@ from surfel_mapper.tsdf.kernels.blocks import (
     SURFACE,
     VERSION,
 )
+from surfel_mapper.tsdf.kernels.integration import INSIDE as BEHIND
+from surfel_mapper.tsdf.kernels.integration import MOVED, SOLID
 
 Int64 = npt.NDArray[np.int64]
 Float32 = npt.NDArray[np.float32]
@@ -251,7 +252,6 @@ class BlockMap(BlockArrays):
         self.version = 0
         self.max_bytes = 0
         self.num_evicted = 0
-        self._settled = 0
         self._hash = HashTable(MAX_DEPTH)
         self._state = self._hash.state
 
@@ -386,9 +386,7 @@ class BlockMap(BlockArrays):
         self.head[rows, DRIFT] = self.head[rows, FREE_VISITS] = 0
         self.head[rows, INSIDE] = (observed & (self.distance[rows] < 0.0)).sum(axis=1)
 
-    def touch_fused(
-        self, rows: Int64, stamp_ns: int, moved_um: Int64, solid: Int64, inside: Int64
-    ) -> None:
+    def touch_fused(self, rows: Int64, stamp_ns: int, figures: Int64) -> None:
         """
         Mark blocks as changed by a measurement; increments the version.
 
@@ -398,20 +396,18 @@ class BlockMap(BlockArrays):
             The blocks.
         stamp_ns : int
             Stamp of the measurement, ns.
-        moved_um : (K,) int64
-            Largest change of a distance, micrometres; see tsdf/kernels/integration.py.
-        solid, inside : (K,) int64
-            Number of observed voxels that are not free, and behind a surface.
+        figures : (K, NUM_FOUND) int64
+            Of each block, see tsdf/kernels/integration.py.
 
         """
         self._mark(rows, stamp_ns)
         head = self.head
-        drift = head[rows, DRIFT] + moved_um
+        drift = head[rows, DRIFT] + figures[:, MOVED]
         visible = drift > VISIBLE_VOXELS * self.config.voxel_size_m * 1e6
         head[rows, DRIFT] = np.where(visible, 0, drift)
         head[rows[visible], SURFACE] = self.version
-        head[rows, FREE_VISITS] = np.where(solid == 0, head[rows, FREE_VISITS] + 1, 0)
-        head[rows, INSIDE] = inside
+        head[rows, FREE_VISITS] = np.where(figures[:, SOLID], 0, head[rows, FREE_VISITS] + 1)
+        head[rows, INSIDE] = figures[:, BEHIND]
 
     def _mark(self, rows: Int64, stamp_ns: int) -> None:
         self.version += 1
@@ -451,14 +447,6 @@ class BlockMap(BlockArrays):
         remove_blocks(rows, self.head, self._hash.arrays, self._state)
         return len(rows)
 
-    def clear_updated(self) -> None:
-        """Clear the updated flag of all blocks."""
-        self._settled = self.version
-
-    def updated(self) -> Int64:
-        """Return the rows of blocks changed since the flags were cleared."""
-        return self.changed_since(self._settled)
-
     def evict(self, position: npt.ArrayLike) -> Blocks:
         """
         Remove the blocks outside of the window and return their content.
@@ -471,7 +459,7 @@ class BlockMap(BlockArrays):
         Returns
         -------
         Blocks
-            Blocks whose centre is farther than max_radius_m, except those flagged as updated.
+            Blocks whose centre is farther than max_radius_m.
 
         """
         config, rows = self.config, self.rows()
@@ -479,7 +467,6 @@ class BlockMap(BlockArrays):
         if config.max_radius_m > 0.0:
             centres = (self.index(rows) + 0.5) * config.block_size_m
             leaves |= np.linalg.norm(centres - np.asarray(position), axis=1) > config.max_radius_m
-        leaves &= self.head[rows, VERSION] <= self._settled
         return self.remove(rows[leaves])
 
     def remove(self, rows: Int64) -> Blocks:

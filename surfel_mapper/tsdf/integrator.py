@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 import logging
-import math
 from typing import Any
 
 import numpy as np
@@ -24,12 +23,9 @@ from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.kernels import lookup as kernels
 from surfel_mapper.tsdf.kernels.blocks import STAMP
 from surfel_mapper.tsdf.kernels.integration import (
-    INSIDE,
     integrate_blocks,
-    MOVED,
     NUM_FOUND,
     OBSERVED,
-    SOLID,
 )
 from surfel_mapper.tsdf.measurements import (
     checked_pose,
@@ -39,7 +35,6 @@ from surfel_mapper.tsdf.measurements import (
 )
 from surfel_mapper.tsdf.range_image import RangeImage
 from surfel_mapper.tsdf.selection import BlockSelection
-from surfel_mapper.tsdf.sensors import Sensor
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +66,6 @@ class Integrator:
         config = blocks.config
         warn_of_short_truncation(config)
         self._selection = BlockSelection(config)
-        self._has_warned = False
         self._threads = config.threads or usable_cores()
         side = np.arange(config.voxels_per_side) * config.voxel_size_m
         z, y, x = np.meshgrid(side, side, side, indexing='ij')
@@ -115,7 +109,6 @@ class Integrator:
 
         """
         T = checked_pose(T_map_sensor)
-        self._warn_of_radius(image.sensor)
         image = self._labelled(image)
         blocks, selected = self.blocks, self._selection.blocks(image, T)
         if allocate_blocks:
@@ -134,8 +127,7 @@ class Integrator:
             changed = observed > 0
             updated = rows[fused][changed]
             if len(updated):
-                columns = (figures[changed, column] for column in (MOVED, SOLID, INSIDE))
-                blocks.touch_fused(updated, stamp_ns, *columns)
+                blocks.touch_fused(updated, stamp_ns, figures[changed])
         finally:
             blocks.drop_new(rows)
         return Integrated(
@@ -178,19 +170,6 @@ class Integrator:
         share(fuse, len(rows), self._threads)
         return figures
 
-    def _warn_of_radius(self, sensor: Sensor) -> None:
-        """Warn once if the window is smaller than the reach of the sensor."""
-        config = self.blocks.config
-        needed_m = sensor.max_range_m + math.sqrt(0.75) * config.block_size_m
-        if 0.0 < config.max_radius_m < needed_m and not self._has_warned:
-            self._has_warned = True
-            logger.warning(
-                'layers.tsdf.max_radius_m: %g m is less than the range of the sensor plus half '
-                'the diagonal of a block, %.4g m; blocks beyond it come and go with every scan',
-                config.max_radius_m,
-                needed_m,
-            )
-
     def _labelled(self, image: RangeImage) -> RangeImage:
         """Return an image in which labels of moving objects are masked."""
         if image.label is None or not len(self._dynamic_labels):
@@ -202,7 +181,7 @@ class Integrator:
         """Return ranges in pairs, colours, labels, mask; missing ones have no rows."""
         mask, label = image.mask, image.label
         rows, (first, last) = kernels.BORDER
-        edges = [rows, (first, last - image.sensor.wraps)]
+        edges = [rows, (first, last)]
         return (
             paired(np.pad(image.range_m, edges)),
             NO_COLOR if image.color is None else image.color,

@@ -14,7 +14,7 @@ divided among threads, and the result has the same bits for any number of thread
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import logging
 from typing import Any
 
@@ -31,12 +31,10 @@ from surfel_mapper.tsdf.kernels.blocks import INSIDE as BEHIND
 from surfel_mapper.tsdf.kernels.blocks import STAMP
 from surfel_mapper.tsdf.kernels.integration import (
     INSIDE,
-    MOVED,
     NEAR,
     NUM_FOUND,
     OBSERVED,
     OPPOSED,
-    SOLID,
 )
 from surfel_mapper.tsdf.kernels.point_cells import CELL, EMPTY, MOMENTS
 from surfel_mapper.tsdf.measurements import (
@@ -115,14 +113,8 @@ class ScanBlocks:
 
     def only(self, kept: npt.NDArray[np.bool_]) -> ScanBlocks:
         """Return some of the blocks."""
-        if kept.all():
-            return self
-        return ScanBlocks(
-            index=self.index[kept],
-            ends=self.ends[kept],
-            grouped=self.grouped,
-            freed=self.freed[kept],
-        )
+        index, ends, freed = self.index[kept], self.ends[kept], self.freed[kept]
+        return replace(self, index=index, ends=ends, freed=freed)
 
 
 class PointIntegrator:
@@ -321,8 +313,7 @@ class PointIntegrator:
             updated = rows[fused][changed]
             self._fuse_channels(channels, frame, rows, rates)
             if len(updated):
-                columns = (figures[changed, column] for column in (MOVED, SOLID, INSIDE))
-                blocks.touch_fused(updated, stamp_ns, *columns)
+                blocks.touch_fused(updated, stamp_ns, figures[changed])
         finally:
             blocks.drop_new(rows)
         return Integrated(

@@ -107,7 +107,7 @@ class RangeImage:
         expected = (self.sensor.rows, self.sensor.columns, *channels)
         if image.shape != expected:
             raise CloudFormatError(f'{name}: {image.shape}, expected {expected} as the sensor has')
-        return repeated(image) if self.sensor.wraps else np.ascontiguousarray(image)
+        return np.ascontiguousarray(image)
 
 
 def from_depth(
@@ -204,38 +204,6 @@ def from_points(
     return range_image.with_images(**more) if more else range_image
 
 
-def from_ranges(sensor: Sensor, range_m: npt.NDArray[Any]) -> RangeImage:
-    """
-    Return the range image of ranges that are already in the pixels of the sensor.
-
-    Parameters
-    ----------
-    sensor : CameraModel or LidarModel
-        Model of the sensor, rows from the highest beam to the lowest.
-    range_m : (rows, columns) float
-        Length of each ray, m; 0, negative and nan mean unknown, inf free up to max_range_m.
-
-    Raises
-    ------
-    CloudFormatError
-        If the size differs from the sensor model.
-
-    """
-    if range_m.shape != (sensor.rows, sensor.columns) or range_m.dtype.kind != 'f':
-        raise CloudFormatError(
-            f'ranges: {range_m.dtype} {range_m.shape}, expected floats '
-            f'{(sensor.rows, sensor.columns)} as the sensor has (rows, columns)'
-        )
-    image = np.empty((sensor.rows, sensor.columns + sensor.wraps), np.float32)
-    native = np.ascontiguousarray(range_m, np.float32)
-    largest, used = kernels.from_depth(
-        native, np.float32(1.0), np.nan, np.ones_like(native), limits(sensor), image
-    )
-    if sensor.wraps:
-        image[:, -1] = image[:, 0]
-    return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
-
-
 def limits(sensor: Sensor) -> Float32:
     """Return the smallest and largest range, and the value of a clearing pixel, m, (3,)."""
     farthest = sensor.max_range_m
@@ -257,8 +225,3 @@ def image_of(
     image = values[source]
     image[source < 0] = missing
     return image
-
-
-def repeated(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return an image with its first column repeated after the last."""
-    return np.concatenate([image, image[:, :1]], axis=1)

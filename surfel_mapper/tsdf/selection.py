@@ -143,5 +143,5 @@ def reach(config: TsdfConfig, image: RangeImage) -> Float64:
     sensor = image.sensor
     free = [config.block_size_m / 8.0 / pitch for pitch in sensor.pitch_rad]
     band = [SPACING_VOXELS * config.voxel_size_m / pitch for pitch in sensor.pitch_rad]
-    ends = [config.tau_m, config.tau_m, sensor.min_range_m, sensor.max_range_m]
+    ends = [config.tau_m, sensor.min_range_m, sensor.max_range_m]
     return np.array([*ends, float(config.carve_m > 0.0), *free, *band])

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cached_property
 import itertools
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -157,10 +157,8 @@ class LidarModel:
         Angle between the highest and the lowest beam.
     vertical_fov_top_deg : float
         Elevation of the highest beam; nan means half of vertical_fov_deg.
-    horizontal_fov_deg : float
-        360 for a full circle, otherwise the angle between the first and the last column.
     first_azimuth_deg : float
-        Azimuth of column 0, from x towards y; nan means half of horizontal_fov_deg.
+        Azimuth of column 0, from x towards y; the columns are a full circle.
     beam_elevations_deg : tuple of float
         Elevation of each beam, descending; empty for evenly spaced beams.
     min_range_m, max_range_m : float
@@ -173,12 +171,12 @@ class LidarModel:
 
     """
 
+    wraps: ClassVar[bool] = True
     rows: int = 64
     columns: int = 2048
     vertical_fov_deg: float = 45.0
     vertical_fov_top_deg: float = math.nan
-    horizontal_fov_deg: float = 360.0
-    first_azimuth_deg: float = math.nan
+    first_azimuth_deg: float = 180.0
     beam_elevations_deg: tuple[float, ...] = ()
     min_range_m: float = 0.5
     max_range_m: float = 100.0
@@ -192,8 +190,6 @@ class LidarModel:
             object.__setattr__(self, 'vertical_fov_deg', beams[0] - beams[-1])
         if math.isnan(self.vertical_fov_top_deg):
             object.__setattr__(self, 'vertical_fov_top_deg', self.vertical_fov_deg / 2.0)
-        if math.isnan(self.first_azimuth_deg):
-            object.__setattr__(self, 'first_azimuth_deg', self.horizontal_fov_deg / 2.0)
         top, bottom = self.vertical_fov_top_deg, self.vertical_fov_top_deg - self.vertical_fov_deg
         descends = all(high > low for high, low in itertools.pairwise(beams))
         checks = [
@@ -204,16 +200,9 @@ class LidarModel:
             ('columns', self.columns >= 2, 'at least 2'),
             ('vertical_fov_deg', 0.0 < self.vertical_fov_deg < 180.0, 'between 0 and 180'),
             ('vertical_fov_top_deg', bottom > -90.0 and top < 90.0, 'beams between -90 and 90'),
-            ('horizontal_fov_deg', 0.0 < self.horizontal_fov_deg <= 360.0, 'in (0, 360]'),
             ('first_azimuth_deg', -360.0 <= self.first_azimuth_deg <= 360.0, 'in [-360, 360]'),
         ]
         refuse_unless(self, checks)
-
-    @property
-    def wraps(self) -> bool:
-        """Whether the last column is the neighbour of the first."""
-        reach = self.horizontal_fov_deg * self.columns / (self.columns - 1)
-        return reach > 360.0 - 1e-6
 
     @property
     def kind(self) -> int:
@@ -228,9 +217,7 @@ class LidarModel:
 
     @property
     def _column_rad(self) -> float:
-        if self.wraps:
-            return 2.0 * math.pi / self.columns
-        return math.radians(self.horizontal_fov_deg) / (self.columns - 1)
+        return 2.0 * math.pi / self.columns
 
     @cached_property
     def elevations_rad(self) -> Float64:
@@ -261,7 +248,7 @@ class LidarModel:
         """Parameters of the projection, see kernels/projection.py."""
         row_rad = math.radians(self.vertical_fov_deg) / (self.rows - 1)
         top_rad, first_rad = self.elevations_rad[0], math.radians(self.first_azimuth_deg)
-        turn, lowest = 2.0 * math.pi / self._column_rad, 0.0 if self.wraps else -0.5
+        turn, lowest = 2.0 * math.pi / self._column_rad, 0.0
         angles = [first_rad, self._column_rad, top_rad, row_rad]
         return np.array([*angles, self.columns, self.rows, turn, lowest], np.float32)
 

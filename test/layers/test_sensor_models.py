@@ -38,9 +38,7 @@ def test_another_lidar_in_the_same_frame_is_fitted_again(caplog):
         second = sensors.of(scan_of(wall_around(SECOND)))
     assert (second.rows, second.columns) == (32, 512)
     assert 'fitted again' in caplog.text
-    assert sensors.summary()['sensor_refits'] == 1
-    assert sensors.summary()['sensors'] == {'lidar': '32 x 512'}
-    assert sensors.summary()['sensor_fit']['lidar'] > 0.9
+    assert sensors.frames['lidar'].share > 0.9
 
 
 def test_frame_without_a_model_is_tried_again_and_warned_of_once(caplog):

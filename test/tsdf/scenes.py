@@ -7,8 +7,9 @@ import numpy as np
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
+from surfel_mapper.tsdf.kernels import range_image as kernels
 from surfel_mapper.tsdf.measurements import LEAST_WEIGHT
-from surfel_mapper.tsdf.range_image import from_ranges
+from surfel_mapper.tsdf.range_image import limits, RangeImage
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
 VGA = CameraModel(columns=640, rows=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
@@ -94,4 +95,11 @@ def zero_crossings(blocks):
 
 
 def image_of(sensor, range_m):
-    return from_ranges(sensor, np.asarray(range_m, np.float32))
+    """Return the range image of ranges in the pixels of a sensor; nan: unknown, inf: free."""
+    image = np.empty((sensor.rows, sensor.columns + sensor.wraps), np.float32)
+    ranges = np.ascontiguousarray(range_m, np.float32)
+    one = np.float32(1.0), np.nan, np.ones_like(ranges), limits(sensor)
+    largest, used = kernels.from_depth(ranges, *one, image)
+    if sensor.wraps:
+        image[:, -1] = image[:, 0]
+    return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)

@@ -12,8 +12,6 @@ import pytest
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.tsdf.blocks import BlockMap
-from surfel_mapper.tsdf.sensors import LidarModel
-from test.tsdf.scenes import image_of, integrator
 
 
 def every_channel(**settings):
@@ -101,16 +99,11 @@ def test_index_beyond_20_bits_is_refused():
     assert blocks.num_blocks == 0
 
 
-SENSOR = LidarModel(rows=8, columns=90, vertical_fov_deg=40.0, max_range_m=3.0)
-HALF_DIAGONAL_M = np.sqrt(3.0) / 2.0
-
-
 def filled_along_x(**settings):
     """Return a map of blocks of 1 m along x, changed 10 s apart."""
     blocks = BlockMap(TsdfConfig(voxel_size_m=0.25, voxels_per_side=4, **settings))
     for x in range(-5, 6):
         blocks.touch(blocks.place([[x, 0, 0]]), (x + 5) * 10 * 10**9)
-    blocks.clear_updated()
     return blocks
 
 
@@ -125,44 +118,6 @@ def test_blocks_leave_whose_centre_is_beyond_the_radius():
     assert sorted(removed.index[:, 0]) == [-5, -4, -3, 3, 4, 5]
     assert (blocks.find(removed.index) == -1).all()
     assert len(blocks.evict([0.5, 0.5, 0.5])) == 0
-
-
-def test_blocks_flagged_updated_stay_until_the_flag_is_cleared():
-    blocks = filled_along_x(max_radius_m=2.2)
-    blocks.touch(blocks.find([[5, 0, 0], [-5, 0, 0]]), 0)
-    assert sorted(blocks.index(blocks.updated())[:, 0]) == [-5, 5]
-    blocks.evict([0.5, 0.5, 0.5])
-    assert left_along_x(blocks) == [-5, -2, -1, 0, 1, 2, 5]
-    blocks.clear_updated()
-    assert len(blocks.updated()) == 0
-    assert len(blocks.evict([0.5, 0.5, 0.5])) == 2
-    assert left_along_x(blocks) == [-2, -1, 0, 1, 2]
-
-
-def drive(max_radius_m):
-    """Return the number of blocks added and removed while the sensor stands still."""
-    one = integrator(voxel_size_m=0.1, truncation_m=0.3, max_radius_m=max_radius_m)
-    added = removed = 0
-    T = np.eye(4)
-    T[:3, 3] = [0.31, -0.17, 0.05]
-    image = image_of(SENSOR, np.full((8, 90), 2.69))
-    for number in range(5):
-        result = one.integrate(image, T, number)
-        one.blocks.clear_updated()
-        gone = one.blocks.evict(T[:3, 3])
-        if number:
-            added, removed = added + result.num_added, removed + len(gone)
-    return added, removed
-
-
-def test_blocks_do_not_come_and_go_where_the_radius_holds_all_that_is_seen(caplog):
-    assert drive(3.0 + HALF_DIAGONAL_M * 0.8) == (0, 0)
-    assert not caplog.records
-    added, removed = drive(2.0)
-    assert added == removed > 0
-    assert [record.message.split(':')[0] for record in caplog.records] == [
-        'layers.tsdf.max_radius_m'
-    ]
 
 
 def test_beyond_the_limit_the_farthest_blocks_leave():

@@ -9,14 +9,13 @@ import pytest
 
 from surfel_mapper.errors import CloudFormatError, ConfigError
 from surfel_mapper.kernels.projection import OUTSIDE, project
-from surfel_mapper.tsdf.range_image import from_depth, from_points, from_ranges
+from surfel_mapper.tsdf.range_image import from_depth, from_points
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 from test.tsdf import twin
 from test.tsdf.scenes import SMALL, VLP16
 
 LIDARS = {
     'around': VLP16,
-    'narrow': LidarModel(rows=10, columns=50, vertical_fov_deg=20.0, horizontal_fov_deg=100.0),
     'turned': LidarModel(rows=8, columns=100, vertical_fov_deg=30.0, first_azimuth_deg=10.0),
     'table': LidarModel(rows=4, columns=90, beam_elevations_deg=(15.0, 2.0, 0.0, -25.0)),
 }
@@ -116,7 +115,6 @@ def test_65535_mm_is_no_depth_and_no_free_space():
     [
         (lambda: from_depth(SMALL, np.zeros((80, 60), np.float32)), r'\(80, 60\), expected'),
         (lambda: from_depth(SMALL, np.zeros((60, 80), np.int32)), 'int32, expected float32'),
-        (lambda: from_ranges(VLP16, np.zeros((16, 361))), r'expected floats \(16, 360\)'),
         (lambda: from_points(VLP16, np.zeros((5, 2))), r'expected \(N, 3\)'),
         (lambda: from_points(VLP16, np.zeros((5, 3), int)), r'expected \(N, 3\) float'),
         (lambda: from_points(VLP16, np.zeros((5, 3)), labels=np.zeros(4, int)), 'labels: '),
@@ -150,7 +148,6 @@ def blank():
         (lambda: LidarModel(rows=1), 'rows: 1'),
         (lambda: LidarModel(vertical_fov_deg=0.0), 'vertical_fov_deg: 0'),
         (lambda: LidarModel(vertical_fov_top_deg=95.0), 'vertical_fov_top_deg: 95'),
-        (lambda: LidarModel(horizontal_fov_deg=361.0), 'horizontal_fov_deg: 361'),
         (
             lambda: LidarModel(rows=2, beam_elevations_deg=(1.0, 2.0)),
             'beam_elevations_deg: .*desc',

@@ -9,10 +9,9 @@ from surfel_mapper.config import TsdfConfig
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
-from surfel_mapper.tsdf.range_image import from_ranges
 from surfel_mapper.tsdf.selection import BlockSelection
 from test.tsdf import twin
-from test.tsdf.scenes import SMALL
+from test.tsdf.scenes import image_of, SMALL
 
 POSE = pose_matrix([3.2, -7.1, 0.4], [0.1, -0.2, 0.3, 0.927361849549570])
 SETTINGS = [
@@ -34,7 +33,7 @@ def random_image(sensor, rng):
     range_m[rng.random(shape) < 0.05] = np.nan
     range_m[rng.random(shape) < 0.05] = np.inf
     labels = rng.integers(-1, 4, (4, 4))[rows][:, columns]
-    image = from_ranges(sensor, range_m.astype(np.float32))
+    image = image_of(sensor, range_m)
     return image.with_images(
         color=rng.integers(0, 256, (*shape, 3)).astype(np.uint8),
         label=labels,

@@ -32,13 +32,7 @@ def place_in_image(sensor, p):
         azimuth = np.arctan2(p[:, 1], p[:, 0])
         elevation = np.arcsin(p[:, 2] / np.linalg.norm(p, axis=1))
     first = np.deg2rad(sensor.first_azimuth_deg)
-    if sensor.wraps:
-        u = (first - azimuth) / (2 * np.pi) % 1.0 * sensor.columns
-    else:
-        pitch = np.deg2rad(sensor.horizontal_fov_deg) / (sensor.columns - 1)
-        turn = 2 * np.pi / pitch
-        u = ((first - azimuth) / pitch + 0.5) % turn - 0.5
-        u = np.where(u < sensor.columns - 0.5, u, np.nan)
+    u = (first - azimuth) / (2 * np.pi) % 1.0 * sensor.columns
     beams = np.deg2rad(
         sensor.beam_elevations_deg
         or np.linspace(

@@ -163,7 +163,6 @@ class TsdfLayer(Layer):
         scan, T_map_sensor = self.around.sensors.centered(scan, T_map_sensor)
         self._limit()
         sensor = self.around.sensors.camera_of(scan)
-        self.blocks.clear_updated()
         config = self.config.tsdf
         wanted = {'has_color': config.color, 'has_label': config.semantics != 'none'}
         if sensor is None:

@@ -24,20 +24,19 @@ from numba import njit
 import numpy as np
 
 # What rays reach, float64 m.
-BEFORE = 0
-"""Distance before a surface at which the band begins, m; BEHIND is the end behind it."""
-BEHIND = 1
-NEAR = 2
-MAX_RANGE = 3
-CARVE = 4
+BAND = 0
+"""Distance before a surface at which the band begins, and behind it at which it ends, m."""
+NEAR = 1
+MAX_RANGE = 2
+CARVE = 3
 """Not 0: rays are traversed from the sensor on."""
-ROW_FREE = 5
+ROW_FREE = 4
 """Range up to which neighbouring rows are within an eighth of a block, m."""
-COLUMN_FREE = 6
-ROW_BAND = 7
+COLUMN_FREE = 5
+ROW_BAND = 6
 """Range up to which rows are denser than the spacing of rays in the band, m."""
-COLUMN_BAND = 8
-NUM_REACH = 9
+COLUMN_BAND = 7
+NUM_REACH = 8
 
 
 @njit(cache=True, nogil=True)
@@ -90,8 +89,8 @@ def mark_rays(image, directions, pose, reach, side, marks, near):
                 continue
             range_m = np.float64(measured)
             clears = range_m > max_range
-            start = range_m - reach[BEFORE]
-            end = range_m + reach[BEHIND] if in_band else start
+            start = range_m - reach[BAND]
+            end = range_m + reach[BAND] if in_band else start
             if clears:
                 start, end = max_range, max_range
             surface = start if separate and in_band and not clears else np.inf

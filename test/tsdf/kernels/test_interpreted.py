@@ -42,7 +42,6 @@ for carve_m in (20.0, 0.0):
             print(by_points.integrate(points, pose, number))
         else:
             print(one.integrate(image, pose, number))
-        one.blocks.clear_updated()
         print(len(one.blocks.evict(pose[:3, 3])))
     blocks = one.blocks
     places = rng.normal(size=(50, 3)) + [0.0, -2.0, 1.0]
