@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 import logging
 from pathlib import Path
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple, overload, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,9 @@ FLOAT_REACH_M = 8192.0
 
 QUALITY = ('thickness', 'normal_sigma', 'radius', 'num_scans', 'size')
 """Names of the columns that tell how good a surfel is."""
+
+SHAPE = ('thickness', 'normal_sigma', 'radius')
+"""Columns that follow from the eigenvalues and the number of points."""
 
 COVARIANCE = ('cov_xx', 'cov_xy', 'cov_xz', 'cov_yy', 'cov_yz', 'cov_zz')
 
@@ -83,6 +86,11 @@ class Surfels:
         Number of points.
     voxel_index : (K, 3) int32
         floor(point / voxel size).
+    num_scans : (K,) int64
+        Number of scans with points in the voxel, exact if scans are removed as they were added; of
+        a coarser voxel the largest of its voxels.
+    size : (K,) float64, m
+        Edge of the voxel, or of the cell of adaptive surfels.
     thickness : (K,) float64, m
         Standard deviation of the points along the normal about their plane: the square root of
         e0 (n - 1) / (n - 3), as fitting the plane takes three of the n degrees of freedom. nan for
@@ -94,11 +102,6 @@ class Surfels:
         nan for 3 points or fewer, and if the normal is nan.
     radius : (K,) float64, m
         Radius of the uniform disc of equal spread in the plane: the square root of 2 (e1 + e2).
-    num_scans : (K,) int64
-        Number of scans with points in the voxel, exact if scans are removed as they were added; of
-        a coarser voxel the largest of its voxels.
-    size : (K,) float64, m
-        Edge of the voxel.
     covariance : (K, 6) float64, m^2, optional
         Covariance of the points, xx xy xz yy yz zz, if asked for.
     channels : mapping of str to (K,) float64
@@ -125,13 +128,30 @@ class Surfels:
     eigenvalues: npt.NDArray[np.float64]
     num_points: npt.NDArray[np.int64]
     voxel_index: npt.NDArray[np.int32]
-    thickness: npt.NDArray[np.float64]
-    normal_sigma: npt.NDArray[np.float64]
-    radius: npt.NDArray[np.float64]
     num_scans: npt.NDArray[np.int64]
     size: npt.NDArray[np.float64]
+    thickness: npt.NDArray[np.float64] = None  # type: ignore[assignment]  # as __getattr__ derives
+    normal_sigma: npt.NDArray[np.float64] = None  # type: ignore[assignment]
+    radius: npt.NDArray[np.float64] = None  # type: ignore[assignment]
     covariance: npt.NDArray[np.float64] | None = None
     channels: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Leave missing columns unset, which __getattr__ derives."""
+        if self.thickness is None:
+            for name in SHAPE:
+                object.__delattr__(self, name)
+
+    if not TYPE_CHECKING:  # which would take any name
+
+        def __getattr__(self, name: str) -> Any:
+            """Derive thickness, normal_sigma and radius when the first of them is read."""
+            if name not in SHAPE:
+                raise AttributeError(f'Surfels have no {name}')
+            columns = quality(self.eigenvalues, self.num_points)
+            for column, values in zip(SHAPE, columns, strict=True):
+                object.__setattr__(self, column, values)
+            return getattr(self, name)
 
     @classmethod
     def from_message(cls, msg: Any) -> Surfels:
@@ -406,9 +426,6 @@ def derive(
         np.empty((num, 3)),
         np.empty(num, np.int64),
         np.empty((num, 3), np.int32),
-        np.empty(num),
-        np.empty(num),
-        np.empty(num),
         np.empty(num, np.int64),
     )
     covariances = np.empty((num if covariance else 0, 6))

@@ -25,7 +25,7 @@ from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.kernels.layout import INDEX_BITS
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import quality, Surfels
+from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.kernels.surfel_classes import (
     classify,
     classify_sparse,
@@ -211,7 +211,6 @@ class SurfelGraph:
         eigenvalues, num_points = self.eigenvalues[rows], self.count[rows]
         e0, e1, e2 = eigenvalues.T
         total = np.where(e2 > 0.0, e0 + e1 + e2, np.nan)
-        thickness, normal_sigma, radius = quality(eigenvalues, num_points)
         return Surfels(
             position=self.position[rows],
             normal=self.own_normal[rows],
@@ -220,9 +219,6 @@ class SurfelGraph:
             eigenvalues=eigenvalues,
             num_points=num_points,
             voxel_index=unpack_keys(self.key[rows]),
-            thickness=thickness,
-            normal_sigma=normal_sigma,
-            radius=radius,
             num_scans=self.num_scans[rows],
             size=np.full(len(rows), self.map.voxel_size_m),
         )

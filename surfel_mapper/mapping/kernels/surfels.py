@@ -77,8 +77,7 @@ def derive_surfels(rows, stamps, chosen, voxel_size, bits, outputs):
     bits        a voxel is 2^bits lattice units wide
     outputs     position (K, 3) float64 m, normal (K, 3), planarity (K,), curvature (K,),
                 eigenvalues (K, 3) m^2, num_points (K,) int64, voxel_index (K, 3) int32,
-                thickness (K,) m, normal_sigma (K,) rad, radius (K,) m, num_scans (K,) int64,
-                covariance (K, 6) m^2, or (0, 6) to leave it out
+                num_scans (K,) int64, covariance (K, 6) m^2, or (0, 6) to leave it out
 
     A single point or identical points: eigenvalues 0; normal, planarity and curvature nan.
     """
@@ -88,11 +87,8 @@ def derive_surfels(rows, stamps, chosen, voxel_size, bits, outputs):
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     unit = voxel_size / (1 << bits)
     vectors = outputs[0].ravel(), outputs[1].ravel(), outputs[4].ravel()
-    written = (
-        *(*vectors, outputs[2], outputs[3], outputs[5], outputs[6].ravel()),
-        *(outputs[7], outputs[8], outputs[9], outputs[10]),
-    )
-    changes, covariance = stamps.ravel(), outputs[11]
+    written = *vectors, outputs[2], outputs[3], outputs[5], outputs[6].ravel(), outputs[7]
+    changes, covariance = stamps.ravel(), outputs[8]
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
         most = gather(rows, changes, chosen, start, num, keys, moments, written)
@@ -111,11 +107,6 @@ def derive_surfels(rows, stamps, chosen, voxel_size, bits, outputs):
             shape[0, i], shape[1, i] = 2.0 * (e1 - e0) * inverse, e0 * inverse
             scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
             values[0, i], values[1, i], values[2, i] = e0 * scale, e1 * scale, e2 * scale
-        thickness, normal_sigma, radius = outputs[7], outputs[8], outputs[9]
-        for i in range(U(num)):
-            quality = quality_of(values[0, i], values[1, i], values[2, i], moments[N, i])
-            row = U(start) + i
-            thickness[row], normal_sigma[row], radius[row] = quality
         for i in range(num):
             nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
             side = side_of(nx, ny, nz, moments[V, i], moments[V + 1, i], moments[V + 2, i])
@@ -124,7 +115,7 @@ def derive_surfels(rows, stamps, chosen, voxel_size, bits, outputs):
         write_surfels(
             start, num, keys, moments, mean, normals, values, shape, voxel_size, bits, outputs
         )
-        write_scans(start, num, chosen, moments, changes, outputs[10])
+        write_scans(start, num, chosen, moments, changes, outputs[7])
         if len(covariance):
             write_covariances(start, num, moments, scatter, unit, covariance)
 
@@ -152,7 +143,10 @@ def quality_of(e0, e1, e2, n):
 @kernel(error_model='numpy')
 def derive_quality(eigenvalues, num_points, outputs):
     """
-    Derive the quality of surfels from their eigenvalues, as derive_surfels does.
+    Derive the quality of surfels from their eigenvalues.
+
+    Not a part of derive_surfels: three more columns of each changed voxel take a fifth of its
+    time, and most callers do not read them.
 
     eigenvalues  (K, 3) float64, m^2
     num_points   (K,) int64
@@ -171,8 +165,7 @@ def prefetch_outputs(written, row):
     Prefetch the memory of LINE surfels from a row on, to be written.
 
     written  position, normal and eigenvalues, each (3 K,) float64; planarity and curvature (K,)
-             float64; num_points (K,) int64; voxel_index (3 K,) int32; further columns (K,) of
-             64 bits
+             float64; num_points (K,) int64; voxel_index (3 K,) int32; num_scans (K,) int64
     """
     position, normal, eigenvalues, planarity, curvature, num_points, voxel_index = written[:7]
     for line in range(3):
@@ -185,11 +178,7 @@ def prefetch_outputs(written, row):
     prefetch_to_write(num_points, row)
     prefetch_to_write(voxel_index, 3 * row)
     prefetch_to_write(voxel_index, min(3 * row + 2 * LINE, len(voxel_index) - 1))
-    thickness, normal_sigma, radius, num_scans = written[7:]
-    prefetch_to_write(thickness, row)
-    prefetch_to_write(normal_sigma, row)
-    prefetch_to_write(radius, row)
-    prefetch_to_write(num_scans, row)
+    prefetch_to_write(written[7], row)
 
 
 @inlined()

@@ -41,7 +41,6 @@ def outputs_for(num):
         np.full((num, 3), -7.0),
         np.full(num, -7, np.int64),
         np.full((num, 3), -7, np.int32),
-        *np.full((3, num), -7.0),
         np.full(num, -7, np.int64),
         np.full((num, 6), -7.0),
     )
