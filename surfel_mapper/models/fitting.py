@@ -70,6 +70,12 @@ SIZES = (0.5, 2.0, 4.0, 8.0, 16.0, 64.0, 128.0)
 """Edges of the voxels in which points that are left are grown, in those of the cloud; the finer
 ones only if these can be numbered."""
 
+MERGED_VOXELS = 0.3
+"""
+Largest offset of merged clusters before growth. Books lie on a table, and what is merged is not
+divided again, but what is not may still be joined by all points.
+"""
+
 MOST_JOINED = 16.0
 """Largest of these in which patches are joined, too."""
 
@@ -157,7 +163,12 @@ def fit_points(
     rows = np.flatnonzero(core)
     clusters = segment_cloud(thinned.means[rows], config, view)
     laps.append(clock())
-    surfaces = merge_clusters(clusters, config, view)
+    close = replace(
+        config,
+        max_offset_voxels=min(config.max_offset_voxels, MERGED_VOXELS),
+        arc_offset_voxels=min(config.arc_offset_voxels, MERGED_VOXELS),
+    )
+    surfaces = merge_clusters(clusters, close, view)
     laps.append(clock())
     patches = fitted_patches(clusters, surfaces, config, view, whole=False)
     laps.append(clock())

@@ -31,6 +31,9 @@ Indices = npt.NDArray[np.int64]
 EDGE_M, EDGE_RANGE_M, COARSEST = 0.32, 2.0, 2
 """Edge of cubes up to twice EDGE_RANGE_M; it doubles with the range, up to COARSEST times."""
 
+NEAR_M = 1.0
+"""Cubes nearer than this are half as large: objects on a table are smaller than walls."""
+
 CUBES, CUBE_POINTS, LEAST_POINTS = 128, 64, 32
 """Cubes for the estimate, most and least points used in each."""
 
@@ -158,6 +161,7 @@ def sampled_cubes(samples: NoiseSamples, edge_m: float) -> tuple[Array, Array, f
         range_m = np.sqrt(((means[seeds] - view) ** 2).sum(axis=1))
         level = np.floor(np.log2(np.maximum(range_m / EDGE_RANGE_M, 1.0)))
         halves *= 2.0 ** np.minimum(level, COARSEST)
+        halves[range_m < NEAR_M] *= 0.5
     z = np.stack([np.maximum.accumulate(means[:, 2]), np.minimum.accumulate(means[::-1, 2])[::-1]])
     rows: Indices = np.empty((len(seeds), more * CUBE_POINTS), np.int64)
     sample_cubes(samples.starts, means, z, seeds, halves, rows)

@@ -73,6 +73,43 @@ def posed_frames(data_folder, number):
         yield points @ (u @ vt).T + pose[:3, 3], pose[:3, 3]
 
 
+def table_of_books(seed, number=5):
+    """
+    Return points (307200, 3) float32 of a camera above books on a table, and labels: table 1.
+
+    Books are boxes of 12 to 28 cm and 1.5 to 5 cm high; noise is matched and in steps.
+    """
+    from scipy.ndimage import uniform_filter
+
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[:480, :640]
+    rays = np.stack([(u - 320) / 525.0, (v - 240) / 525.0, np.ones((480, 640))], -1).reshape(-1, 3)
+    tilt = np.radians(35.0)
+    up = np.array([0.0, -np.cos(tilt), -np.sin(tilt)])
+    R_table_camera = np.stack([[1.0, 0.0, 0.0], np.cross(up, [1.0, 0.0, 0.0]), up])
+    local, eye = rays @ R_table_camera.T, -R_table_camera @ [0.0, 0.05, 0.95]
+    depth = np.where(local[:, 2] < 0.0, -eye[2] / local[:, 2], np.inf)
+    depth[(np.abs(eye + depth[:, None] * local) > [0.6, 0.45, 1.0]).any(axis=1)] = np.inf
+    labels = np.isfinite(depth).astype(np.int64)
+    for book in range(number):
+        a = rng.uniform(0.0, np.pi)
+        turn = np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
+        x, y = rng.uniform([-0.35, -0.3], [0.35, 0.3])
+        half, height = rng.uniform([0.08, 0.06], [0.14, 0.1]), rng.uniform(0.015, 0.05)
+        start, way = turn @ (eye - [x, y, 0.0]), local @ turn.T
+        ends = np.array([[-half[0], -half[1], 0.0], [half[0], half[1], height]])
+        first, last = np.sort((ends[:, None] - start) / way, axis=0)
+        near = first.max(axis=1)
+        hit = (near < last.min(axis=1)) & (near > 0.0) & (near < depth)
+        depth[hit], labels[hit] = near[hit], book + 2
+    noise = uniform_filter(rng.standard_normal((480, 640)), 5).ravel()
+    z = np.where(labels > 0, depth, 1.0)
+    z += SIGMA * z**2 * noise / noise.std()
+    least = FOCAL_PX * BASELINE_M * STEPS_PER_PX
+    z = np.where(labels > 0, least / np.rint(least / z), np.nan)
+    return (rays * z[:, None]).astype(np.float32), labels
+
+
 def disparity_noise(cloud, side=48):
     """
     Return sigma of the depth by depth^2, 1/m, from windows of pixels.

@@ -90,6 +90,17 @@ def test_walls_of_real_rooms_are_few_planes(data_folder):
     assert model.size_bytes < 15_000
 
 
+@pytest.mark.parametrize(('size_m', 'impure'), [(0.01, 0.03), (0.02, 0.06)])
+def test_a_table_under_books_is_one_plane_without_them(size_m, impure):
+    """Books were in the plane of the table: a tenth of the points, and it fell into pieces."""
+    figures = []
+    for seed in range(4):
+        points, labels = depth_frames.table_of_books(seed)
+        figures.append(tabletop.ours(points, labels, size_m))
+    assert min(one['table'] for one in figures) >= 0.9
+    assert np.mean([one['impure'] for one in figures]) <= impure
+
+
 def test_noise_grows_with_the_square_of_the_range():
     rng, parts = np.random.default_rng(7), []
     for far in (1.0, 2.0, 3.0, 4.0):
