@@ -272,6 +272,17 @@ class RegisteredPoses:
             self.apart = [*self.apart, map_part.apart()][-MOST_PARTS:]
             self._num_parts += 1
 
+    @property
+    def problem(self) -> str:
+        """Why the newest scans have no certain place on the map; empty if they have."""
+        map_part = self._map_part
+        if map_part is None:
+            return ''
+        return (
+            f'the newest {len(map_part.scans)} scans have no certain place on the map: '
+            f'{map_part.reasons}; publish the pose of the robot on /initialpose'
+        )
+
     def summary(self) -> dict[str, Any]:
         """Return figures of the fit of the scans, for files and reports."""
         fits = list(self._fits) or [float('nan')]

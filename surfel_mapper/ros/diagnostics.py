@@ -157,6 +157,7 @@ class Totals:
     def since(self, last: Totals, node: Node, session: Session) -> Interval:
         """Return the interval since an earlier count; of several topics, the most silent one."""
         topic, received_s = session.inputs.most_silent
+        registered = session.mapper.registered
         self.num_publishers, unheard = publishers(node, topic)
         silent_s = max(self.time_s - received_s, 0.0)
         is_silent = silent_s > SILENT_S and min(self.num_publishers, last.num_publishers) > 0
@@ -178,7 +179,7 @@ class Totals:
             layers_off=session.mapper.counters.layers_off,
             loss=session.inputs.loss() if self.lost > last.lost or not self.received else '',
             alternatives=session.inputs.alternatives,
-            poses=session.inputs.poses.warning,
+            poses=session.inputs.poses.warning or (registered.problem if registered else ''),
             clocks=session.inputs.clocks.problem,
             checkpoints=session.checkpoints.problem,
             mounts=session.inputs.poses.mount_changes(session.mapper.mount_changes),

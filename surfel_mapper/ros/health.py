@@ -61,7 +61,7 @@ class Interval:
     alternatives : str
         The missing publisher, and the topics that could be read instead; empty if none.
     poses : str
-        The poses that are missing, and the remedy; empty if none.
+        The poses that are missing or uncertain, and the remedy; empty if none.
     checkpoints : str
         Why checkpoints fail, and the age of the last good one; empty if none failed.
     mounts : str
@@ -109,7 +109,7 @@ def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[in
         yield WARN, f'layer {name} is off until ~/clear, it failed repeatedly: {error}'
     drops = list(_drops(interval, limits))
     yield from drops
-    if interval.never_mapped and not drops and not interval.paused:
+    if interval.never_mapped and not (drops or interval.paused or interval.poses):
         yield WARN, f'none of {interval.never_mapped} clouds is mapped yet: {NO_POSE}'
     yield from _latency(interval, limits)
 

@@ -165,7 +165,8 @@ class Session:
         """Publish the changes of a scan; called in the mapping thread."""
         if not self.latencies_s:
             self._node.get_logger().info(
-                f'first scan mapped: {update.num_points} points of frame {update.scan.frame_id}, '
+                f'first scan {update.outcome.outcome}: {len(update.filtered)} points of frame '
+                f'{update.scan.frame_id}, '
                 f'{self.mapper.map.num_voxels} voxels'
             )
         self.outputs.publish_update(update)

@@ -22,7 +22,7 @@ from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.pose_outputs import covariance
 from test.alignment.test_registration import map_of, points_on, ROOM
-from test.pipeline.test_registered_poses import pose_at, scan_at
+from test.pipeline.test_registered_poses import in_hall, pose_at, scan_at
 from test.ros.live import cloud, LATCHED, RVIZ, START_NS
 
 PERIOD_NS = 100_000_000
@@ -124,6 +124,25 @@ def test_a_cloud_is_a_map_to_localise_on_without_an_initial_pose(start, peer, tm
     for number, message in enumerate(odometry):
         np.testing.assert_allclose(pose_of(message), pose_at(number), atol=5e-3)
     assert 'its initial pose is unknown, and searched for in the map' in node.output
+    assert 'first scan localised: ' in node.output
+    assert node.stop() == 0
+
+
+def test_diagnostics_name_the_reason_and_the_remedy_without_a_place(start, peer, tmp_path):
+    save_map(tmp_path / 'room.npz', map_of(ROOM))
+    more = arguments(map__mode='frozen', map__load='room.npz', publish__diagnostics_rate_hz=20.0)
+    node = start('node', *more)
+    node.wait_for_output('ready')
+    peer.advertise('/points')
+    scans = [in_hall(number, np.eye(4)) for number in range(3)]
+
+    send(peer, [cloud(START_NS + n * PERIOD_NS, scan.points) for n, scan in enumerate(scans)])
+
+    text = 'the newest 3 scans have no certain place on the map: its initial pose is unknown'
+    peer.spin_until(lambda: text in peer.diagnosis()[0].message, what=lambda: node.output)
+    message = peer.diagnosis()[0].message
+    assert 'publish the pose of the robot on /initialpose' in message
+    assert 'is mapped yet' not in message
     assert node.stop() == 0
 
 
