@@ -61,7 +61,7 @@ def drawn(page):
 
 def test_a_map_is_drawn_in_a_browser(browser, served):
     # so small that the viewer leaves out its panels: a pixel costs the processor 20 us
-    page = browser.new_page(viewport={'width': 450, 'height': 350})
+    page = browser.new_page(viewport={'width': 450, 'height': 510})
     page.set_default_timeout(1000 * WAIT_S)
     page.goto(f'{served}&renderer=webgl')
 
