@@ -8,7 +8,7 @@ So if summary.json is new, all other files are too.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import csv
 import io
 import os
@@ -134,6 +134,41 @@ def check_not_scans(recording: Path, directory: Path) -> None:
             f'{directory}: the folder of the scans, where map.ply would be one of them; expected '
             'another directory'
         )
+
+
+def check_distinct(
+    recording: Path, wanted: Path | None, formats: Sequence[str], extra: Mapping[str, Path | None]
+) -> None:
+    """
+    Raise FileFormatError if two outputs of a replay have the same path.
+
+    Parameters
+    ----------
+    recording : Path
+        The recording, which names the directory if none is asked for.
+    wanted : Path, optional
+        The output directory asked for.
+    formats : sequence of str
+        Formats of the map and of layers.
+    extra : mapping of str to Path
+        Files beside the directory, by their options.
+
+    """
+    from surfel_mapper.files.trajectory import TRAJECTORY
+
+    directory = output_directory(recording, wanted)
+    files = known_formats()
+    names = [*(files[name] for name in formats), TRAJECTORY, SCANS, 'map.png', 'report.html']
+    paths = {os.path.realpath(directory / n): str(directory / n) for n in (*names, 'summary.json')}
+    for option, path in extra.items():
+        if path is None:
+            continue
+        full = os.path.realpath(path)
+        if full in paths:
+            raise FileFormatError(
+                f'{option} {path}: this replay writes {paths[full]} too, expected another file'
+            )
+        paths[full] = f'{path} for {option}'
 
 
 def check_writable(path: Path) -> None:
