@@ -100,16 +100,14 @@ def test_every_file_has_the_coordinates_of_the_poses(near, far):
         assert run.summary['pose_errors']['absolute']['translation_m']['max'] < 1e-6
 
 
-def test_the_report_states_heights_and_the_origin_in_the_fixed_frame(near, far):
+def test_the_report_states_positions_and_the_origin_in_the_fixed_frame(near, far):
     pages = [(out_of(run) / 'report.html').read_text() for run in (near, far)]
 
     assert 'origin of the map</dt><dd>400000, 5400000, 250 m<' in pages[1]
     assert 'origin of the map' not in pages[0]
     data = [json.loads(re.search('id="map">(.*?)</script>', text)[1]) for text in pages]
-    expected, found = (
-        [float(height.removesuffix(' m')) for height in view['heights']] for view in data
-    )
-    np.testing.assert_allclose(found, np.array(expected) + 250.0, rtol=0, atol=1e-9)
+    expected, found = (np.array(view['middle']) for view in data)
+    np.testing.assert_allclose(found, expected + UTM, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize('name', ['map.npz', 'map.parquet', 'map.ply', '.'])
