@@ -36,9 +36,9 @@ SHAPE = ('thickness', 'normal_sigma', 'radius')
 COVARIANCE = ('cov_xx', 'cov_xy', 'cov_xz', 'cov_yy', 'cov_yz', 'cov_zz')
 
 GOOD_THICKNESS_M, GOOD_SIGMA_RAD, GOOD_SCANS = 0.028, 0.13, 3
-"""Limits of a good surfel, chosen on two parts of a hall and in a city. A single scan often sees one
-of two surfaces only: of its surfels within the first two limits up to 19 % are off by more than
-10 deg."""
+"""Limits of a good surfel, chosen on two parts of a hall and in a city. A single scan often sees
+one of two surfaces only: of its surfels within the first two limits up to 19 % are off by more
+than 10 deg."""
 
 Columns = dict[str, npt.NDArray[Any]]
 
