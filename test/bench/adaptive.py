@@ -9,7 +9,8 @@ Normals are compared at some points of the scans with planes fitted robustly to 
 that are more than 10 deg from both of two planes fitted to the points in their own cell.
 ``edge_mm`` is the distance of points near a second plane from their surfel that 90 % are within.
 Each of these is of adaptive surfels, and with ``base_`` and ``coarse_`` of voxels of the base and
-of four times its size. Surfels have 5 points or more. ``cut_ms`` is the time of a whole cut.
+of four times its size. Surfels have 5 points or more. ``add_ms`` is the time to add a scan,
+``map_mb`` the size of the map, ``cut_ms`` the time of a whole cut.
 
 The rows of the job are the window job of ``real``, 20 scans of the simulated street, followed by
 an adaptive cut every so many scans: ``job_ms`` without it, ``x_time`` and ``x_memory`` with it.
@@ -68,7 +69,9 @@ def data_sets() -> Iterator[tuple[str, float, Scans]]:
     recordings = {'hall': 'bags/hall_os0_full', 'KITTI city': 'folders/kitti_city'}
     for name, path in recordings.items():
         if (root / path).exists():
-            yield name, 0.125, recorded(root / path)
+            scans = recorded(root / path)
+            for base_m in (0.5, 0.2, 0.125):
+                yield name, base_m, scans
     files = {
         'nuScenes': 'scans/nuscenes_hdl32_1532402927647951.pcd.bin',
         'RELLIS': 'scans/rellis3d_os1_64_offroad_000104.bin',
@@ -121,12 +124,16 @@ def quality_row(scans: Scans, base_m: float, number: int) -> Row:
     tree, rng = cKDTree(points), np.random.default_rng(1)
     at = points[rng.choice(len(points), number)]
     fits = [fit_at(points[near_points(tree, p, REACH * base_m, rng)], p, rng) for p in at]
-    base, coarse = map_of(scans, base_m), map_of(scans, 4.0 * base_m)
-    base.adaptive(MIN_POINTS)
+    map_of(scans[:1], base_m).adaptive(MIN_POINTS)
+    start = process_time()
+    base = map_of(scans, base_m)
+    add_ms = (process_time() - start) * 1e3 / len(scans)
+    coarse = map_of(scans, 4.0 * base_m)
     start = process_time()
     adaptive = base.adaptive(MIN_POINTS)
     cut_ms = (process_time() - start) * 1e3
-    row = {'surfels': len(adaptive), 'base_surfels': base.num_surfels(MIN_POINTS)}
+    row = {'add_ms': add_ms, 'map_mb': base.nbytes / 1e6}
+    row |= {'surfels': len(adaptive), 'base_surfels': base.num_surfels(MIN_POINTS)}
     row['x_surfels'] = row['surfels'] / row['base_surfels']
     voxels = {'base_': base.surfels(MIN_POINTS), 'coarse_': coarse.surfels(MIN_POINTS)}
     for prefix, surfels in {'': adaptive, **voxels}.items():
