@@ -106,7 +106,7 @@ def test_dangerous_calls_are_found(source):
 IMPORTERS = {
     '__init__.py': 'public names of this package',
     'cli/main.py': 'verbs of this package',
-    'files/foreign_points.py': 'fixed names of libraries',
+    'libraries.py': 'fixed names of libraries',
     'filters/__init__.py': 'public names of this package',
     'filters/registry.py': 'modules in a folder of this package',
     'layers/registry.py': 'places that code registered',

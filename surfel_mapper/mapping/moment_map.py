@@ -91,12 +91,14 @@ class VoxelTable:
     ----------
     rows : Slab
         The rows, 12 int64 each.
+    stamps : Slab
+        Stamps and numbers of scans of the rows, 2 uint32 each.
 
     """
 
     def __init__(self, num_channels: int = 0) -> None:
         self.rows = Slab(1024, layout.ROW)
-        self._stamps = Slab(1024, layout.STAMP_ROW, np.uint32)
+        self.stamps = Slab(1024, layout.STAMP_ROW, np.uint32)
         self._version = 0
         self._channels = Slab(1024, num_channels) if num_channels else None
         self._hash = HashTable(MAX_DEPTH)
@@ -105,7 +107,7 @@ class VoxelTable:
     @property
     def nbytes(self) -> int:
         """Bytes in use for voxels and their hash table."""
-        slabs = (self.rows, self._stamps, self._channels)
+        slabs = (self.rows, self.stamps, self._channels)
         row_bytes = sum(slab.row_bytes for slab in slabs if slab)
         return self._hash.rows_used * row_bytes + self._hash.nbytes
 
@@ -124,7 +126,7 @@ class VoxelTable:
         num_added, self._version = 0, version
         try:
             while True:
-                slab, stamps, table = self.rows.array, self._stamps.array, self._hash.arrays
+                slab, stamps, table = self.rows.array, self.stamps.array, self._hash.arrays
                 num_added = add_moments(
                     *(arrays, slab, stamps.reshape(-1), table),
                     *(self.state, stamp_of(version), num_added, rows),
@@ -224,13 +226,8 @@ class VoxelTable:
 
         A number would be beyond if scans were removed in other pieces than they were added in.
         """
-        num_scans = self._stamps.array[chosen.astype(np.intp), layout.SCANS].view(np.int32)
+        num_scans = self.stamps.array[chosen.astype(np.intp), layout.SCANS].view(np.int32)
         return np.asarray(np.clip(num_scans, 1, count), np.int64)
-
-    @property
-    def slabs(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint32]]:
-        """Rows (R, 12) and their stamps (R, 2), of which surfels are derived."""
-        return self.rows.array, self._stamps.array
 
     @property
     def rows_used(self) -> int:
@@ -250,7 +247,7 @@ class VoxelTable:
 
         With min_points of 0 emptied rows are included.
         """
-        stamps, used = self._stamps.array.reshape(-1), self._hash.rows_used
+        stamps, used = self.stamps.array.reshape(-1), self._hash.rows_used
         stamp, changes = stamp_of(self._version), self._version - version
         rows = rows_changed_after(self.rows.array, stamps, used, stamp, changes, min_points)
         return np.asarray(rows)
@@ -261,7 +258,7 @@ class VoxelTable:
 
         Rows of fewer than min_points points are left out.
         """
-        stamps, selected = self._stamps.array.reshape(-1), [np.empty(0, np.int32)]
+        stamps, selected = self.stamps.array.reshape(-1), [np.empty(0, np.int32)]
         for version, rows in changes:
             stamp = stamp_of(version)
             selected.append(rows_changed_at(self.rows.array, stamps, rows, stamp, min_points))
@@ -290,7 +287,7 @@ class VoxelTable:
     ) -> tuple[int, npt.NDArray[np.int32]]:
         """Subtract moments without channels; see remove_moments."""
         fallen: npt.NDArray[np.int32] = np.empty((len(rows), 3), np.int32)
-        stamps, table = self._stamps.array.reshape(-1), self._hash.arrays
+        stamps, table = self.stamps.array.reshape(-1), self._hash.arrays
         missing, num_fallen = remove_moments(
             *(moments, self.rows.array, stamps, table),
             *(self.state, stamp_of(self._version), rows, min_points, fallen),
@@ -303,7 +300,7 @@ class VoxelTable:
         if not self._hash.lacks_row(num_rows):
             self._hash.grow()
             return
-        self._stamps.grow(2 * num_rows)
+        self.stamps.grow(2 * num_rows)
         if self._channels:
             self._channels.grow(2 * num_rows)
         self.rows.grow(2 * num_rows)  # last: the rows tell how many there are
@@ -371,7 +368,8 @@ def kernel_arrays(moments: ScanMoments) -> tuple[Arrays, Arrays]:
     Sums of a map, int64, are zero in the first result. They follow as total (K, 3) and view
     (K, 3), which ``add_sums`` adds; of a scan there are none.
     """
-    key, count, total, product, view = moments.arrays
+    key, product, total, view = moments.key, moments.product, moments.total, moments.view
+    count = moments.count
     count = count.view(np.uint32) if count.dtype == np.int32 else count.astype(np.uint32)
     scans: npt.NDArray[np.uint32] = np.ones(len(key), np.uint32)
     if moments.num_scans is not None:
@@ -478,8 +476,8 @@ class MomentMap:
     @property
     def slabs(self) -> Arrays:
         """Rows (R, 12), stamps (R, 2) and channel sums (R, C); valid until the map changes."""
-        rows, stamps = self._table.slabs
-        return rows, stamps, self._table.channel_sums
+        table = self._table
+        return table.rows.array, table.stamps.array, table.channel_sums
 
     def insert(self, moments: ScanMoments) -> None:
         """
@@ -494,7 +492,7 @@ class MomentMap:
         """
         self._check_lattice(moments)
         limit = layout.MAX_MAP_COUNT >> (2 * self.level)
-        if self.num_points + moments.num_points > limit:
+        if self._table.state[hashing.POINTS] + moments.num_points > limit:
             self._check_counts(moments, limit)  # before the sums, which overflow beyond it
         if moments.num_reduced is None:
             check_possible(moments)

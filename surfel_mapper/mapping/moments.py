@@ -143,8 +143,8 @@ class ScanMoments:
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays, without the hints."""
-        key, count, total, product, view = self.arrays
-        num_bytes = key.nbytes + count.nbytes + total.nbytes + product.nbytes + view.nbytes
+        num_bytes = self.key.nbytes + self.count.nbytes + self.total.nbytes
+        num_bytes += self.product.nbytes + self.view.nbytes
         num_scans = 0 if self.num_scans is None else self.num_scans.nbytes
         return num_bytes + self.channels.nbytes + num_scans
 

@@ -180,19 +180,22 @@ class Reducer:
             for cause, row in CAUSES.items():
                 if scratch.left_out[row]:
                     left_out[cause] = int(scratch.left_out[row])
-            moments = ScanMoments(
-                voxel_size_m=self.voxel_size_m,
-                key=np.empty(num, np.int64),
-                count=np.empty(num, np.int32),
-                total=np.empty((num, 3), np.int32),
-                product=np.empty((num, 6), np.int64),
-                view=np.empty((num, 3), np.int16),
-                left_out=left_out,
-            )
+            key, count = np.empty(num, np.int64), np.empty(num, np.int32)
+            total, product = np.empty((num, 3), np.int32), np.empty((num, 6), np.int64)
+            view = np.empty((num, 3), np.int16)
+            outputs = key, count, total, product, view
             keys, sums = scratch.keys[2 : num + 2], scratch.sums[1 : num + 1]
-            largest = pack_moments(keys, sums, origin, self.voxel_size_m, moments.arrays)
+            largest = pack_moments(keys, sums, origin, self.voxel_size_m, outputs)
             if largest <= FULL:
-                return moments
+                return ScanMoments(
+                    voxel_size_m=self.voxel_size_m,
+                    key=key,
+                    count=count,
+                    total=total,
+                    product=product,
+                    view=view,
+                    left_out=left_out,
+                )
             size = max(FULL, num_points * FULL // (2 * largest))  # half full on average
         starts = range(0, num_points, size)
         chunks = (np.ascontiguousarray(xyz[:, i : i + size]) for i in starts)

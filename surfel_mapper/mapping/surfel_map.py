@@ -461,7 +461,8 @@ class SurfelMap(MomentMap):
 
     def _derive(self, chosen: npt.NDArray[np.int32], covariance: bool = False) -> Surfels:
         bits = layout.BITS + self.level
-        surfels = derive(self._table.slabs, chosen, self.voxel_size_m, bits, covariance)
+        slabs = self._table.rows.array, self._table.stamps.array
+        surfels = derive(slabs, chosen, self.voxel_size_m, bits, covariance)
         if not self._channel_names:
             return surfels
         sums = self._table.channels(chosen)

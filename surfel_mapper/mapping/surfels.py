@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 import logging
 from pathlib import Path
-from typing import Any, NamedTuple, overload, TYPE_CHECKING
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -29,9 +29,6 @@ FLOAT_REACH_M = 8192.0
 
 QUALITY = ('thickness', 'normal_sigma', 'radius', 'num_scans', 'size')
 """Names of the columns that tell how good a surfel is."""
-
-SHAPE = ('thickness', 'normal_sigma', 'radius')
-"""Columns that follow from the eigenvalues and the number of points."""
 
 COVARIANCE = ('cov_xx', 'cov_xy', 'cov_xz', 'cov_yy', 'cov_yz', 'cov_zz')
 
@@ -130,28 +127,11 @@ class Surfels:
     voxel_index: npt.NDArray[np.int32]
     num_scans: npt.NDArray[np.int64]
     size: npt.NDArray[np.float64]
-    thickness: npt.NDArray[np.float64] = None  # type: ignore[assignment]  # as __getattr__ derives
-    normal_sigma: npt.NDArray[np.float64] = None  # type: ignore[assignment]
-    radius: npt.NDArray[np.float64] = None  # type: ignore[assignment]
+    thickness: npt.NDArray[np.float64]
+    normal_sigma: npt.NDArray[np.float64]
+    radius: npt.NDArray[np.float64]
     covariance: npt.NDArray[np.float64] | None = None
     channels: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Leave missing columns unset, which __getattr__ derives."""
-        if self.thickness is None:
-            for name in SHAPE:
-                object.__delattr__(self, name)
-
-    if not TYPE_CHECKING:  # which would take any name
-
-        def __getattr__(self, name: str) -> Any:
-            """Derive thickness, normal_sigma and radius when the first of them is read."""
-            if name not in SHAPE:
-                raise AttributeError(f'Surfels have no {name}')
-            columns = quality(self.eigenvalues, self.num_points)
-            for column, values in zip(SHAPE, columns, strict=True):
-                object.__setattr__(self, column, values)
-            return getattr(self, name)
 
     @classmethod
     def from_message(cls, msg: Any) -> Surfels:
@@ -429,23 +409,24 @@ def derive(
         np.empty(num, np.int64),
     )
     covariances = np.empty((num if covariance else 0, 6))
+    size = np.broadcast_to(voxel_size_m, num)  # of eight bytes
+    shape = np.empty(num), np.empty(num), np.empty(num)
     if num:  # readers of files import this module, and need no compiler
-        from surfel_mapper.mapping.kernels.surfels import derive_surfels
+        from surfel_mapper.mapping.kernels.surfels import derive_quality, derive_surfels
 
         derive_surfels(*slabs, chosen, voxel_size_m, bits, (*arrays, covariances))
-    size = np.broadcast_to(voxel_size_m, num)  # of eight bytes
-    return Surfels(*arrays, size=size, covariance=covariances if covariance else None)
+        derive_quality(arrays[4], arrays[5], shape)
+    return Surfels(*arrays, size, *shape, covariance=covariances if covariance else None)
 
 
 def quality(
     eigenvalues: npt.NDArray[np.float64], num_points: npt.NDArray[np.int64]
-) -> npt.NDArray[np.float64]:
-    """Return thickness, normal_sigma and radius, (3, K), of eigenvalues (K, 3) and counts (K,)."""
-    columns = np.empty((3, len(num_points)))
-    if len(num_points):
-        from surfel_mapper.mapping.kernels.surfels import derive_quality
+) -> dict[str, Any]:
+    """Return thickness, normal_sigma and radius of eigenvalues (K, 3) and counts (K,)."""
+    from surfel_mapper.mapping.kernels.surfels import derive_quality
 
-        derive_quality(eigenvalues, num_points, tuple(columns))
+    columns: dict[str, Any] = {name: np.empty(len(num_points)) for name in QUALITY[:3]}
+    derive_quality(eigenvalues, num_points, tuple(columns.values()))
     return columns
 
 
@@ -472,16 +453,18 @@ def surfel_columns(surfels: Surfels) -> Columns:
     if 'red' in surfels.channels:
         channels = (surfels.channels[name] for name in ('red', 'green', 'blue'))
         columns['rgb'] = packed_rgb(*channels)
-    return columns | covariance_columns(surfels)
+    if surfels.covariance is not None:
+        columns |= covariance_columns(surfels)
+    return columns
 
 
 def quality_columns(surfels: Surfels) -> Columns:
     """Return the columns of QUALITY for messages and files: float32, and uint32 for num_scans."""
-    values = {name: getattr(surfels, name) for name in QUALITY}
-    return {
-        name: column.astype(np.uint32 if name == 'num_scans' else np.float32)
-        for name, column in values.items()
-    }
+    columns: Columns = {}
+    for name in QUALITY:
+        dtype = np.uint32 if name == 'num_scans' else np.float32
+        columns[name] = getattr(surfels, name).astype(dtype)
+    return columns
 
 
 def covariance_columns(surfels: Surfels) -> Columns:

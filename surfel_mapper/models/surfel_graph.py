@@ -25,7 +25,7 @@ from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.kernels.layout import INDEX_BITS
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.surfels import quality, Surfels
 from surfel_mapper.models.kernels.surfel_classes import (
     classify,
     classify_sparse,
@@ -221,6 +221,7 @@ class SurfelGraph:
             voxel_index=unpack_keys(self.key[rows]),
             num_scans=self.num_scans[rows],
             size=np.full(len(rows), self.map.voxel_size_m),
+            **quality(eigenvalues, num_points),
         )
 
     def _forgotten(self) -> RemovedVoxels:

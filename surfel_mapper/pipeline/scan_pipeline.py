@@ -170,7 +170,7 @@ class ScanPipeline:
 
     def add_scan(self, scan: Scan) -> None:
         """Take a scan that can be mapped; ``run`` judges its stamp."""
-        self.queue.ended = False
+        self.queue.ended, clocks = False, self.config.input
         if not scan.frame_id:
             self.drops.scan(scan, 'empty_frame_id', 'its header has no frame_id')
         elif len(scan) == 0:
@@ -178,7 +178,7 @@ class ScanPipeline:
         elif self.map.columns and (missing := self._missing_columns(scan)):
             reason = f'its points have no {" and no ".join(missing)}'
             self.drops.scan(scan, 'missing_column', reason)
-        elif self.config.deskew.enabled or self.config.input.offset_s(scan.topic):
+        elif self.config.deskew.enabled or clocks.time_offset_s or clocks.time_offsets_s:
             self._add_timed(scan)
         else:
             self.arrived.append(scan)

@@ -238,6 +238,13 @@ class World:
         """Return the index of the primitive that each surface belongs to; -1 for -1."""
         return np.where(surface < 0, -1, surface // surfaces.FACES)
 
+    def is_plane(self, surface: IntArray) -> npt.NDArray[np.bool_]:
+        """Return whether each surface is flat: rectangles, faces of boxes, caps; False for -1."""
+        kind = np.append(self._kind, -1)[self.primitive_of(surface)]
+        cap = (kind == surfaces.CYLINDER) & (surface % surfaces.FACES > 0)
+        plane: npt.NDArray[np.bool_] = np.isin(kind, (surfaces.RECTANGLE, surfaces.BOX)) | cap
+        return plane
+
     def reflectivity(self, surface: IntArray) -> FloatArray:
         """Return the reflectivity of each surface in [0, 1], nan for -1."""
         return np.append(self._reflectivity, np.nan)[self.primitive_of(surface)]

@@ -145,8 +145,7 @@ def derive_quality(eigenvalues, num_points, outputs):
     """
     Derive the quality of surfels from their eigenvalues.
 
-    Not a part of derive_surfels: three more columns of each changed voxel take a fifth of its
-    time, and most callers do not read them.
+    Apart from derive_surfels, since models have eigenvalues without rows of a slab.
 
     eigenvalues  (K, 3) float64, m^2
     num_points   (K,) int64
