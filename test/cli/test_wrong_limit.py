@@ -7,32 +7,16 @@ from __future__ import annotations
 import subprocess
 import sys
 
-import pytest
-
 from surfel_mapper.budget import VARIABLE
-from surfel_mapper.errors import ConfigError
-from surfel_mapper.files.parquet import read_map
-from test import extras
 from test.fuzz import corpus
 
 MESSAGE = f"{VARIABLE}: '4G', expected a positive number of bytes, such as 4294967296"
 
 
-@pytest.fixture
-def wrong(monkeypatch):
+def test_a_verb_that_reads_files_ends_with_the_message(tmp_path, monkeypatch):
     monkeypatch.setenv(VARIABLE, '4G')
-
-
-def test_a_verb_that_reads_files_ends_with_the_message(tmp_path, wrong):
     (tmp_path / 'a.mcap').write_bytes(corpus.mcap()[0])
     command = [sys.executable, '-m', 'surfel_mapper.cli.main', 'info', str(tmp_path / 'a.mcap')]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (1, '')
     assert done.stderr == f'surfel-mapper info: {MESSAGE}\n'
-
-
-def test_a_tile_is_not_taken_for_damaged(tmp_path, wrong):
-    extras.load('pyarrow')
-    (tmp_path / 'a.parquet').write_bytes(corpus.parquet()[0])
-    with pytest.raises(ConfigError, match='4G'):
-        read_map(tmp_path / 'a.parquet')
