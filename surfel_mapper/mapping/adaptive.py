@@ -30,14 +30,16 @@ import numpy.typing as npt
 from surfel_mapper.arguments import as_real, as_whole
 from surfel_mapper.errors import MapError
 from surfel_mapper.kernels import layout
-from surfel_mapper.kernels.layout import KEY
+from surfel_mapper.kernels.layout import KEY, STAMP
 from surfel_mapper.mapping.channels import channel_names, means
+from surfel_mapper.mapping.coarsening import coarse_keys
 from surfel_mapper.mapping.kernels import adaptive as kernels
-from surfel_mapper.mapping.kernels.adaptive import LINKED
+from surfel_mapper.mapping.kernels.adaptive import DIRTY, EMPTY, LINK, LINK_BITS, LINKED, SHOWN
 from surfel_mapper.mapping.kernels.rows import read_rows
-from surfel_mapper.mapping.moment_map import MAX_LEVEL, MomentMap
-from surfel_mapper.mapping.moments import unpack_keys
-from surfel_mapper.mapping.storage import HashTable, Slab
+from surfel_mapper.mapping.kernels.surfels import derive_surfels
+from surfel_mapper.mapping.moment_map import MAX_LEVEL, MomentMap, VoxelTable
+from surfel_mapper.mapping.moments import pack_keys, ScanMoments, unpack_keys
+from surfel_mapper.mapping.storage import Slab
 from surfel_mapper.mapping.surfels import concatenated, derive, Surfels
 
 MAX_LEVELS = 6
@@ -46,13 +48,19 @@ MAX_LEVELS = 6
 LEVELS, MAX_THICKNESS_M = 4, 0.04
 """Default settings, of the configuration too."""
 
-MAX_DEPTH = 24
-"""The directory of the hash table of cells has at most 2^24 entries, as that of a map."""
+BLOCK = 1024
+"""Number of cells judged at once: their shapes stay in the cache."""
+
+EACH_AXIS = 1 | 1 << layout.INDEX_BITS | 1 << 2 * layout.INDEX_BITS
+"""A key of index 1 on each axis, without the offset."""
 
 Nodes = tuple[npt.NDArray[Any], ...]
-"""Rows, stamps, links and channels, as the kernels take them."""
+"""Rows, stamps and links, as the kernels take them."""
 
-Rows = npt.NDArray[np.int32]
+Space = tuple[Any, ...]
+"""Arrays that the judgement of a block of cells overwrites; see ``workspace``."""
+
+Rows = npt.NDArray[np.intp]
 Keys = tuple[npt.NDArray[Any], npt.NDArray[Any]]
 """Keys of voxels and of cells."""
 
@@ -80,7 +88,7 @@ class CutChange:
     removed_size: npt.NDArray[np.float64]
 
 
-class CellTable:
+class CellTable(VoxelTable):
     """
     The cells above the voxels of a map; kernels/adaptive.py describes the arrays.
 
@@ -92,77 +100,62 @@ class CellTable:
     """
 
     def __init__(self, num_channels: int) -> None:
-        self._hash = HashTable(MAX_DEPTH)
-        columns: list[tuple[int, Any]] = [(layout.ROW, np.int64), (layout.STAMP_ROW, np.uint32)]
-        columns += [(2, np.int64), (8, np.int32), (num_channels, np.int64)]
-        self._slabs = [Slab(1024, width, dtype) for width, dtype in columns if width]
+        super().__init__(num_channels)
+        self._links = Slab(1024, 2)
+        self._children = Slab(1024, 8, np.int32)
 
     @property
     def nbytes(self) -> int:
         """Bytes in use."""
-        row_bytes = sum(slab.row_bytes for slab in self._slabs)
-        return self._hash.rows_used * row_bytes + self._hash.nbytes
-
-    @property
-    def rows_used(self) -> int:
-        """Number of rows ever used."""
-        return self._hash.rows_used
+        row_bytes = self._links.row_bytes + self._children.row_bytes
+        return super().nbytes + self.rows_used * row_bytes
 
     @property
     def nodes(self) -> Nodes:
         """The cells as nodes."""
-        arrays: list[npt.NDArray[Any]] = [slab.array for slab in self._slabs]
-        sums = arrays[4] if len(arrays) > 4 else np.empty((len(arrays[0]), 0), np.int64)
-        return *arrays[:3], sums
+        return self.rows.array, self.stamps.array, self._links.array
 
     @property
     def children(self) -> npt.NDArray[np.int32]:
         """Rows + 1 of the children of each cell, (R, 8)."""
-        return self._slabs[3].array
+        return self._children.array
 
-    def attach(
-        self, chosen: Rows, level: int, voxels: Nodes | None, dirty: Rows, num_dirty: int
-    ) -> Rows:
-        """
-        Link changed nodes to their parents; return these, which become dirty.
+    def find_or_add(self, key: npt.NDArray[np.int64]) -> Rows:
+        """Return the rows of cells (K,), which are added if they are missing."""
+        keys, numbers = coarse_keys(key, 0)
+        rows = self.add(no_points(keys, self.channel_sums.shape[1]), 0).astype(np.intp)
+        for slab in (self._links, self._children):
+            if len(slab.array) < len(self.rows.array):
+                slab.grow(len(self.rows.array))
+        return rows[numbers.astype(np.intp)]
 
-        Parameters
-        ----------
-        chosen : (K,) int32
-            Rows of voxels, or of cells of a level if there are no voxels.
-        level : int
-            0 for voxels.
-        voxels : tuple of array, optional
-            The voxels as nodes.
-        dirty : (D,) int32
-            Dirty cells, overwritten; room for K more than there are.
-        num_dirty : int
-            Number of dirty cells.
+    def mark(self, links: npt.NDArray[np.int64]) -> Rows:
+        """Mark the parents of nodes as dirty; return those that were clean, each once."""
+        is_parent = np.zeros(self.rows_used + 1, np.bool_)
+        is_parent[links >> LINK_BITS] = True
+        parents = np.flatnonzero(is_parent[1:])
+        cells: Rows = parents[self._links.array[parents, LINK] & DIRTY == 0]
+        self._links.array[cells, LINK] |= DIRTY
+        return cells
 
-        """
-        done = 0
-        while done < len(chosen):
-            done, num_dirty = kernels.attach(
-                *(chosen, done, level, voxels or self.nodes, self.nodes, self.children),
-                *(self._hash.arrays, self._hash.state, dirty, num_dirty),
-            )
-            if done < len(chosen):
-                self._make_room()
-        return dirty[:num_dirty]
+    def detach(self, links: npt.NDArray[np.int64], key: npt.NDArray[np.int64], level: int) -> None:
+        """Remove nodes of a level from the children of their parents."""
+        parents = links >> LINK_BITS
+        linked = parents > 0
+        self.children[parents[linked] - 1, octants(key[linked], level)] = 0
 
     def clean(self, dirty: Rows, level: int) -> None:
         """Mark dirty cells of a level as clean, and free the empty ones."""
-        table, state = self._hash.arrays, self._hash.state
-        kernels.clean(dirty, level, self.nodes, self.children, table, state)
-
-    def _make_room(self) -> None:
-        """Enlarge the array that had no room for a new cell."""
-        num_rows = len(self._slabs[0].array)
-        if not self._hash.lacks_row(num_rows):
-            self._hash.grow()
-            return
-        for slab in reversed(self._slabs):  # the rows last: they tell how many there are
-            slab.grow(2 * num_rows)
+        links = self._links.array
+        kernels.clean(dirty, links)
+        empty = dirty[self.stamps.array[dirty, STAMP] == EMPTY]
+        if len(empty):
+            key = self.keys(empty)
+            self.detach(links[empty, LINK], key, level)
+            links[empty] = 0
+            moments = no_points(key, self.channel_sums.shape[1])
+            object.__setattr__(moments, 'rows', empty)  # hints save compiling the look-up
+            self.remove(moments, 0)
 
 
 class AdaptiveCut:
@@ -231,8 +224,8 @@ class AdaptiveCut:
     @property
     def _voxels(self) -> Nodes:
         """The voxels of the map as nodes."""
-        rows, stamps, channels = self._map.slabs
-        return rows, stamps, self._links.array, channels
+        rows, stamps, _ = self._map.slabs
+        return rows, stamps, self._links.array
 
     def refresh(self, *, covariance: bool = False) -> CutChange:
         """
@@ -277,7 +270,7 @@ class AdaptiveCut:
         self._reset()
 
     def _refresh(self, covariance: bool) -> CutChange:
-        changed = self._map.rows_changed(self._version)
+        changed = self._map.rows_changed(self._version).astype(np.intp)
         self._version, self._num_rows = self._map.version, self._map.rows_used
         if len(self._links.array) < self._num_rows:
             self._links.grow(2 * self._num_rows)
@@ -287,7 +280,7 @@ class AdaptiveCut:
         shown = self._keys(voxels, cells)
         for level, dirty_cells in enumerate(dirty, 1):
             self._cells.clean(dirty_cells, level)
-        kernels.clean_voxels(changed, self._links.array)
+        kernels.clean(changed, self._links.array)
         gone = joined(self._lost, (np.concatenate([detached, left_voxels]), left_cells))
         self._removed = np.setdiff1d(gone[0], shown[0]), np.setdiff1d(gone[1], shown[1])
         index, levels = indices(*self._removed)
@@ -336,46 +329,92 @@ class AdaptiveCut:
 
     def _judge(self, changed: Rows) -> tuple[list[Rows], npt.NDArray[np.int64]]:
         """Link and judge the cells above changed voxels: dirty ones by level, detached keys."""
-        detached = np.empty(len(changed), np.int64)
-        parents = np.empty(2 * len(changed), np.int32)
-        new = np.empty(len(changed), np.int32)
-        num_dirty, num_detached, num_new = kernels.detach(
-            *(changed, self._voxels, self._cells.nodes, self._cells.children),
-            *(parents, detached, new),
-        )
-        dirty = [self._cells.attach(new[:num_new], 0, self._voxels, parents, num_dirty)]
+        new, emptied, detached = self._detach(changed)
+        dirty = [np.concatenate([emptied, self._attach(new, 0)])]
+        space = workspace()
         for level in range(1, self._levels + 1):
-            nodes = self._voxels if level == 1 else self._cells.nodes
-            kernels.judge(
-                *(dirty[-1], level, self._bits, self._thickness),
-                *(nodes, self._cells.nodes, self._cells.children),
-            )
-            del nodes  # views would pin the memory
+            for start in range(0, len(dirty[-1]), BLOCK):
+                self._judge_cells(dirty[-1][start : start + BLOCK], level, space)
             if level < self._levels:
-                parents = np.empty(len(dirty[-1]), np.int32)
-                dirty.append(self._cells.attach(dirty[-1], level, None, parents, 0))
-        return dirty, detached[:num_detached]
+                dirty.append(self._attach(dirty[-1], level))
+        return dirty, detached
+
+    def _detach(self, changed: Rows) -> tuple[Rows, Rows, npt.NDArray[np.int64]]:
+        """
+        Unlink the changed rows that hold their voxel no longer.
+
+        Returns rows without a link, dirty cells, and the keys of unlinked voxels of the cut.
+        """
+        links = self._links.array
+        key, link = links[changed].T
+        is_linked = link != 0
+        rows, key, link = changed[is_linked], key[is_linked], link[is_linked]
+        stays = key == self._map.slabs[0][rows, KEY]
+        links[rows, LINK] = np.where(stays, link | DIRTY, 0)
+        dirty, gone = self._cells.mark(link), ~stays
+        new = np.concatenate([changed[~is_linked], rows[gone]])
+        link, key = link[gone], key[gone]
+        self._cells.detach(link, key, 0)
+        return new, dirty, key[link & SHOWN > 0]
+
+    def _attach(self, chosen: Rows, level: int) -> Rows:
+        """Link changed nodes of a level to their parents; return the ones that become dirty."""
+        rows, _, links = self._nodes(level)
+        new = chosen[links[chosen, LINK] >> LINK_BITS == 0]
+        key = rows[new, KEY]
+        del rows, links  # views would pin the memory
+        if key.min(initial=0) < 0:  # emptied voxels
+            new, key = new[key >= 0], key[key >= 0]
+        parents = self._cells.find_or_add(parent_keys(key, level))
+        self._cells.children.reshape(-1)[parents * 8 + octants(key, level)] = new + 1
+        links = self._nodes(level)[2]
+        links[new] = np.column_stack([key, ((parents + 1) << LINK_BITS) | DIRTY])
+        return self._cells.mark(links[chosen, LINK])
+
+    def _judge_cells(self, dirty: Rows, level: int, space: Space) -> None:
+        """Sum and judge cells of a level."""
+        nodes, cells, bits = self._nodes(level - 1), self._cells.nodes, self._bits + level
+        summed, full, means, ends, of_cells, of_children = space
+        num = kernels.sum_children(
+            *(dirty, level, self._bits, nodes, cells, self._cells.children),
+            *(summed, full, means, ends),
+        )
+        size, summed, full = 2.0**bits, summed[:num], full[: ends[num, 1]]
+        derive_surfels(cells[0], cells[1], summed, size, bits, of_cells)
+        derive_surfels(nodes[0], nodes[1], full, size / 2.0, bits - 1, of_children)
+        shapes = (of_cells[1], of_cells[4]), (of_children[1], of_children[4])
+        kernels.judge(summed, means, ends, *shapes, self._thickness, size, cells[1])
+        if self._map.columns:
+            chosen = summed.astype(np.intp)
+            below = self._cells.children[chosen].astype(np.intp)
+            sums = self._channel_sums(level - 1)[below - 1] * (below > 0)[:, :, None]
+            self._cells.channel_sums[chosen] = sums.sum(axis=1)
 
     def _compare(self, roots: Rows) -> list[npt.NDArray[Any]]:
         """Return rows of changed voxels and cells, keys of those that left the cut."""
         num_voxels, num_cells = self._num_rows, self._cells.rows_used
         outputs: list[npt.NDArray[Any]]
-        outputs = [np.empty(num, np.int32) for num in (num_voxels, num_cells)]
+        outputs = [np.empty(num, np.intp) for num in (num_voxels, num_cells)]
         outputs += [np.empty(num, np.int64) for num in (num_voxels, num_cells)]
         numbers = np.zeros(4, np.int64)
         nodes = self._voxels, self._cells.nodes, self._cells.children
         kernels.compare(roots, self._levels, self._min_points, *nodes, (*outputs, numbers))
         return [array[:num] for array, num in zip(outputs, numbers, strict=True)]
 
+    def _nodes(self, level: int) -> Nodes:
+        """Return the nodes of a level, 0 for voxels."""
+        return self._cells.nodes if level else self._voxels
+
     def _shown(self) -> tuple[Rows, Rows]:
         """Return the rows of the voxels and cells in the cut."""
-        voxels = kernels.shown_rows(self._links.array, self._num_rows)
-        return voxels, kernels.shown_rows(self._cells.nodes[2], self._cells.rows_used)
+        voxels = self._links.array[: self._num_rows, LINK]
+        cells = self._cells.nodes[2][: self._cells.rows_used, LINK]
+        return np.flatnonzero(voxels & SHOWN), np.flatnonzero(cells & SHOWN)
 
     def _keys(self, voxels: Rows, cells: Rows) -> Keys:
         """Return the keys of rows of voxels and of cells."""
         linked, rows = self._links.array, self._cells.nodes[0]  # the map may have been cleared
-        return linked[voxels.astype(np.intp), LINKED], rows[cells.astype(np.intp), KEY]
+        return linked[voxels, LINKED], rows[cells, KEY]
 
     def _moments(self, voxels: Rows, cells: Rows) -> list[npt.NDArray[np.int64]]:
         """Return count, total, product and view of rows of voxels and cells."""
@@ -389,7 +428,7 @@ class AdaptiveCut:
 
     def _surfels(self, voxels: Rows, cells: Rows, covariance: bool) -> Surfels:
         """Return the surfels of rows of voxels and cells."""
-        levels = levels_of(self._cells.nodes[0][cells.astype(np.intp), KEY])
+        levels = levels_of(self._cells.keys(cells))
         tables = [self._surfels_at(0, voxels, covariance)]
         for level in range(1, self._levels + 1):
             tables.append(self._surfels_at(level, cells[levels == level], covariance))
@@ -397,16 +436,64 @@ class AdaptiveCut:
 
     def _surfels_at(self, level: int, chosen: Rows, covariance: bool) -> Surfels:
         """Return the surfels of rows of a level."""
-        rows, stamps, _, channels = self._cells.nodes if level else self._voxels
-        chosen = chosen.astype(np.intp)
-        slab = np.empty((len(chosen), layout.ROW), np.int64)
-        kernels.copy_rows(rows, chosen, level, slab)
-        numbers = np.arange(len(chosen), dtype=np.int32)
+        rows, stamps, _ = self._nodes(level)
+        numbers, channels = chosen.astype(np.int32), self._channel_sums(level)[chosen]
+        if level:  # keyed by index >> level
+            rows, stamps, numbers = (
+                rows[chosen],
+                stamps[chosen],
+                np.arange(len(chosen), dtype=np.int32),
+            )
+            rows[:, KEY] = pack_keys(unpack_keys(rows[:, KEY]) >> level)
         size_m = self._map.voxel_size_m * 2.0**level
-        slabs, bits = (slab, stamps[chosen]), self._bits + level
-        surfels = derive(slabs, numbers, size_m, bits, covariance)
+        surfels = derive((rows, stamps), numbers, size_m, self._bits + level, covariance)
         names = channel_names(self._map.columns)
-        return replace(surfels, channels=means(channels[chosen], surfels.num_points, names))
+        return replace(surfels, channels=means(channels, surfels.num_points, names))
+
+    def _channel_sums(self, level: int) -> npt.NDArray[np.int64]:
+        """Return the channel sums of the nodes of a level, (R, C)."""
+        return self._cells.channel_sums if level else self._map.slabs[2]
+
+
+def workspace() -> Space:
+    """Return arrays for the sums and shapes of a block of cells and their children."""
+    shapes = [
+        (
+            *(np.empty((num, 3)), np.empty((num, 3)), np.empty(num), np.empty(num)),
+            *(np.empty((num, 3)), np.empty(num, np.int64), np.empty((num, 3), np.int32)),
+            *(np.empty(num, np.int64), np.empty((0, 6))),
+        )
+        for num in (BLOCK, 8 * BLOCK)
+    ]
+    rows = np.empty(BLOCK, np.int32), np.empty(8 * BLOCK, np.int32)
+    ends = np.zeros((BLOCK + 1, 2), np.int64)
+    return *rows, np.empty((8 * BLOCK, 5)), ends, *shapes
+
+
+def no_points(key: npt.NDArray[np.int64], num_channels: int) -> ScanMoments:
+    """Return moments of no points, by which a table adds and removes cells."""
+    num = len(key)
+    return ScanMoments(
+        voxel_size_m=1.0,
+        key=key,
+        count=np.zeros(num, np.int32),
+        total=np.zeros((num, 3), np.int32),
+        product=np.zeros((num, 6), np.int64),
+        view=np.zeros((num, 3), np.int16),
+        channels=np.zeros((num, num_channels), np.int64),
+        num_scans=np.zeros(num, np.int64),
+    )
+
+
+def parent_keys(key: npt.NDArray[np.int64], level: int) -> npt.NDArray[np.int64]:
+    """Return the keys of the cells of the next level around nodes of a level."""
+    return np.asarray(key & ~(((2 << level) - 1) * EACH_AXIS) | (EACH_AXIS << level))
+
+
+def octants(key: npt.NDArray[np.int64], level: int) -> npt.NDArray[np.int64]:
+    """Return the octants of nodes of a level in their parents: 4 x + 2 y + z, each 0 or 1."""
+    x, y, z = (key >> (level + axis * (layout.INDEX_BITS - 1)) & 1 << axis for axis in (2, 1, 0))
+    return np.asarray(x | y | z)
 
 
 def joined(first: Keys, second: Keys) -> Keys:
