@@ -259,8 +259,8 @@ class AdaptiveCut:
         Parameters
         ----------
         undo : bool
-            The last change did not arrive: what it removed is removed by the next one, and
-            surfels may be removed that only it had.
+            The last change did not arrive. The next one removes its removed surfels too, and
+            may remove surfels that only the last change had.
 
         """
         if undo:

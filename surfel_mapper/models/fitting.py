@@ -72,8 +72,8 @@ ones only if these can be numbered."""
 
 MERGED_VOXELS = 0.3
 """
-Largest offset of merged clusters before growth. Books lie on a table, and what is merged is not
-divided again, but what is not may still be joined by all points.
+Largest offset of merged clusters before growth, in voxels. Merged clusters are never divided
+again, as a book and its table would have to be. Separate ones may be joined after growth.
 """
 
 MOST_JOINED = 16.0
@@ -325,8 +325,8 @@ def narrow_groups(
     """
     Divide wide groups of points at their mean, across their longest axis.
 
-    What is left of a cluster beside its patches may surround them: a Gaussian of it fills the
-    space between.
+    The remaining points of a cluster may surround its patches. One Gaussian of all of them would
+    fill the space of the patches.
 
     Parameters
     ----------

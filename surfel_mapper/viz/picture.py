@@ -5,7 +5,7 @@ map.png: a map obliquely from above, and its plan with coordinates beside it.
 
 A compiled kernel draws the discs (rendering.py) and matplotlib the rest: drawn by matplotlib, each
 70,000 discs took 2 s. The oblique view is level on the ground and has no perspective, so its scale
-bar and the squares of its ground hold anywhere. A line below the views states what they leave out.
+bar and the squares of its ground hold anywhere. A line below states the surfels left out.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ BALL_PX, BAR_PX = 80, (220, 14)
 
 RED, GREEN, GRID, INK = '#d62728', '#2ca02c', '#dcdfe2', '#4a5054'
 LINE, LINE_ALPHA, IN_FRONT_M = 0.25, 0.25, 0.3
-"""Grey and opacity of the lines of the ground; what is higher by more than this hides them, m."""
+"""Grey and opacity of the lines of the ground; surfels above by IN_FRONT_M (m) hide them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -36,7 +36,7 @@ def test_a_tilted_map_is_upright_to_the_tilt(tilt_deg):
 
     np.testing.assert_allclose(R @ R_tilted @ [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], atol=1e-9)
     assert np.linalg.det(R) == pytest.approx(1.0)
-    assert R[0, 0] > 0.8  # x stays where it was
+    assert R[0, 0] > 0.8  # x is kept
 
 
 def test_the_ground_of_a_camera_is_where_its_y_points():

@@ -64,8 +64,8 @@ MOST_FREED = 2
 """A ray ends after more voxels in a row that other rays of the scan have freed."""
 
 FADING = 4
-"""Weights in front of a surface fade so many times as fast as a distance moves: from MEMORY scans
-at 1 m to the least weight within forget_s."""
+"""Ratio of the rates at which the weight in front of a surface fades and its distance moves. A
+weight of MEMORY scans at 1 m falls to the least weight within forget_s."""
 
 MEMORY = 16.0
 """Largest weight of a voxel, in scans like the last, if surfaces are forgotten."""

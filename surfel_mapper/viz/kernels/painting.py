@@ -20,7 +20,7 @@ def draw_depth(discs, depth):
 
     discs  (K, 8) float64: column and row of the centre, px; its depth and the radius, m; px per
            m; normal to the right, up and towards the viewer, the last one positive
-    depth  (H, W) float32, m; inf where nothing is drawn; the centre of the first pixel is at 0, 0
+    depth  (H, W) float32, m; inf without a disc; the centre of the first pixel is at 0, 0
     """
     height, width = depth.shape
     for d in range(len(discs)):
