@@ -6,7 +6,8 @@ Adaptive surfels of real scans: their number, normals and edges; and what follow
 Normals are compared at some points of the scans with planes fitted robustly to all points within
 ``REACH`` base voxels. ``median_deg`` is the median angle, ``plane_deg`` that of the points
 of which one plane has 80 % of the neighbours. ``off_%`` is the share of the surfels that
-``is_flat`` selects (``good_%``) that are more than 10 deg from both of two planes fitted to the points in their own cell.
+``is_flat`` selects (``good_%``) that are more than 10 deg from both of two planes fitted to the
+points in their own cell.
 ``edge_mm`` is the distance of points near a second plane from their surfel that 90 % are within.
 Each of these is of adaptive surfels, and with ``base_`` and ``coarse_`` of voxels of the base and
 of four times its size. Surfels have 5 points or more. ``add_ms`` is the time to add a scan,
