@@ -20,8 +20,9 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from sensor_msgs.msg import PointCloud2
 
 from surfel_mapper.viz.discs import DrawnDiscs
-from surfel_mapper.viz.server import free_port, LIVE
+from surfel_mapper.viz.server import LIVE
 from test import extras
+from test.ports import reserved_pair
 from test.ros.driving import arguments, drive, mapped, send
 from test.ros.live import LATCHED, NODE, TIMEOUT_S
 
@@ -80,8 +81,14 @@ def command_lines():
     return found
 
 
-def test_a_node_serves_a_page_of_its_map(start, peer, tmp_path):
-    port = free_port()
+@pytest.fixture
+def port():
+    """Return the port of a page, of which the next one is that of its data."""
+    with reserved_pair() as first:
+        yield first
+
+
+def test_a_node_serves_a_page_of_its_map(start, peer, tmp_path, port):
     settings = {'viewer.enabled': True, 'viewer.port': port}
     node = start('node', *arguments(**settings))
     node.wait_for_output(f'the map is shown at http://127.0.0.1:{port}/')

@@ -25,6 +25,7 @@ from surfel_mapper.viz.viewer import Viewer
 from test import extras
 from test.bags.recorded import drive, write_rosbag2
 from test.layers.test_distance_field import insert, mapper_with
+from test.ports import reserved_pair
 
 pytestmark = extras.needs('rerun')
 
@@ -92,26 +93,26 @@ exec '{rerun}' --serve-grpc "$@"
 @pytest.mark.parametrize('taken', [0, 1])
 @pytest.mark.parametrize('address', ['127.0.0.1', '0.0.0.0'])
 def test_a_port_on_which_another_program_listens_is_refused(address, taken):
-    with socket.create_server((address, 0)) as other:
-        port = other.getsockname()[1] - taken
-        with pytest.raises(SurfelMapperError, match=f':{port + taken} .* is the port free'):
-            started_server(port, port + 1, LIVE)
+    with (
+        reserved_pair(address) as port,
+        socket.create_server((address, port + taken)),
+        pytest.raises(SurfelMapperError, match=f':{port + taken} .* is the port free'),
+    ):
+        started_server(port, port + 1, LIVE)
 
 
 @pytest.mark.skipif(not Path('/proc/net/tcp').exists(), reason='sockets are not shown')
 def test_the_window_listens_on_loopback_only(tmp_path, monkeypatch):
-    with socket.socket() as probe:
-        probe.bind(('127.0.0.1', 0))
-        port = probe.getsockname()[1]
     window, pid = tmp_path / 'rerun', tmp_path / 'pid'
     window.write_text(WINDOW.format(pid=pid, rerun=PROGRAM))
     window.chmod(0o755)
     monkeypatch.setenv('PATH', f'{tmp_path}{os.pathsep}{os.environ["PATH"]}')
-    monkeypatch.setattr(scene, 'PORT', port)
 
-    with Viewer(Mapper()):
-        listening = addresses(port)
-    os.kill(int(pid.read_text()), signal.SIGTERM)
+    with reserved_pair() as port:
+        monkeypatch.setattr(scene, 'PORT', port)
+        with Viewer(Mapper()):
+            listening = addresses(port)
+        os.kill(int(pid.read_text()), signal.SIGTERM)
 
     assert listening == {'127.0.0.1'}
 
