@@ -122,6 +122,8 @@ class RegistrationResult:
     seen_through : float
         Share of the surfaces of the map in view that the scan sees through, in [0, 1]; nan if the
         pose is near the first start and no search was needed.
+    level : int
+        Level of the map that overlap and fit refer to.
 
     """
 
@@ -137,6 +139,7 @@ class RegistrationResult:
     rival: float = 0.0
     is_found: bool = False
     seen_through: float = math.nan
+    level: int = 0
 
     @property
     def support(self) -> float:
@@ -230,7 +233,8 @@ class Registration:
             self._viewed(self._descend(cells, levels, start, width_m), view, levels)
             for start in self._searched_poses(cells, levels, starts)
         ]
-        chosen = self._chosen([result, *searched], starts, is_lost)
+        results = self._at_one_level([result, *searched], cells, levels)
+        chosen = self._chosen(results, starts, is_lost)
         return replace(chosen, is_found=not self._is_near(chosen, result.T_map_sensor))
 
     def relocate(
@@ -286,6 +290,27 @@ class Registration:
         share = view.seen_through(levels.surfaces, result.T_map_sensor, self._voxel_size_m)
         return replace(result, seen_through=share)
 
+    def _at_one_level(
+        self,
+        results: Sequence[RegistrationResult],
+        cells: npt.NDArray[np.float64],
+        levels: PlaneLevels,
+    ) -> list[RegistrationResult]:
+        """
+        Return results with overlap and fit at the coarsest level of any of them.
+
+        More cells meet a surfel in larger voxels: results of two levels cannot be compared.
+        """
+        level = max(result.level for result in results)
+        planes, width_m = levels.planes(level), 0.5 * levels.voxel_size_m(level)
+        compared = []
+        for result in results:
+            if result.level < level:
+                *_, overlap, fit = planes.equations(cells, result.T_map_sensor, width_m)
+                result = replace(result, overlap=overlap, fit=fit, level=level)
+            compared.append(result)
+        return compared
+
     def _chosen(
         self, results: Sequence[RegistrationResult], starts: Sequence[Transform], is_lost: bool
     ) -> RegistrationResult:
@@ -340,7 +365,7 @@ class Registration:
             finer = self._converge(some, levels.planes(level), pose, width_m, tolerance_m, most)
             iterations += finer.iterations
             if result is None or finer.overlap >= LEAST_FINER * result.overlap:
-                result = finer
+                result = replace(finer, level=level)
         assert result is not None, 'there is always level 0'
         if not coarsest and result.overlap < SPARSE:
             return self._descend(cells, levels, start, levels.voxel_size_m(0))
