@@ -188,22 +188,27 @@ class Counters:
 
 
 class Laps:
-    """Times of consecutive stages, without the time of kernels that were compiled meanwhile."""
+    """
+    Times of consecutive stages, without the time of kernels that were compiled meanwhile.
+
+    Attributes
+    ----------
+    milliseconds : dict of str to float
+        Time of every ended stage, and their ``total``.
+
+    """
 
     def __init__(self) -> None:
-        self._start = self._lap = perf_counter() - PROGRESS.ended_s
-        self._stages: dict[str, float] = {}
+        self._lap = perf_counter() - PROGRESS.ended_s
+        self.milliseconds = {'total': 0.0}
 
     def end(self, stage: str) -> None:
         """End a stage and start the next."""
         stop = perf_counter() - PROGRESS.ended_s
-        self._stages[stage] = max(stop - self._lap, 0.0) * 1e3
+        spent_ms = max(stop - self._lap, 0.0) * 1e3
+        total_ms = self.milliseconds.pop('total') + spent_ms  # it stays the last entry
+        self.milliseconds |= {stage: spent_ms, 'total': total_ms}
         self._lap = stop
-
-    @property
-    def milliseconds(self) -> dict[str, float]:
-        """Return the time of every ended stage, and their ``total``."""
-        return {**self._stages, 'total': max(self._lap - self._start, 0.0) * 1e3}
 
 
 def percentiles(milliseconds: deque[float]) -> dict[str, float]:

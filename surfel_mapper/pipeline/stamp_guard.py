@@ -108,16 +108,12 @@ class StampGuard:
         self._recent_ns: dict[Source, deque[int]] = {}
         self.ahead_ns = round(MAX_AHEAD_S * 1e9)
         self.newest_ns: int | None = None
-
-    @property
-    def newest_scan_ns(self) -> int | None:
-        """The newest stamp of a scan, whether the scan is mapped or still waits."""
-        return max(self._scan_ns.values(), default=None)
+        self._newest_scan_ns: int | None = None  # of all sources
 
     def newest_of(self, scan: Scan) -> int | None:
         """Return the newest stamp of the source of a scan; of all scans if there are no poses."""
         own_ns = self._scan_ns.get(source_of(scan))
-        return self.newest_scan_ns if self._transforms.newest_ns is None else own_ns
+        return self._newest_scan_ns if self._transforms.newest_ns is None else own_ns
 
     def judge(self, message: Scan | StampedPose) -> list[Judged]:
         """Return the messages that are decided now, in their order."""
@@ -187,18 +183,20 @@ class StampGuard:
             for stamps in (self._scan_ns, self._previous_ns, self._recent_ns):
                 stamps.pop(silent, None)
         self._scan_ns[source] = stamp_ns
+        self._newest_scan_ns = max(self._scan_ns.values())
         self._recent_ns.setdefault(source, deque(maxlen=MAX_RECENT)).append(stamp_ns)
         return Order(back_s=back_s, odd_ns=odd_ns)
 
     def forget_scans(self) -> None:
         """Forget the stamps of all scans, as after time was set back."""
         self._scan_ns.clear()
+        self._newest_scan_ns = None
         self._previous_ns.clear()
         self._recent_ns.clear()
 
     def _newest_of(self, source: Source) -> int | None:
         """Return the newest stamp of a source; of a new one the older of all scans' and poses'."""
-        scan_ns = self._scan_ns.get(source, self.newest_scan_ns)
+        scan_ns = self._scan_ns.get(source, self._newest_scan_ns)
         pose_ns = self._transforms.newest_ns
         if source in self._scan_ns or scan_ns is None or pose_ns is None:
             return scan_ns
@@ -208,7 +206,7 @@ class StampGuard:
         """Return whether the stamp of a message is far from those of its source and of others."""
         stamp_ns, scan_ns, pose_ns = (
             message.stamp_ns,
-            self.newest_scan_ns,
+            self._newest_scan_ns,
             self._transforms.newest_ns,
         )
         if isinstance(message, Scan):

@@ -24,7 +24,6 @@ climbs a limited number of edges, and costs the same however many other frames t
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import count, filterfalse, islice, pairwise
 import math
@@ -261,12 +260,12 @@ class TransformBuffer:
 
     def is_between(self, frame: str, target: str, source: str) -> bool:
         """Return whether a frame has its edge on the way between two frames, or to the roots."""
-        between = {*self._edges_above(source)} ^ {*self._edges_above(target)}
+        between = {*self._above(source)[0]} ^ {*self._above(target)[0]}
         return any(edge.child == frame for edge in between)
 
     def _dynamic(self, target: str, source: str, stamp_ns: int | None = None) -> list[PoseTrack]:
         """Return the dynamic edges between two frames, at a stamp or now."""
-        up, down = self._edges_above(source, stamp_ns), self._edges_above(target, stamp_ns)
+        up, down = self._above(source, stamp_ns)[0], self._above(target, stamp_ns)[0]
         return [*filterfalse(attrgetter('is_static'), {*up} ^ {*down})]
 
     def add(
@@ -459,11 +458,11 @@ class TransformBuffer:
                 kind, came = ('static', 'dynamic') if edge.is_static else ('dynamic', 'static')
                 raise PoseError(f'{name}: known as {kind}, a {came} transform came')
             return edge
-        above = [upper.child for upper in self._edges_above(parent)]
-        if len(above) >= MAX_DEPTH:
+        edges, frames = self._above(parent)
+        if len(edges) >= MAX_DEPTH:
             raise PoseError(f'{name}: over {MAX_DEPTH} transforms above {child!r}')
-        if child in above or (above and self._edges[above[-1]].parent == child):
-            loop = above[: above.index(child)] if child in above else above
+        if child in frames:
+            loop = frames[: frames.index(child)]
             raise PoseError(f'{name}: closes the loop {" -> ".join([child, *loop[::-1], child])}')
         if (edge is None and len(self._edges) >= MAX_EDGES) or (
             parent not in self._frames and len(self._frames) >= 2 * MAX_EDGES
@@ -477,24 +476,25 @@ class TransformBuffer:
         self, target: str, source: str, stamp_ns: int
     ) -> tuple[list[PoseTrack], list[PoseTrack]]:
         """Return the edges from source and from target up to their first common frame."""
-        up = list(self._edges_above(source, stamp_ns))
-        down = list(self._edges_above(target, stamp_ns))
-        rows = dict(zip(_frames_along(target, down, stamp_ns), count()))
-        for row, frame in enumerate(_frames_along(source, up, stamp_ns)):
+        (up, sources), (down, targets) = (
+            self._above(source, stamp_ns),
+            self._above(target, stamp_ns),
+        )
+        rows = dict(zip(targets, count()))
+        for row, frame in enumerate(sources):
             if frame in rows:
                 return up[:row], down[: rows[frame]]
         raise PoseNotYetError(
             f'{_request(target, source, stamp_ns)}: {self._why_not_connected(target, source)}'
         )
 
-    def _edges_above(self, frame: str, stamp_ns: int | None = None) -> Iterator[PoseTrack]:
-        """Yield up to MAX_DEPTH edges from a frame upwards, at a stamp or now."""
-        for _ in range(MAX_DEPTH):
-            edge = self._edges.get(frame)
-            if edge is None:
-                return
-            yield edge
-            frame = edge.parent_at(stamp_ns)
+    def _above(self, frame: str, stamp_ns: int | None = None) -> tuple[list[PoseTrack], list[str]]:
+        """Return up to MAX_DEPTH edges from a frame upwards, at a stamp or now, and the frames."""
+        edges, frames = list[PoseTrack](), [frame]
+        while len(edges) < MAX_DEPTH and (edge := self._edges.get(frames[-1])) is not None:
+            edges.append(edge)
+            frames.append(edge.parent_at(stamp_ns))
+        return edges, frames
 
     def _why_not_connected(self, target: str, source: str) -> str:
         """Return which of two frames is unknown, or that they are in two trees."""
@@ -505,14 +505,6 @@ class TransformBuffer:
         if unseen:
             return f'no transform of {unseen} yet; frames seen: {names or "none"}'
         return f'no transforms lead from one to the other yet; frames seen: {names}'
-
-
-def _frames_along(frame: str, edges: list[PoseTrack], stamp_ns: int) -> list[str]:
-    """Return a frame and those above it, at a stamp."""
-    frames = [frame]
-    for edge in edges:
-        frames.append(edge.parent_at(stamp_ns))
-    return frames
 
 
 def _request(target: str, source: str, stamp_ns: int) -> str:
