@@ -13,15 +13,14 @@ executor.
 A subscription is reliable while all publishers of its topic are, and best effort as soon as one is
 not, since a reliable subscription receives nothing from that one. Messages above 0.5 MB need a
 reliable subscription: Fast DDS sends them in fragments, and of the best-effort ones most are
-lost. The middleware reports publishers that come and go; the subscription is then created again,
-and the earlier one kept until the new one is connected.
+lost. The middleware reports publishers that come and go; the subscription is then created again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 import math
 import threading
@@ -91,10 +90,6 @@ class TopicReader:
         The reliability follows the publishers; False if the user has set it.
     subscription : Subscription
         The present subscription.
-    retiring : Subscription or None
-        The one before it, until the new one is connected, so that no message is missed.
-    seen : set of int
-        Source timestamps of the messages taken meanwhile, which both receive.
     reliability : ReliabilityPolicy
         Its reliability.
     follow_until_s : float
@@ -115,16 +110,10 @@ class TopicReader:
     raw: bool
     follows: bool
     subscription: Subscription | None = None
-    retiring: Subscription | None = None
-    source_stamps: set[int] = field(default_factory=set)
     reliability: ReliabilityPolicy = RELIABLE
     follow_until_s: float = -math.inf
     lost: int = 0
     mismatch: str = ''
-
-    def subscriptions(self) -> list[Subscription]:
-        """Return the open subscriptions, oldest first."""
-        return [opened for opened in (self.retiring, self.subscription) if opened is not None]
 
     def on_publishers_changed(self, _: object) -> None:
         """Check the QoS of the publishers soon."""
@@ -298,18 +287,10 @@ class SubscriptionExecutor:
         reader.on_publishers_changed(None)  # one may have come since the graph was looked at
 
     def _close(self, reader: TopicReader) -> None:
-        """Destroy the subscriptions of a reader."""
-        self._retire(reader)
+        """Destroy the subscription of a reader."""
         if reader.subscription is not None:
             self._node.destroy_subscription(reader.subscription)
             reader.subscription = None
-
-    def _retire(self, reader: TopicReader) -> None:
-        """Destroy the earlier of two subscriptions."""
-        if reader.retiring is not None:
-            self._node.destroy_subscription(reader.retiring)
-            reader.retiring = None
-            reader.source_stamps.clear()
 
     def _offered(self, reader: TopicReader, *, default: ReliabilityPolicy) -> ReliabilityPolicy:
         """Return the best reliability that all publishers of a topic offer."""
@@ -323,9 +304,6 @@ class SubscriptionExecutor:
         """Subscribe again to topics whose publishers now offer another reliability."""
         now_s = time.monotonic()
         for reader in (*self._eager, *self._lazy):
-            if reader.retiring is not None:
-                self._finish_switch(reader, now_s)
-                continue
             if now_s > reader.follow_until_s:
                 continue
             reliability = reader.qos.reliability
@@ -335,9 +313,10 @@ class SubscriptionExecutor:
                 self._report_mismatch(reader)
                 continue
             reader.qos.reliability = reliability
-            previous = reader.subscription
+            while self._take(reader):
+                pass
+            self._close(reader)
             self._open(reader)
-            reader.retiring = previous
             self._node.get_logger().info(
                 f'{reader.topic} is now read {name_of(reliability)}, as its publishers offer'
             )
@@ -350,17 +329,6 @@ class SubscriptionExecutor:
         if text and text != reader.mismatch:
             self._node.get_logger().warning(f'{reader.topic}: {text}')
         reader.mismatch = text
-
-    def _finish_switch(self, reader: TopicReader, now_s: float) -> None:
-        """Destroy the earlier subscription once the new one is connected to all publishers."""
-        assert reader.subscription is not None
-        connected = reader.subscription.get_publisher_count()
-        if connected < len(self.publishers(reader.topic)) and now_s <= reader.follow_until_s:
-            return
-        while self._take(reader):
-            pass
-        self._retire(reader)
-        self._report_mismatch(reader)
 
     def _run(self) -> None:
         try:
@@ -383,7 +351,7 @@ class SubscriptionExecutor:
     def _wait(self) -> None:
         """Return when a message has arrived, or the thread has to end; call event callbacks."""
         readers = (*self._eager, *self._lazy)
-        subscriptions = [opened for reader in readers for opened in reader.subscriptions()]
+        subscriptions = [r.subscription for r in readers if r.subscription is not None]
         events = [event for opened in subscriptions for event in opened.event_handlers]
         wait_set = rclpy_implementation.WaitSet(
             len(subscriptions), 1, 0, 0, 0, len(events), self._node.context.handle
@@ -416,24 +384,14 @@ class SubscriptionExecutor:
 
     def _take(self, reader: TopicReader) -> bool:
         """Take a message and call the callback; return whether there was one."""
-        if time.monotonic() > self._end_s:
+        subscription, received = reader.subscription, None
+        if subscription is None or time.monotonic() > self._end_s:
             return False
-        for subscription in reader.subscriptions():
-            received = None
-            with self._node.surviving(f'a message on {reader.topic}'):
-                handle = subscription.handle
-                received = handle.take_message(subscription.msg_type, subscription.raw)
-            if received is None:
-                continue
-            message, info = received
-            if reader.retiring is not None:
-                if info['source_timestamp'] in reader.source_stamps:
-                    return True
-                reader.source_stamps.add(info['source_timestamp'])
-            with self._node.surviving(f'a message on {reader.topic}'):
-                reader.callback(message)
-            return True
-        return False
+        with self._node.surviving(f'a message on {reader.topic}'):
+            received = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if received is not None:
+                reader.callback(received[0])
+        return received is not None
 
 
 def name_of(reliability: ReliabilityPolicy) -> str:
