@@ -9,8 +9,6 @@ aligned, its present voxels are compared with the published ones, which covers a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,10 +22,6 @@ Keys = npt.NDArray[np.int64]
 
 LIST_EVERY = 30
 """After this many scans the voxels of the map are listed again, which takes milliseconds."""
-
-
-BEHIND = -1
-"""Number of scans published, if a change could not be: all since it are collected then."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,21 +83,6 @@ class ChangeTracker:
         self._version = self._mapper.map.version
         self._num_resets = self._mapper.counters.resets
         self._num_mapped = self._mapper.counters.mapped
-
-    @contextmanager
-    def undone_on_error(self) -> Iterator[None]:
-        """In a with-block, take a change back that cannot be published; it comes with the next."""
-        version, published, content = self._version, self._published, self._content
-        num_changes = 0 if published is None else len(published)
-        try:
-            yield
-        except Exception:  # MemoryError too
-            self._num_mapped = BEHIND
-            self._version, self._content = version, content
-            if published is not None:
-                self._published = published
-                published.cut(num_changes)
-            raise
 
     def after_scan(self, update: Update) -> MapChange:
         """Return the changes of a scan, and all others since the last call."""
@@ -182,15 +161,6 @@ class AdaptiveTracker:
     def reset(self) -> None:
         """Start from the present map, as the next full map does."""
 
-    @contextmanager
-    def undone_on_error(self) -> Iterator[None]:
-        """In a with-block, take a change back that cannot be published; it comes with the next."""
-        try:
-            yield
-        except Exception:  # MemoryError too
-            self._cut.restart(undo=True)
-            raise
-
     def after_scan(self, _: Update) -> MapChange:
         """Return the changes of a scan, and all others since the last call."""
         return self.changes()
@@ -239,10 +209,6 @@ class PublishedKeys:
     def append(self, change: MapChange) -> None:
         """Add a change."""
         self._changes.append(change)
-
-    def cut(self, number: int) -> None:
-        """Keep the first changes."""
-        del self._changes[number:]
 
     def keys(self) -> Keys:
         """Return all keys, ascending."""

@@ -233,9 +233,7 @@ class Outputs:
         if wants_changed or not is_removed_read:
             self._removals.reset()
         if is_removed_read or (is_read and wants_changed):
-            tracker = self._changes if wants_changed else self._removals
-            with tracker.undone_on_error():
-                self._publish_change(find(tracker))
+            self._publish_change(find(self._changes if wants_changed else self._removals))
 
     def _publish_change(self, change: MapChange) -> None:
         mapper = self._mapper
@@ -274,10 +272,9 @@ class Outputs:
 
     def _followed(self, tracker: AdaptiveTracker, at_most: int | None = None) -> Surfels:
         """Return the adaptive surfels; changes that they have are published first."""
-        with tracker.undone_on_error():
-            change = tracker.changes()
-            if len(change.surfels) or len(change.removed):
-                self._publish_change(change)
+        change = tracker.changes()
+        if len(change.surfels) or len(change.removed):
+            self._publish_change(change)
         return tracker.surfels(at_most)
 
     def _publish_normals(self) -> int:
