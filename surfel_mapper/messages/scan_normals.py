@@ -15,13 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.geometry import inverse, Transform
-from surfel_mapper.kernels.grouping import build_table
-from surfel_mapper.kernels.layout import BITS
-from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.geometry import Transform
+from surfel_mapper.mapping.moments import point_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.messages.kernels.attach import attach_surfels
 from surfel_mapper.messages.pointcloud2 import (
     append_fields,
     CloudBytes,
@@ -53,30 +49,15 @@ def scan_with_normals(
         Voxels with fewer points are no surfels.
 
     """
-    keys = surfel_map.reduce(scan.points, T_map_sensor, columns=scan.columns).key
-    rows = surfel_map.find(keys)
-    surfels = surfel_map.surfels_of(rows[rows >= 0])
-    surfels = surfels.select(surfels.num_points >= min_points)
-    added = surfels_of_points(scan, T_map_sensor, surfels, surfel_map.voxel_size_m)
+    added = surfels_of_points(scan, T_map_sensor, surfel_map, min_points)
     return cloud_of_scan(scan, added) if scan.msg is None else extended_cloud(scan.msg, added)
 
 
 def surfels_of_points(
-    scan: Scan, T_map_sensor: Transform, surfels: Surfels, voxel_size_m: float
+    scan: Scan, T_map_sensor: Transform, surfel_map: SurfelMap, min_points: int
 ) -> npt.NDArray[np.float32]:
     """
     Return normal, planarity and number of points of the surfel of each point.
-
-    Parameters
-    ----------
-    scan : Scan
-        Deskewed, if its sensor moved.
-    T_map_sensor : (4, 4) float64
-        Its pose.
-    surfels : Surfels
-        The surfels in which points may lie, in the fixed frame.
-    voxel_size_m : float
-        Edge of a voxel.
 
     Returns
     -------
@@ -85,17 +66,19 @@ def surfels_of_points(
         of the same bytes. nan and 0 for points without a surfel.
 
     """
-    keys = pack_keys(surfels.voxel_index)
-    table = np.empty(1 << max(2 * len(keys) - 1, 1).bit_length(), np.int32)
-    build_table(keys, table)
-    R = inverse(T_map_sensor)[:3, :3]
-    normal = np.ascontiguousarray(surfels.normal @ R.T)
-    pose = np.ascontiguousarray(T_map_sensor[:3])
-    quantisation = (pose, (1 << BITS) / voxel_size_m, np.array([0.0, np.inf]))
-    added = np.empty((len(scan), len(ADDED)), np.float32)
-    points = np.require(scan.points, None, ['F', 'A', 'W'])
-    values = (normal, surfels.planarity, surfels.num_points)
-    attach_surfels(points.T, quantisation, values, keys, table, added, added.view(np.uint32))
+    added = np.full((len(scan), len(ADDED)), np.nan, np.float32)
+    count = added.view(np.uint32)[:, -1]
+    count[:] = 0
+    rows = surfel_map.find(point_keys(scan.points, T_map_sensor, surfel_map.voxel_size_m))
+    is_mapped = rows >= 0
+    if is_mapped.any():
+        used = np.flatnonzero(np.bincount(rows[is_mapped])).astype(rows.dtype)
+        surfels = surfel_map.surfels_of(used)
+        values = np.column_stack([surfels.normal @ T_map_sensor[:3, :3], surfels.planarity])
+        values[surfels.num_points < min_points] = np.nan
+        numbers = np.where(surfels.num_points < min_points, 0, surfels.num_points)
+        row = np.searchsorted(used, rows[is_mapped])
+        added[is_mapped, :-1], count[is_mapped] = values[row], numbers[row]
     return added
 
 
