@@ -3,9 +3,7 @@
 """
 Checkpoints of a map: saved every ``output.checkpoint_s``, and found again after a restart.
 
-A checkpoint is a file as ~/save_map writes it, whole or not at all. The previous one is kept, so
-that a complete checkpoint exists at any moment, also while one is written. A map and its layers
-cannot be renamed at once, so layers get their second name before the map and lose the first after.
+A checkpoint is a file as ~/save_map writes it. A complete one replaces the one before it at once.
 """
 
 from __future__ import annotations
@@ -13,15 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import logging
-import os
 from pathlib import Path
-import shutil
 import time
-from zipfile import is_zipfile
 
 from surfel_mapper.config import OutputConfig
 from surfel_mapper.errors import FileFormatError, MapError
-from surfel_mapper.files.atomic import make_directory, replace_file
+from surfel_mapper.files.atomic import make_directory
 from surfel_mapper.pipeline.drops import described
 from surfel_mapper.pipeline.mapper import Mapper
 from surfel_mapper.pipeline.saved_state import CopiedMapper, layer_files, load_mapper
@@ -60,12 +55,9 @@ class Checkpoints:
         """Why the last checkpoint failed, and the age of the last good one; empty if none did."""
         if not self._failure:
             return ''
-        ages_s = [
-            time.time() - path.stat().st_mtime
-            for path in checkpoint_paths(self._mapper.config.output)
-            if path.is_file()
-        ]
-        age = f'the last good one is {min(ages_s):.0f} s old' if ages_s else 'there is no good one'
+        path, age = checkpoint_path(self._mapper.config.output), 'there is no good one'
+        if path.is_file():
+            age = f'the last good one is {time.time() - path.stat().st_mtime:.0f} s old'
         return f'checkpoints fail ({self._failure}); {age}'
 
     def save_if_due(self, run: Callable[[Callable[[], Path]], object] = at_once) -> Path | None:
@@ -93,10 +85,13 @@ class Checkpoints:
     def save(self, run: Callable[[Callable[[], Path]], object] = at_once) -> Path:
         """Save the map now; see save_if_due."""
         self._started_s, version = time.monotonic(), self._mapper.map.version
-        newest, older = checkpoint_paths(self._mapper.config.output)
+        path = checkpoint_path(self._mapper.config.output)
         with self._reporting():
-            self._make_room(newest, older)
-            copied = CopiedMapper(newest, self._mapper)
+            make_directory(path.parent)
+            for file in (path, *(file for file, _ in layer_files(path, self._mapper))):
+                if file.is_symlink():
+                    raise FileFormatError(f'{file}: a link, expected a file or none')
+            copied = CopiedMapper(path, self._mapper)
 
         def write() -> Path:
             try:
@@ -105,11 +100,11 @@ class Checkpoints:
             finally:
                 self._is_writing = False
             self._version, self._failure = version, ''
-            return newest
+            return path
 
         self._is_writing = True
         run(write)
-        return newest
+        return path
 
     @contextmanager
     def _reporting(self) -> Iterator[None]:
@@ -120,39 +115,10 @@ class Checkpoints:
             self._failure = described(error)
             raise
 
-    def _make_room(self, newest: Path, older: Path) -> None:
-        """Make the newest checkpoint the older one."""
-        make_directory(newest.parent)
-        both = (layer_files(path, self._mapper) for path in (newest, older))
-        layers = [(new, old) for (new, _), (old, _) in zip(*both, strict=True)]
-        for path in (newest, older, *(path for pair in layers for path in pair)):
-            if path.is_symlink():
-                raise FileFormatError(f'{path}: a link, expected a file or none')
-        if is_zipfile(newest):  # else it is cut, or layers are those of a checkpoint that failed
-            older.unlink(missing_ok=True)  # first, and last comes back: a map has its own layers
-            for new, old in layers:
-                old.unlink(missing_ok=True)
-                if new.exists():
-                    duplicate(new, old)
-            os.replace(newest, older)
-            for new, _ in layers:
-                new.unlink(missing_ok=True)
 
-
-def duplicate(path: Path, name: Path) -> None:
-    """Give a file a second name, or a copy if the file system has no hard links, as FAT."""
-    try:
-        os.link(path, name)
-    except OSError:
-        with open(path, 'rb') as source, replace_file(name) as target:
-            shutil.copyfileobj(source, target)
-
-
-def checkpoint_paths(output: OutputConfig) -> tuple[Path, Path]:
-    """Return the files of the newest checkpoint and of the one before it."""
-    directory = Path(output.directory).expanduser().absolute()
-    name = output.map_name
-    return directory / f'{name}.checkpoint.npz', directory / f'{name}.checkpoint.1.npz'
+def checkpoint_path(output: OutputConfig) -> Path:
+    """Return the file of the checkpoints."""
+    return Path(output.directory).expanduser().absolute() / f'{output.map_name}.checkpoint.npz'
 
 
 def load_start(mapper: Mapper) -> None:
@@ -179,12 +145,10 @@ def load_start(mapper: Mapper) -> None:
 
 
 def _load_latest(mapper: Mapper) -> None:
-    output = mapper.config.output
-    saved = checkpoint_paths(output)[0].with_name(f'{output.map_name}.npz')
-    paths = [path for path in checkpoint_paths(output) if path.is_file()]
-    if saved.is_file():  # names give the order of checkpoints: a clock may be set back
-        saved_ns = saved.stat().st_mtime_ns
-        paths.insert(sum(path.stat().st_mtime_ns > saved_ns for path in paths), saved)
+    checkpoint = checkpoint_path(mapper.config.output)
+    saved = checkpoint.with_name(f'{mapper.config.output.map_name}.npz')
+    paths = [path for path in (checkpoint, saved) if path.is_file()]
+    paths.sort(key=lambda path: -path.stat().st_mtime_ns)
     for path in paths:
         try:
             load_mapper(path, mapper)

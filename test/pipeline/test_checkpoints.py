@@ -14,7 +14,8 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.parquet_tiles import write_tiles
 from surfel_mapper.pipeline import checkpoints, saved_state
-from surfel_mapper.pipeline.checkpoints import checkpoint_paths, Checkpoints, load_start
+from surfel_mapper.pipeline.checkpoints import checkpoint_path, Checkpoints, load_start
+from surfel_mapper.pipeline.saved_state import save_mapper
 from test import extras
 from test.pipeline.made_scans import add_pose, insert, mapper_with, scan_at
 
@@ -49,24 +50,20 @@ def drive(mapper, *stamps_s):
         insert(mapper, scan_at(stamp_s))
 
 
-def test_a_checkpoint_is_written_when_due_and_two_are_kept(tmp_path, clock):
+def test_a_checkpoint_is_written_when_due_and_replaces_the_one_before(tmp_path, clock):
     mapper = mapper_in(tmp_path)
-    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    saving, path = Checkpoints(mapper), checkpoint_path(mapper.config.output)
     drive(mapper, 1.0)
     assert saving.save_if_due() is None
-    digests = []
     for stamp_s in (2.0, 3.0, 4.0):
         clock.now_s += 10.0
         drive(mapper, stamp_s)
-        assert saving.save_if_due() == newest
+        assert saving.save_if_due() == path
         assert saving.save_if_due() is None
-        digests.append(mapper.map.digest())
     clock.now_s += 10.0
     assert saving.save_if_due() is None  # the map is as it was
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([newest.name, before.name])
-
-    for path, digest in ((newest, digests[2]), (before, digests[1])):
-        assert load_map(path)[0].digest() == digest
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    assert load_map(path)[0].digest() == mapper.map.digest()
 
 
 def test_latest_continues_with_map_and_window(tmp_path, clock):
@@ -83,41 +80,27 @@ def test_latest_continues_with_map_and_window(tmp_path, clock):
     assert after.map.digest() == mapper.map.digest()  # the same scans have left
 
 
-@pytest.mark.parametrize('damage', ['cut', 'missing'])
-def test_the_checkpoint_before_is_used_if_the_newest_is_damaged(tmp_path, clock, caplog, damage):
+@pytest.mark.parametrize('is_damaged', [False, True])
+@pytest.mark.parametrize('is_newer', [False, True])
+def test_latest_is_the_newer_file_that_is_whole(tmp_path, clock, caplog, is_newer, is_damaged):
     mapper = mapper_in(tmp_path)
-    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
-    digests = []
-    for stamp_s in (1.0, 2.0):
-        drive(mapper, stamp_s)
-        clock.now_s += 10.0
-        saving.save_if_due()
-        digests.append(mapper.map.digest())
-    if damage == 'cut':
+    path = checkpoint_path(mapper.config.output)
+    saved = tmp_path / f'{mapper.config.output.map_name}.npz'
+    drive(mapper, 1.0)
+    saved_digest = save_mapper(saved, mapper)
+    drive(mapper, 2.0)
+    Checkpoints(mapper).save()
+    at_s = saved.stat().st_mtime + (10.0 if is_newer else -10.0)
+    os.utime(path, (at_s, at_s))
+    newest = path if is_newer else saved
+    if is_damaged:
         newest.write_bytes(newest.read_bytes()[:-100])
-    else:
-        newest.unlink()  # killed while the newest one was written
-    os.utime(before, (1, 1))
+        os.utime(newest, (at_s + 20.0, at_s + 20.0))
     after = mapper_in(tmp_path, map__load='latest')
     load_start(after)
-    assert after.map.digest() == digests[0]
-    assert ('an older one is tried' in caplog.text) == (damage == 'cut')
-
-
-@pytest.mark.parametrize('age_s', [-3600, 3600])
-def test_the_newest_checkpoint_is_used_whatever_the_clock_was(tmp_path, clock, age_s):
-    """A robot without a battery for its clock saves after a restart at an earlier time."""
-    mapper = mapper_in(tmp_path)
-    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
-    for stamp_s in (1.0, 2.0):
-        drive(mapper, stamp_s)
-        clock.now_s += 10.0
-        saving.save_if_due()
-    at_s = before.stat().st_mtime + age_s
-    os.utime(newest, (at_s, at_s))
-    after = mapper_in(tmp_path, map__load='latest')
-    load_start(after)
-    assert after.map.digest() == mapper.map.digest()
+    expected = mapper.map.digest() if is_newer != is_damaged else saved_digest
+    assert after.map.digest() == expected
+    assert ('an older one is tried' in caplog.text) == is_damaged
 
 
 def test_a_map_in_tiles_is_a_start_too(tmp_path):
@@ -140,7 +123,7 @@ def test_latest_without_any_map_starts_empty(tmp_path, caplog):
 
 def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, clock, monkeypatch):
     mapper = mapper_in(tmp_path)
-    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    saving, path = Checkpoints(mapper), checkpoint_path(mapper.config.output)
     drive(mapper, 1.0)
     clock.now_s += 10.0
     saving.save_if_due()
@@ -155,8 +138,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, clo
         clock.now_s += 10.0
         with pytest.raises(FileFormatError):
             saving.save_if_due()
-    assert not newest.exists()
-    assert load_map(before)[0].digest() == digest
+    assert load_map(path)[0].digest() == digest
     assert saving.problem.startswith('checkpoints fail (FileFormatError: no space); the last good')
     assert int(saving.problem.split()[-3]) in range(999, 1600)  # the clock is 1000 s ahead
 
@@ -167,8 +149,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, clo
 
 def test_a_checkpoint_is_not_written_through_a_link(tmp_path, clock):
     mapper = mapper_in(tmp_path)
-    newest, _ = checkpoint_paths(mapper.config.output)
-    newest.symlink_to(tmp_path / 'elsewhere')
+    checkpoint_path(mapper.config.output).symlink_to(tmp_path / 'elsewhere')
     saving = Checkpoints(mapper)
     drive(mapper, 1.0)
     clock.now_s += 10.0
