@@ -160,13 +160,19 @@ class DetailedMap:
 
 
 def drawn_surfels(
-    surfel_map: SurfelMap, min_points: int, target: npt.ArrayLike, at_most: int
+    surfels: Surfels,
+    surfel_map: SurfelMap,
+    min_points: int,
+    target: npt.ArrayLike,
+    at_most: int,
 ) -> Surfels:
     """
     Return the surfels of a map by which it is drawn: adaptive ones, of parts if there are many.
 
     Parameters
     ----------
+    surfels : Surfels
+        The adaptive surfels of the map.
     surfel_map : SurfelMap
         The map.
     min_points : int
@@ -177,7 +183,6 @@ def drawn_surfels(
         Limit of their number.
 
     """
-    surfels = surfel_map.adaptive(min_points)
     if len(surfels) <= at_most:
         return surfels
     detailed = DetailedMap(surfel_map.moments(), min_points)

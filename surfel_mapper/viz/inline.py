@@ -91,7 +91,8 @@ def show(
         near = np.zeros(3) if place is None else as_numbers('place', place)
         if near.shape != (3,) or not np.isfinite(near).all():
             raise ValueError(f'place: {place!r}, expected x y z, m, finite')
-        drawn = drawn_surfels(shown, min_points, near, most_shown({}))
+        adaptive = shown.adaptive(min_points)
+        drawn = drawn_surfels(adaptive, shown, min_points, near, most_shown({}))
     else:
         surfels = drawn = shown
     summary['surfels'] = len(surfels)

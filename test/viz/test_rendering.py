@@ -2,11 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """A rendered image shows discs where geometry says, closed, if they face the viewer."""
 
+import math
+
 import numpy as np
 import pytest
 
 from surfel_mapper.viz.discs import DrawnDiscs
-from surfel_mapper.viz.rendering import Camera, CLOSING, direction, fitted, rendered, round_length
+from surfel_mapper.viz.rendering import (
+    BEYOND_CELL,
+    Camera,
+    CLOSING,
+    direction,
+    fitted,
+    hollow_shade,
+    rendered,
+    round_length,
+)
 from test.viz.test_picture import sheet
 
 RED, BLUE = np.array([[200, 0, 0], [0, 0, 200]], np.uint8)
@@ -94,6 +105,65 @@ def test_an_eye_sees_a_wall_closed_and_not_what_lies_behind_it():
     assert image[near, 3].min() == 1.0
     assert near[-1].all()
     assert np.isfinite(rendered(camera, behind, RED[None])[1]).sum() == 0
+
+
+@pytest.mark.parametrize('eye_m', [None, np.array([0.0, 0.0, 40.0])])
+def test_a_disc_ends_one_voxel_beyond_its_cell(eye_m):
+    scale = 10.0 if eye_m is None else 400.0
+    camera = Camera(DOWN, np.zeros(2), 200, 200, scale, eye_m)
+    large, small = disc((1.0, 2.0, 0.0), radius_m=8.0), disc((7.8, 7.8, 0.0), radius_m=0.01)
+    shown = joined(large, small)
+    shown = DrawnDiscs(
+        shown.position, shown.normal, shown.radius_m, {'size': np.array([4.0, 0.5])}
+    )
+
+    image, _ = rendered(camera, shown, np.stack([RED, RED]))
+
+    rows, columns = np.nonzero(image[:, :, 3] == 1.0)
+    beyond_m = BEYOND_CELL * 0.5
+    for low, high in (
+        (columns.min() - 100, columns.max() - 99),
+        (99 - rows.max(), 100 - rows.min()),
+    ):
+        assert (low / 10.0, high / 10.0) == pytest.approx((-beyond_m, 4.0 + beyond_m), abs=0.11)
+
+
+def test_discs_of_unknown_cells_are_whole():
+    camera, whole = Camera(DOWN, np.zeros(2), 80, 80, 10.0), disc((0.1, 0.1, 0.0), radius_m=2.0)
+    unknown = DrawnDiscs(
+        whole.position, whole.normal, whole.radius_m, {'size': np.array([np.nan])}
+    )
+    images = [rendered(camera, discs, RED[None])[0] for discs in (whole, unknown)]
+    np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.parametrize('slope', [0.0, 0.3, 2.0])
+def test_a_plane_is_not_shaded_whatever_its_slope(slope):
+    rows, columns = np.mgrid[:24, :31]
+    depth = (5.0 + 0.1 * slope * (rows + columns)).astype(np.float32)
+    np.testing.assert_allclose(hollow_shade(depth, 0.1), 1.0)
+
+
+def test_a_valley_is_darker_than_its_sides_and_a_ridge_is_not():
+    across = np.abs(np.arange(31) - 15) * 0.1
+    # two units for pairs across the valley, of which each step has three of four
+    dark = math.exp(-1.5 * 9 * (2.0 - 0.25) / 12.0)
+    for sign, expected in ((-1.0, max(dark, 0.4)), (1.0, 1.0)):
+        depth = np.tile(5.0 + sign * across, (24, 1)).astype(np.float32)
+        assert hollow_shade(depth, 0.1)[12, 15] == pytest.approx(expected, rel=1e-4)
+
+
+def test_shades_are_those_of_the_angle_at_any_distance_from_an_eye():
+    near = np.tile(1.0 - 0.05 * np.abs(np.arange(31) - 15), (24, 1)).astype(np.float32)
+    first, second = (hollow_shade(factor * near, 0.05 * factor * near) for factor in (1.0, 3.0))
+    np.testing.assert_allclose(second, first, rtol=1e-5)
+    assert first.min() < 0.75
+
+
+def test_pixels_without_a_disc_shade_none():
+    depth = np.full((9, 9), np.inf, np.float32)
+    depth[4, 4] = 3.0
+    np.testing.assert_array_equal(hollow_shade(depth, 0.1), 1.0)
 
 
 def test_no_discs_are_an_empty_image():
