@@ -67,7 +67,7 @@ class TsdfConfig(Stage):
         high=1e6,
     )
     carve_m: float = setting(
-        20.0,
+        10.0,
         'Rays free the space up to this far from the sensor, m; beyond, only surfaces are kept; '
         '0: no space.',
         low=0.0,

@@ -63,7 +63,7 @@ Share and number of opposed voxels of a scan from which it warns.
 A hall with pose errors of 20 mm has 1 to 6 %, a wall of half a voxel 13 %.
 """
 
-FIRST_BLOCKS = 4096
+FIRST_BLOCKS = 16384
 """Blocks for which there is room at first."""
 
 FIRST_PAIRS = 4
@@ -113,6 +113,8 @@ class ScanBlocks:
 
     def only(self, kept: npt.NDArray[np.bool_]) -> ScanBlocks:
         """Return some of the blocks."""
+        if kept.all():
+            return self
         index, ends, freed = self.index[kept], self.ends[kept], self.freed[kept]
         return replace(self, index=index, ends=ends, freed=freed)
 
@@ -185,21 +187,24 @@ class PointIntegrator:
                 raise CloudFormatError(f'{name}: {len(values)}, expected {len(points)} as points')
         side, size_m = self.blocks.config.voxels_per_side, self.blocks.config.voxel_size_m
         corner = self._corner(T)
-        origin = T[:3, 3] / size_m - corner * side
-        with np.errstate(invalid='ignore'):  # points may be infinite
-            scaled = points.astype(np.float64) @ (T[:3, :3].T / size_m) + origin
+        pose = T[:3] / size_m  # from m in the frame of the sensor to voxels from the corner
+        pose[:, 3] -= corner * side
+        origin, points = pose[:, 3], np.ascontiguousarray(points, np.float64)
         solid: npt.NDArray[np.bool_] = np.ones(len(points), bool)
         if labels is not None:
             labels = checked_labels('labels', np.asarray(labels))
             solid = ~np.isin(labels, self._dynamic_labels)
-        cells = self._cells(scaled, solid, origin)
+        cells = self._cells(points, solid, pose)
         scan = self._blocks_of(cells, origin, corner)
         images = (
             NO_COLORS if colors is None else np.ascontiguousarray(colors[solid]),
             NO_LABELS if labels is None else labels[solid],
         )
-        points = scaled[solid] + corner * side if len(images[0]) + len(images[1]) else NO_POINTS
-        return self._fuse(scan, cells, (origin, corner), stamp_ns, (points, *images))
+        places: Float64 = NO_POINTS
+        if len(images[0]) + len(images[1]):
+            with np.errstate(invalid='ignore'):  # points may be infinite
+                places = points[solid] @ pose[:, :3].T + (origin + corner * side)
+        return self._fuse(scan, cells, (origin, corner), stamp_ns, (places, *images))
 
     @property
     def _carve_m(self) -> float:
@@ -228,35 +233,33 @@ class PointIntegrator:
         position: Float64 = (origin + corner * config.voxels_per_side) * config.voxel_size_m
         return position
 
-    def _cells(self, scaled: Float64, solid: npt.NDArray[np.bool_], origin: Float64) -> ScanCells:
+    def _cells(self, points: Float64, solid: npt.NDArray[np.bool_], pose: Float64) -> ScanCells:
         """Return the points by voxel; free rays end at the range up to which they free."""
-        config = self.blocks.config
-        size_m = config.voxel_size_m
-        near, far = config.min_range_m / size_m, config.max_range_m / size_m
-        offsets = scaled - origin
-        ranges = np.sqrt(np.einsum('ij,ij->i', offsets, offsets))
-        with np.errstate(invalid='ignore'):
+        near, far = self.blocks.config.min_range_m, self.blocks.config.max_range_m
+        with np.errstate(invalid='ignore', over='ignore'):
+            ranges = np.sqrt(np.einsum('ij,ij->i', points, points))
             ends = (~solid | (ranges > far)) & (ranges < np.inf) & (ranges > near)
-            lengths = np.minimum(ranges[ends], self._carve_m / size_m)
-            short = origin + offsets[ends] * (lengths / ranges[ends])[:, None]
-        surfaces = self._described(scaled if solid.all() else scaled[solid], origin, (near, far))
-        return ScanCells(
-            surfaces=surfaces, free=self._described(short, origin, (near, 1.001 * far))
-        )
+        lengths = np.minimum(ranges[ends], self._carve_m)
+        short = points[ends] * (lengths / ranges[ends])[:, None]
+        surfaces = self._described(points if solid.all() else points[solid], pose, (near, far))
+        return ScanCells(surfaces=surfaces, free=self._described(short, pose, (near, 1.001 * far)))
 
-    def _described(self, points: Float64, origin: Float64, limits: tuple[float, float]) -> Float64:
+    def _described(self, points: Float64, pose: Float64, limits: tuple[float, float]) -> Float64:
         """Return the cells of points."""
         table, rows = new_table(len(points)), (len(points), MOMENTS)
         all_keys, all_sums = np.empty(len(points), np.int64), np.empty(rows)
-        number = point_cells.merge_points(points, origin, limits, table, all_keys, all_sums)
+        number = point_cells.merge_points(points, pose, limits, table, all_keys, all_sums)
         keys, sums = all_keys[:number], all_sums[:number]
-        table, plane_keys, plane_sums = new_table(number), np.empty_like(keys), np.empty_like(sums)
-        number = point_cells.merge_cells(keys, sums, table, plane_keys, plane_sums)
-        normals = np.empty((number, 3))
-        point_cells.fit_planes(table, plane_keys[:number], plane_sums[:number], normals)
+        planes, plane_keys, plane_sums = (np.empty_like(a) for a in (keys, keys, sums))
+        table = new_table(number)
+        number = point_cells.merge_cells(keys, sums, table, planes, plane_keys, plane_sums)
+        order = np.argsort(plane_keys[:number])
+        fitted, normals = np.empty((number, 3)), np.empty((number, 3))
+        point_cells.fit_planes(plane_keys[order], plane_sums[order], fitted)
+        normals[order] = fitted
         cells = np.empty((len(keys), CELL))
         size_m = self.blocks.config.voxel_size_m
-        point_cells.describe_cells(origin, size_m, keys, sums, table, normals, cells)
+        point_cells.describe_cells(pose[:, 3].copy(), size_m, keys, sums, planes, normals, cells)
         return cells
 
     def _blocks_of(self, cells: ScanCells, origin: Float64, corner: Int64) -> ScanBlocks:

@@ -103,29 +103,32 @@ def add_moments(row, x, y, z, moved):
 
 
 @njit(cache=True, nogil=True)
-def merge_points(points, origin, limits, table, keys, sums):
+def merge_points(points, pose, limits, table, keys, sums):
     """
     Sum the moments of points by voxel.
 
-    points  (N, 3) float64
-    origin  (3,) float64, the sensor
-    limits  smallest and largest range of points that count; others and nan do not
+    points  (N, 3) float64, m in the frame of the sensor
+    pose    (3, 4) float64, from there to voxels
+    limits  smallest and largest range of points that count, m; others and nan do not
     table   (T, 2) int64, in and out: number of each cell; T more than N
     keys    (N,) int64, out: index of each cell
     sums    (N, MOMENTS) float64, out
 
     Returns the number of cells.
     """
-    number = 0
+    number, last_key, cell = 0, np.int64(EMPTY), np.int64(0)
     for p in range(len(points)):
-        x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        u, v, w = x - origin[0], y - origin[1], z - origin[2]
-        measured = math.sqrt(u * u + v * v + w * w)
-        if not limits[0] <= measured <= limits[1]:
+        u, v, w = points[p, 0], points[p, 1], points[p, 2]
+        if not limits[0] <= math.sqrt(u * u + v * v + w * w) <= limits[1]:
             continue
+        x = pose[0, 0] * u + pose[0, 1] * v + pose[0, 2] * w + pose[0, 3]
+        y = pose[1, 0] * u + pose[1, 1] * v + pose[1, 2] * w + pose[1, 3]
+        z = pose[2, 0] * u + pose[2, 1] * v + pose[2, 2] * w + pose[2, 3]
         i, j, k = math.floor(x), math.floor(y), math.floor(z)
-        last = number
-        cell, number = number_of(packed(np.int64(i), np.int64(j), np.int64(k)), table, keys, last)
+        key, last = packed(np.int64(i), np.int64(j), np.int64(k)), number
+        if key != last_key:
+            last_key = key
+            cell, number = number_of(key, table, keys, last)
         row = sums[cell]
         if number > last:
             row[:] = 0.0
@@ -144,12 +147,13 @@ def merge_points(points, origin, limits, table, keys, sums):
 
 
 @njit(cache=True, nogil=True)
-def merge_cells(keys, sums, table, plane_keys, plane_sums):
+def merge_cells(keys, sums, table, planes, plane_keys, plane_sums):
     """
     Sum the moments of cells by the larger cell that they lie in.
 
     keys, sums              of K cells of a voxel
     table                   (T, 2) int64, in and out; T more than K
+    planes                  (K,) int64, out: number of the larger cell of each
     plane_keys, plane_sums  (K,) and (K, MOMENTS), out
 
     Returns the number of larger cells.
@@ -160,6 +164,7 @@ def merge_cells(keys, sums, table, plane_keys, plane_sums):
         a, b, c = i // PLANE, j // PLANE, k // PLANE
         last = number
         into, number = number_of(packed(a, b, c), table, plane_keys, last)
+        planes[cell] = into
         if number > last:
             plane_sums[into] = 0.0
         middle = 0.5 * (PLANE - 1)
@@ -169,22 +174,25 @@ def merge_cells(keys, sums, table, plane_keys, plane_sums):
 
 
 @njit(cache=True, nogil=True)
-def fit_planes(table, keys, sums, normals):
+def fit_planes(keys, sums, normals):
     """
     Fit a plane to each cell and its neighbours.
 
-    table, keys, sums  of M cells of PLANE voxels
-    normals            (M, 3) float64, out: either sign; 0 if the points are no plane
+    keys, sums  of M cells of PLANE voxels, ascending
+    normals     (M, 3) float64, out: either sign; 0 if the points are no plane
     """
-    near = np.empty(MOMENTS)
+    near, first = np.empty(MOMENTS), np.zeros(9, np.int64)
     for cell in range(len(keys)):
         near[:] = 0.0
-        for n in range(27):
-            a, b, c = n % 3 - 1, n // 3 % 3 - 1, n // 9 - 1
-            entry = entry_of(keys[cell] + (a << 2 * INDEX_BITS) + (b << INDEX_BITS) + c, table)
-            if table[entry, 0] == EMPTY:
-                continue
-            add_moments(sums[table[entry, 1]], a * PLANE, b * PLANE, c * PLANE, near)
+        for column in range(9):
+            a, b = column % 3 - 1, column // 3 - 1
+            middle = keys[cell] + (a << 2 * INDEX_BITS) + (b << INDEX_BITS)
+            while first[column] < len(keys) and keys[first[column]] < middle - 1:
+                first[column] += 1
+            n = first[column]
+            while n < len(keys) and keys[n] <= middle + 1:
+                add_moments(sums[n], a * PLANE, b * PLANE, (keys[n] - middle) * PLANE, near)
+                n += 1
         normals[cell] = 0.0
         count = near[0]
         if count < 4.0:
@@ -204,16 +212,16 @@ def fit_planes(table, keys, sums, normals):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def describe_cells(origin, voxel_m, keys, sums, plane_table, normals, cells):
+def describe_cells(origin, voxel_m, keys, sums, planes, normals, cells):
     """
     Find mean, normal and weight of each cell.
 
-    origin       (3,) float64, the sensor
-    voxel_m      edge of a voxel, m
-    keys, sums   of K cells of a voxel
-    plane_table  of the larger cells, which have planes
-    normals      (L, 3) float64, of these
-    cells        (K, CELL) float64, out; normals point to the sensor
+    origin      (3,) float64, the sensor
+    voxel_m     edge of a voxel, m
+    keys, sums  of K cells of a voxel
+    planes      (K,) int64, number of the plane of each
+    normals     (L, 3) float64, of the planes
+    cells       (K, CELL) float64, out; normals point to the sensor
     """
     for cell in range(len(keys)):
         i, j, k = unpacked(keys[cell])
@@ -221,17 +229,14 @@ def describe_cells(origin, voxel_m, keys, sums, plane_table, normals, cells):
         x, y, z = sums[cell, 1] / count, sums[cell, 2] / count, sums[cell, 3] / count
         x, y, z = x + i + 0.5, y + j + 0.5, z + k + 0.5
         row[0], row[1], row[2] = x, y, z
-        entry = entry_of(packed(i // PLANE, j // PLANE, k // PLANE), plane_table)
         x, y, z = x - origin[0], y - origin[1], z - origin[2]
         measured = math.sqrt(x * x + y * y + z * z)
         x, y, z = x / measured, y / measured, z / measured
-        cosine, weight = 0.0, 1.0
-        if plane_table[entry, 0] != EMPTY:
-            normal = normals[plane_table[entry, 1]]
-            cosine = x * normal[0] + y * normal[1] + z * normal[2]
-            sign = -1.0 if cosine > 0.0 else 1.0
-            cosine = min(abs(cosine), 1.0 - 1e-9)
-            row[3], row[4], row[5] = sign * normal[0], sign * normal[1], sign * normal[2]
+        weight, normal = 1.0, normals[planes[cell]]
+        cosine = x * normal[0] + y * normal[1] + z * normal[2]
+        sign = -1.0 if cosine > 0.0 else 1.0
+        cosine = min(abs(cosine), 1.0 - 1e-9)
+        row[3], row[4], row[5] = sign * normal[0], sign * normal[1], sign * normal[2]
         if cosine < LEAST_COSINE:
             row[3], row[4], row[5] = -x, -y, -z
             cosine, weight = 1.0, NO_PLANE

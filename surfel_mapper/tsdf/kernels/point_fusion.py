@@ -61,7 +61,12 @@ LEAST_SHARE = 0.02
 """Least share of the weight of a cell at the ends of its cylinder."""
 
 MOST_FREED = 2
-"""A ray ends after more voxels in a row that other rays of the scan have freed."""
+"""
+A ray ends after more voxels in a row that other rays of the scan have freed.
+
+After one fewer if it begins at the range up to which rays free: there rays lie denser than at the
+surfaces behind.
+"""
 
 FADING = 4
 """Ratio of the rates at which the weight in front of a surface fades and its distance moves. A
@@ -186,7 +191,7 @@ def free_rays(cells, start, origin, limits, bits, table, keys, number, freed):
         k, tz, uz, sz, nz = walk(pz, -z, 0.0, end - near, 1)
         if number + (nx + ny + nz) // (1 << bits) + 4 > most:
             return number, cell
-        num_freed, block = 0, -1
+        num_freed, block, most_freed = 0, -1, MOST_FREED - (end == far)
         a, b, c = i >> bits, j >> bits, (k >> bits) + 1
         for _ in range(nx + ny + nz + 1):
             if i >> bits != a or j >> bits != b or k >> bits != c:
@@ -195,7 +200,7 @@ def free_rays(cells, start, origin, limits, bits, table, keys, number, freed):
             voxel = (i & mask) | (j & mask) << bits | (k & mask) << 2 * bits
             word, bit = freed[block, voxel >> 6], np.int64(1) << (voxel & 63)
             num_freed = num_freed + 1 if word & bit else 0
-            if num_freed > MOST_FREED:
+            if num_freed > most_freed:
                 break
             freed[block, voxel >> 6] = word | bit
             if tx <= ty and tx <= tz:
@@ -214,49 +219,51 @@ def free_rays(cells, start, origin, limits, bits, table, keys, number, freed):
 
 
 @njit(cache=True, nogil=True)
-def sum_cell(cell, corner, tau, bits, low, high, sums, touched, number):
+def sum_cells(grouped, cells, corner, tau, bits, sums, touched):
     """
-    Sum the distances that a cell gives to the voxels of a block.
+    Sum the distances that cells give to the voxels of a block.
 
-    cell     (CELL,) float64
+    grouped  (P,) int32, the cells that observe the block
+    cells    (K, CELL) float64
     corner   (3,) int64, index of the block's first voxel
-    low, high  (3,) int64, written
-    sums     (N, 2) float32, in and out: weighted distances, voxels, and weights
-    touched  (N,) int64, in and out: voxels that have sums
-    number   of these
+    sums     (N, 2) float32, in: 0; out: weighted distances, voxels, and weights
+    touched  (N,) int64, out: voxels that have sums
 
-    Returns the number of these afterwards.
+    Returns the number of these.
     """
-    behind = cylinder(cell, tau, low, high)
-    side = 1 << bits
-    for axis in range(3):
-        low[axis] = max(low[axis] - corner[axis], 0)
-        high[axis] = min(high[axis] - corner[axis], side - 1)
-    nx, ny, nz, full = cell[3], cell[4], cell[5], cell[WEIGHT]
-    first_x = corner[0] + 0.5 - cell[0]
-    first_y = corner[1] + 0.5 - cell[1]
-    first_z = corner[2] + 0.5 - cell[2]
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     most, per_square = DISC * DISC, EDGE / (DISC * DISC)
-    before, after = 1.0 / tau, 1.0 / behind
-    for k in range(low[2], high[2] + 1):
-        z = first_z + k
-        for j in range(low[1], high[1] + 1):
-            y = first_y + j
-            row = (j << bits) + (k << 2 * bits)
-            level, square = ny * y + nz * z, y * y + z * z
-            for i in range(low[0], high[0] + 1):
-                x = first_x + i
-                signed = nx * x + level
-                aside = x * x + square - signed * signed
-                if aside > most or signed > tau or signed < -behind:
-                    continue
-                share = 1.0 - (signed * before if signed > 0.0 else -signed * after)
-                weight = full * max(share, LEAST_SHARE) * (1.0 - aside * per_square)
-                if sums[row + i, 1] == 0.0:
-                    touched[number] = row + i
-                    number += 1
-                sums[row + i, 0] += np.float32(weight * signed)
-                sums[row + i, 1] += np.float32(weight)
+    number, side, before = 0, 1 << bits, 1.0 / tau
+    for n in range(len(grouped)):
+        cell = cells[grouped[n]]
+        behind = cylinder(cell, tau, low, high)
+        for axis in range(3):
+            low[axis] = max(low[axis] - corner[axis], 0)
+            high[axis] = min(high[axis] - corner[axis], side - 1)
+        nx, ny, nz, full = cell[3], cell[4], cell[5], cell[WEIGHT]
+        first_x = corner[0] + 0.5 - cell[0]
+        first_y = corner[1] + 0.5 - cell[1]
+        first_z = corner[2] + 0.5 - cell[2]
+        after = 1.0 / behind
+        for k in range(low[2], high[2] + 1):
+            z = first_z + k
+            for j in range(low[1], high[1] + 1):
+                y = first_y + j
+                row = (j << bits) + (k << 2 * bits)
+                level, square = ny * y + nz * z, y * y + z * z
+                for i in range(low[0], high[0] + 1):
+                    x = first_x + i
+                    signed = nx * x + level
+                    aside = x * x + square - signed * signed
+                    if aside > most or signed > tau or signed < -behind:
+                        continue
+                    share = 1.0 - (signed * before if signed > 0.0 else -signed * after)
+                    weight = full * max(share, LEAST_SHARE) * (1.0 - aside * per_square)
+                    if sums[row + i, 1] == 0.0:
+                        touched[number] = row + i
+                        number += 1
+                    sums[row + i, 0] += np.float32(weight * signed)
+                    sums[row + i, 1] += np.float32(weight)
     return number
 
 
@@ -280,16 +287,13 @@ def fuse_blocks(blocks, cells, origin, settings, voxel_m, bits, field, figures):
     grouped, cells = cells
     num_voxels, tau = field.shape[2], settings[TAU] / voxel_m
     sums, touched = np.zeros((num_voxels, 2), np.float32), np.empty(num_voxels, np.int64)
-    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     flat, block_size = field.ravel(), 2 * num_voxels
     for b in range(len(rows)):
         if b + 1 < len(rows):
             prefetch_block(flat, block_size * rows[b + 1], block_size)
         mean, total = field[rows[b], 0], field[rows[b], 1]
-        number = 0
-        for place in range(ends[b, 0], ends[b, 1]):
-            cell = cells[grouped[place]]
-            number = sum_cell(cell, corners[b], tau, bits, low, high, sums, touched, number)
+        near = grouped[ends[b, 0] : ends[b, 1]]
+        number = sum_cells(near, cells, corners[b], tau, bits, sums, touched)
         figures[b, OBSERVED], figures[b, MOVED], figures[b, SOLID] = number, 0, number
         figures[b, NEAR] = number
         for voxel in touched[:number]:
@@ -309,53 +313,42 @@ def fuse_blocks(blocks, cells, origin, settings, voxel_m, bits, field, figures):
             moved = mean[voxel] + (value - mean[voxel]) * (weight / (total[voxel] + weight))
             weight = min(total[voxel] + weight, most)
             replace(voxel, moved, weight, settings[LEAST], mean, total, figures[b])
-        for word in range(freed.shape[1]):
-            free_voxels(
-                freed[b, word],
-                64 * word,
-                corners[b],
-                origin,
-                settings,
-                voxel_m,
-                bits,
-                rates[b],
-                mean,
-                total,
-                figures[b],
-            )
+        content = mean, total, figures[b]
+        free_voxels(freed[b], corners[b], origin, settings, voxel_m, bits, rates[b], content)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def free_voxels(word, start, corner, origin, settings, voxel_m, bits, rate, mean, total, figures):
+def free_voxels(freed, corner, origin, settings, voxel_m, bits, rate, content):
     """
     Fuse that rays have crossed voxels.
 
-    word         int64, one bit for each of 64 voxels
-    start        the first of these voxels
-    mean, total  (N,) float32, in and out: distances and weights of the block
-    figures      (NUM_FOUND,) int64, in and out
+    freed    (N / 64,) int64, one bit a voxel
+    content  (mean, total, figures): (N,) float32, in and out, distances and weights of the block;
+             (NUM_FOUND,) int64, in and out
     """
+    mean, total, figures = content
     tau_m, least, mask = settings[TAU], settings[MIN_WEIGHT], (1 << bits) - 1
     keeps = np.float32(1.0) - rate
-    for n in range(64 if word else 0):
-        if word >> n & 1 == 0:
-            continue
-        voxel = start + n
-        figures[OBSERVED] += 1
-        weight = total[voxel]
-        if weight == 0.0:
-            replace(voxel, tau_m, least, settings[LEAST], mean, total, figures)
-        elif mean[voxel] < tau_m:
-            x = corner[0] + (voxel & mask) + 0.5 - origin[0]
-            y = corner[1] + (voxel >> bits & mask) + 0.5 - origin[1]
-            z = corner[2] + (voxel >> 2 * bits) + 0.5 - origin[2]
-            new = np.float32(1.0 / ((x * x + y * y + z * z) * voxel_m * voxel_m))
-            faded, moved = max(weight * keeps**FADING, least), mean[voxel]
-            if moved < 0.0:
-                moved += (tau_m - moved) * max(new / (weight + new), rate)
-            elif faded == least and rate > 0.0:
-                moved = tau_m
-            replace(voxel, moved, faded, settings[LEAST], mean, total, figures)
+    for start in range(0, 64 * len(freed), 64):
+        word = freed[start >> 6]
+        for voxel in range(start, start + 64 if word else start):
+            if word >> (voxel & 63) & 1 == 0:
+                continue
+            figures[OBSERVED] += 1
+            weight = total[voxel]
+            if weight == 0.0:
+                replace(voxel, tau_m, least, settings[LEAST], mean, total, figures)
+            elif mean[voxel] < tau_m:
+                x = corner[0] + (voxel & mask) + 0.5 - origin[0]
+                y = corner[1] + (voxel >> bits & mask) + 0.5 - origin[1]
+                z = corner[2] + (voxel >> 2 * bits) + 0.5 - origin[2]
+                new = np.float32(1.0 / ((x * x + y * y + z * z) * voxel_m * voxel_m))
+                faded, moved = max(weight * keeps**FADING, least), mean[voxel]
+                if moved < 0.0:
+                    moved += (tau_m - moved) * max(new / (weight + new), rate)
+                elif faded == least and rate > 0.0:
+                    moved = tau_m
+                replace(voxel, moved, faded, settings[LEAST], mean, total, figures)
 
 
 @njit(cache=True, nogil=True, inline='always')
