@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+import logging
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_MASK, INDEX_OFFSET, KEY
 from surfel_mapper.mapping.storage import HashTable, Slab
+from surfel_mapper.memory import machine_bytes
 from surfel_mapper.tsdf.kernels.blocks import (
     DRIFT,
     find_blocks,
@@ -51,6 +53,8 @@ from surfel_mapper.tsdf.kernels.blocks import (
 )
 from surfel_mapper.tsdf.kernels.integration import INSIDE as BEHIND
 from surfel_mapper.tsdf.kernels.integration import MOVED, SOLID
+
+logger = logging.getLogger(__name__)
 
 Int64 = npt.NDArray[np.int64]
 Float32 = npt.NDArray[np.float32]
@@ -241,16 +245,16 @@ class BlockMap(BlockArrays):
     version : int
         Number of changes so far.
     max_bytes : int
-        Limit of ``nbytes``; 0: none.
+        Limit of ``nbytes``; 0: none. Half of the memory of the machine by default.
     num_evicted : int
-        Number of blocks that left because of it.
+        Number of blocks that left, or were not added, because of it.
 
     """
 
     def __init__(self, config: TsdfConfig) -> None:
         super().__init__(config)
         self.version = 0
-        self.max_bytes = 0
+        self.max_bytes = machine_bytes() // 2
         self.num_evicted = 0
         self._hash = HashTable(MAX_DEPTH)
         self._state = self._hash.state
@@ -337,6 +341,15 @@ class BlockMap(BlockArrays):
                     raise
         return rows
 
+    def charge(self, num_bytes: int, cause: str) -> None:
+        """Raise MapLimitError if working memory for a scan is beyond ``max_bytes``."""
+        if 0 < self.max_bytes < num_bytes:
+            raise MapLimitError(
+                f'{cause}: {num_bytes} bytes of working memory, but the distance field may use '
+                f'{self.max_bytes} (map.max_bytes): use larger voxels, or smaller max_range_m, '
+                'carve_m or truncation_m'
+            )
+
     def admit(self, index: Int64, position: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """
         Make room for the blocks of a scan within ``max_bytes``; the farthest blocks leave.
@@ -367,10 +380,16 @@ class BlockMap(BlockArrays):
         number = int(ROOM_KEPT * allowed)
         reach = np.partition(every, number)[number] if number < len(every) else np.inf
         leaving = rows[apart >= reach]
-        self.num_evicted += len(leaving)
+        fit &= away < reach
+        if not self.num_evicted:
+            logger.warning(
+                'layers.tsdf: the farthest of %d blocks leave, because map.max_bytes is reached: '
+                'the field may use %d bytes',
+                *(self.num_blocks, self.max_bytes),
+            )
+        self.num_evicted += len(leaving) + int((~fit).sum())
         for first in range(0, len(leaving), PART):
             self.remove(leaving[first : first + PART])
-        fit &= away < reach
         return fit
 
     @property

@@ -34,7 +34,7 @@ from surfel_mapper.tsdf.measurements import (
     warn_of_short_truncation,
 )
 from surfel_mapper.tsdf.range_image import RangeImage
-from surfel_mapper.tsdf.selection import BlockSelection
+from surfel_mapper.tsdf.selection import BlockSelection, half_side
 
 logger = logging.getLogger(__name__)
 
@@ -110,7 +110,9 @@ class Integrator:
         """
         T = checked_pose(T_map_sensor)
         image = self._labelled(image)
-        blocks, selected = self.blocks, self._selection.blocks(image, T)
+        blocks, side = self.blocks, 2 * half_side(self.blocks.config, image) + 1
+        blocks.charge(side**3 // 4, f'an image of ranges up to {image.largest_m:g} m')
+        selected = self._selection.blocks(image, T)
         if allocate_blocks:
             fit = blocks.admit(selected.index, T[:3, 3])
         else:

@@ -66,6 +66,9 @@ A hall with pose errors of 20 mm has 1 to 6 %, a wall of half a voxel 13 %.
 FIRST_BLOCKS = 16384
 """Blocks for which there is room at first."""
 
+BLOCK_BYTES = 40
+"""Bytes of a block of a scan in table and keys: 16 for each of two entries, and 8."""
+
 FIRST_PAIRS = 4
 """Pairs of blocks and cells for which there is room at first, a cell; most cells have two."""
 
@@ -273,8 +276,11 @@ class PointIntegrator:
             number, num_pairs, start = kernels.list_pairs(
                 surfaces, start, tau, self._bits, table, keys, number, pairs, num_pairs
             )
-            if start < len(surfaces):
-                table, keys, freed = enlarged(keys[:number], freed)
+            has_blocks, has_pairs = 2 * number <= len(keys), 2 * num_pairs <= len(pairs)
+            if start < len(surfaces) and has_pairs >= has_blocks:
+                table, keys, freed = self._enlarged(keys[:number], freed)
+            if start < len(surfaces) and has_blocks >= has_pairs:
+                self.blocks.charge(2 * pairs.nbytes, f'{num_pairs} pairs of blocks and cells')
                 pairs = np.concatenate([pairs, np.empty_like(pairs)])
         limits = config.min_range_m / config.voxel_size_m, self._carve_m / config.voxel_size_m
         for rays in (surfaces, cells.free) if config.carve_m else ():
@@ -284,12 +290,21 @@ class PointIntegrator:
                     rays, start, origin, (*limits, tau), self._bits, table, keys, number, freed
                 )
                 if start < len(rays):
-                    table, keys, freed = enlarged(keys[:number], freed)
+                    table, keys, freed = self._enlarged(keys[:number], freed)
         first, grouped = np.zeros(number + 1, np.int64), np.empty(num_pairs, np.int32)
         kernels.group_pairs(pairs[:num_pairs], first, grouped)
         index = block_index(keys[:number]) + corner
         ends = np.column_stack([first[:-1], first[1:]])
         return ScanBlocks(index=index, ends=ends, grouped=grouped, freed=freed[:number])
+
+    def _enlarged(self, keys: Int64, freed: Int64) -> tuple[Int64, Int64, Int64]:
+        """Return table, keys and bits with twice the room, and the content so far."""
+        num_bytes = 2 * len(freed) * (BLOCK_BYTES + freed.strides[0])
+        self.blocks.charge(num_bytes, f'a scan that touches {len(keys)} blocks')
+        table, more, bits = new_blocks(2 * len(freed), freed.shape[1])
+        more[: len(keys)], bits[: len(freed)] = keys, freed
+        kernels.enter_keys(keys, table)
+        return table, more, bits
 
     def _fuse(
         self,
@@ -399,11 +414,3 @@ def new_blocks(number: int, words: int) -> tuple[Int64, Int64, Int64]:
     table = new_table(2 * number - 1)
     size = len(table) // 2
     return table, np.empty(size, np.int64), np.zeros((size, words), np.int64)
-
-
-def enlarged(keys: Int64, freed: Int64) -> tuple[Int64, Int64, Int64]:
-    """Return table, keys and bits with twice the room, and the content so far."""
-    table, more, bits = new_blocks(2 * len(freed), freed.shape[1])
-    more[: len(keys)], bits[: len(freed)] = keys, freed
-    kernels.enter_keys(keys, table)
-    return table, more, bits

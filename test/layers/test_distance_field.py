@@ -87,6 +87,15 @@ def test_with_when_final_scans_are_fused_as_they_leave_the_window():
     assert mapper.tsdf.mesh().vertices[:, 0].max() > 64.0
 
 
+def test_with_when_final_and_no_window_scans_are_fused_at_once():
+    mapper = mapper_with(**{'layers.tsdf.when_final': True, 'window.max_scans': 0})
+    for number in range(1, 4):
+        insert(mapper, number, (20.0 * number, 0.0, 0.0))
+        assert mapper.tsdf.summary()['scans'] == number
+        assert mapper.tsdf.summary()['waiting'] == 0
+    assert mapper.tsdf.mesh().vertices[:, 0].max() > 64.0
+
+
 def test_with_when_final_scans_of_two_lidars_at_one_time_keep_their_poses():
     mapper = mapper_with(**{'layers.tsdf.when_final': True, 'window.max_scans': 2})
     mapper.add_pose('lidar', 'rear', 0, (-40.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), static=True)

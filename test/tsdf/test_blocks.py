@@ -11,6 +11,8 @@ import pytest
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
+from surfel_mapper.layers.distance_field import DistanceField
+from surfel_mapper.memory import machine_bytes
 from surfel_mapper.tsdf.blocks import BlockMap
 
 
@@ -120,7 +122,7 @@ def test_blocks_leave_whose_centre_is_beyond_the_radius():
     assert len(blocks.evict([0.5, 0.5, 0.5])) == 0
 
 
-def test_beyond_the_limit_the_farthest_blocks_leave():
+def test_beyond_the_limit_the_farthest_blocks_leave(caplog):
     blocks = filled_along_x()  # -5 to 5
     blocks.max_bytes = 10 * blocks.block_bytes
     scan = np.array([[0, 0, 0], [0, 1, 0], [0, 2, 0], [0, 20, 0]])
@@ -128,7 +130,8 @@ def test_beyond_the_limit_the_farthest_blocks_leave():
     assert fit.tolist() == [True, True, True, False]
     blocks.place(scan[fit])
     assert left_along_x(blocks) == sorted([*range(-3, 4), 0, 0])
-    assert blocks.num_evicted == 4
+    assert blocks.num_evicted == 5  # and one of the scan was not added
+    assert [record.message.split(':')[0] for record in caplog.records] == ['layers.tsdf']
     assert blocks.num_blocks * blocks.block_bytes <= blocks.max_bytes
 
 
@@ -139,3 +142,8 @@ def test_within_the_limit_all_blocks_stay():
         assert blocks.admit(np.array([[0, 9, 0]]), np.zeros(3)).all()
         assert len(blocks.rows()) == 11
     assert blocks.num_evicted == 0
+
+
+def test_a_map_is_limited_to_half_of_the_memory_of_the_machine():
+    assert filled_along_x().max_bytes == machine_bytes() // 2
+    assert DistanceField().blocks.max_bytes == machine_bytes() // 2

@@ -125,3 +125,11 @@ def test_a_rotation_of_few_digits_is_made_orthonormal_with_a_warning(caplog):
         off[:3, :3] = scale * T[:3, :3]
         with pytest.raises(PoseError, match='not a rotation'):
             fused(image, off, voxel_size_m=0.1)
+
+
+def test_an_image_is_charged_for_its_working_memory():
+    one = integrator(**SIZES)
+    one.blocks.max_bytes = 1000  # two bits for each of 17 blocks a side are 1228 bytes
+    with pytest.raises(MapLimitError, match=r'ranges up to 4.9 m: 1228 bytes .*map\.max_bytes'):
+        one.integrate(wall(SMALL, 4.9), np.eye(4))
+    assert one.blocks.num_blocks == 0

@@ -255,6 +255,25 @@ def test_a_scan_beyond_the_limit_is_right_within_the_radius_that_fits():
     )
 
 
+@pytest.mark.parametrize(
+    ('settings', 'spread_m', 'max_bytes', 'cause'),
+    [
+        ({'carve_m': 50.0}, 45.0, 3 << 20, 'a scan that touches .* blocks'),
+        ({'carve_m': 0.0, 'truncation_m': 8.0}, 1.0, 150_000, 'pairs of blocks and cells'),
+    ],
+    ids=['free space', 'surfaces'],
+)
+def test_a_scan_is_charged_for_its_working_memory(settings, spread_m, max_bytes, cause):
+    one = integrator(max_range_m=60.0, voxel_size_m=0.05, **settings)
+    one.blocks.max_bytes = max_bytes
+    points = np.random.default_rng(4).uniform(-spread_m, spread_m, (2000, 3))
+    points[:, 0] = 30.0
+    with pytest.raises(MapLimitError, match=rf'{cause}: .*working memory.*map\.max_bytes'):
+        one.integrate(points, np.eye(4))
+    assert one.blocks.num_blocks == one.blocks.version == 0
+    assert one.integrate(points[:20], np.eye(4)).num_updated > 0
+
+
 def test_points_that_are_no_measurements_change_nothing():
     points = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [0.1, 0.1, 0.0]])
     blocks = fused(points)

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 import itertools
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +55,6 @@ from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.measurements import Integrated
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
-
-logger = logging.getLogger(__name__)
 
 IMAGE_TOLERANCE_S = 0.02
 """An image belongs to a scan if their stamps differ by no more, s: less than half an image."""
@@ -120,7 +117,6 @@ class TsdfLayer(Layer):
         self._position: npt.NDArray[np.float64] = np.zeros(3)
         self._waiting: dict[tuple[str, int], Scan] = {}
         self._num_scans = 0
-        self._has_evicted = False
 
     def follow(self, inserted: InsertedScan) -> list[Integrated]:
         """
@@ -138,7 +134,7 @@ class TsdfLayer(Layer):
         """
         if len(inserted.cleared):
             self._clear_voxels(inserted.cleared)
-        if not self.config.tsdf.when_final:
+        if not (self.config.tsdf.when_final and self.around.window.keeps_scans):
             return [self.insert(inserted.scan, inserted.T_map_sensor)]
         self._waiting[inserted.scan.frame_id, inserted.scan.stamp_ns] = inserted.scan
         return self._settle(eviction.scan for eviction in inserted.evictions)
@@ -188,14 +184,6 @@ class TsdfLayer(Layer):
         used = self.around.surfel_map.nbytes + self.around.window.nbytes
         free = limit - used - meshes - self._esdf.nbytes
         self.blocks.max_bytes = max(free, LEAST_BYTES)
-        if self.blocks.num_evicted and not self._has_evicted:
-            self._has_evicted = True
-            logger.warning(
-                'layers.tsdf: the farthest of %d blocks leave, because map.max_bytes of %d is '
-                'reached',
-                self.blocks.num_blocks,
-                limit,
-            )
 
     @property
     def field(self) -> DistanceField:
