@@ -194,11 +194,6 @@ class Colouring:
         low, high = np.percentile(values, [BEYOND, 100.0 - BEYOND])
         return cls(kind, float(low), float(max(high, low + 1e-9)))
 
-    @property
-    def has_scale(self) -> bool:
-        """Whether the colours are those of a scale of values."""
-        return self.kind not in ('normal', 'rgb', 'label')
-
     def of(self, discs: DrawnDiscs) -> npt.NDArray[np.uint8]:
         """Return the colours of discs, (K, 3)."""
         if self.kind == 'normal':
@@ -212,12 +207,6 @@ class Colouring:
             return np.asarray(PALETTE[label % len(PALETTE)], np.uint8)
         values = (value_of(discs, self.kind) - self.low) / (self.high - self.low)
         return as_bytes(ramp(values))
-
-
-def label_of(kind: str) -> str:
-    """Return the name of a value with its unit."""
-    name = kind.replace('_', ' ')
-    return f'{name} ({UNITS[kind]})' if kind in UNITS else name
 
 
 def has_value(discs: DrawnDiscs, kind: str) -> bool:

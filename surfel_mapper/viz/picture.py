@@ -10,7 +10,7 @@ bar and the squares of its ground hold anywhere. A line below states the surfels
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -20,13 +20,12 @@ import numpy.typing as npt
 from surfel_mapper.errors import escaped
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.viz.discs import Colouring, DrawnDiscs, label_of, shaded
+from surfel_mapper.viz.discs import as_bytes, DrawnDiscs, shaded
 from surfel_mapper.viz.framing import best_direction, ceiling_m, ground_m, mass_box, upright
-from surfel_mapper.viz.rendering import Camera, fitted, rendered, round_length
+from surfel_mapper.viz.rendering import Camera, fitted, Image, rendered, round_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Array = npt.NDArray[np.float64]
 
@@ -50,8 +49,8 @@ DIGIT_PX, GAP_PX = 11, 60
 TITLE_PT, TEXT_PT, LETTER = 12.0, 8.0, 0.55
 """Font sizes; that of long titles is smaller. Width of a letter relative to it."""
 
-BALL_PX, BAR_PX = 80, (220, 14)
-"""Size of the legends: a ball of all normals, a bar of values."""
+BALL_PX = 80
+"""Size of the legend, a ball of all normals."""
 
 RED, GREEN, GRID, INK = '#d62728', '#2ca02c', '#dcdfe2', '#4a5054'
 LINE, LINE_ALPHA, IN_FRONT_M = 0.25, 0.25, 0.3
@@ -67,7 +66,7 @@ class MapScene:
     R_level_map: Array
     ground_m: float
     top_m: float = np.inf
-    hidden: int = field(default=0)
+    hidden: int = 0
 
     @classmethod
     def of(cls, discs: DrawnDiscs, trajectory: Array | None = None) -> MapScene:
@@ -84,15 +83,11 @@ class MapScene:
 
     def oblique(self) -> Camera:
         """Return the oblique view."""
-        R = self._direction()
+        level = turned(self.discs, self.R_level_map)
+        R = best_direction(level, *np.array(HEIGHTS_PX) / WIDTH_PX) @ self.R_level_map
         low, high = self._box(R)
         height = WIDTH_PX * (high - low)[1] / (high - low)[0]
         return fitted(R, low, high, WIDTH_PX, int(np.clip(height, *HEIGHTS_PX)))
-
-    def _direction(self) -> Array:
-        level = turned(self.discs, self.R_level_map)
-        ends = np.array(HEIGHTS_PX) / WIDTH_PX
-        return best_direction(level, *ends) @ self.R_level_map
 
     def plan(self, height: int) -> Camera:
         """Return the plan along axes of the map, the longer side upwards."""
@@ -122,19 +117,19 @@ class MapScene:
                 return lower, higher
         return low, high
 
-    def colours(self, colouring: Colouring) -> npt.NDArray[np.uint8]:
-        """Return the colours of the discs, (K, 3); light comes from above the ground."""
-        return colouring.of(turned(self.discs, self.R_level_map, self.discs.position))
+    def rendered(self, camera: Camera) -> tuple[Image, Image]:
+        """Return the image of the discs and its depth; light comes from above the ground."""
+        colours = as_bytes(shaded(self.discs.normal @ self.R_level_map.T))
+        return rendered(camera, self.discs, colours)
 
     def left_out(self, camera: Camera) -> int:
         """Return the number of discs beyond a view."""
         return len(self.discs) - int(camera.contains(self.discs.position).sum())
 
 
-def turned(discs: DrawnDiscs, R: Array, position: Array | None = None) -> DrawnDiscs:
-    """Return discs in another frame, or at positions with normals of another frame."""
-    position = discs.position @ R.T if position is None else position
-    return DrawnDiscs(position, discs.normal @ R.T, discs.radius_m, discs.values)
+def turned(discs: DrawnDiscs, R: Array) -> DrawnDiscs:
+    """Return discs in another frame."""
+    return DrawnDiscs(discs.position @ R.T, discs.normal @ R.T, discs.radius_m, discs.values)
 
 
 def draw_map(
@@ -143,7 +138,6 @@ def draw_map(
     title: str = '',
     *,
     trajectory: Array | None = None,
-    colouring: str = 'normal',
     origin_m: npt.ArrayLike = (0.0, 0.0, 0.0),
 ) -> None:
     """
@@ -159,16 +153,12 @@ def draw_map(
         Title above the picture.
     trajectory : (S, 3) float64, m, optional
         Positions of the sensor; drawn as a line from start to end.
-    colouring : str
-        One of discs.COLOURINGS.
     origin_m : (3,) float64, m
         Origin of the map in the fixed frame, ``SurfelMap.origin_m``; the plan has the coordinates
         of the fixed frame.
 
     Raises
     ------
-    ConfigError
-        If there is no such colouring.
     FileFormatError
         If the file cannot be written.
 
@@ -178,27 +168,24 @@ def draw_map(
 
     origin = np.asarray(origin_m, np.float64)
     scene = MapScene.of(DrawnDiscs.of(surfels), trajectory)
-    colours = Colouring.over(colouring, [scene.discs])
     oblique = scene.oblique()
     plan = scene.plan(oblique.height)
-    labels = BETWEEN + DIGIT_PX * digits_of(plan, origin)
-    width = BORDER + oblique.width + labels + plan.width + BORDER
-    height = ABOVE + oblique.height + BELOW
+    left = BORDER + oblique.width + BETWEEN + DIGIT_PX * digits_of(plan, origin)
+    width, height = left + plan.width + BORDER, ABOVE + oblique.height + BELOW
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     FigureCanvasAgg(figure)
-    ax = axes_at(figure, BORDER, BELOW, oblique.width, oblique.height)
-    draw_oblique(ax, scene, oblique, colours)
-    draw_key(figure, scene, oblique, colours)
-    ax = axes_at(figure, BORDER + oblique.width + labels, BELOW, plan.width, plan.height)
-    draw_plan(ax, scene, plan, colours, origin)
+    page = figure.add_axes((0.0, 0.0, 1.0, 1.0), zorder=2)
+    page.set(xlim=(0, width), ylim=(0, height))
+    page.axis('off')
+    draw_oblique(page, scene, oblique)
+    draw_plan(page, scene, plan, origin, left)
+    draw_key(page, scene, oblique)
     # a name of a file may be no text, or hold dollar signs
     write: dict[str, Any] = {'parse_math': False, 'color': INK}
     points = 72.0 * (width - 40) / DPI / (LETTER * max(len(escaped(title)), 1))
-    at = BORDER / width, 1.0 - 20 / height
     size = min(TITLE_PT, points)
-    figure.text(*at, escaped(title), fontsize=size, va='top', **write)
-    note = left_out(scene, oblique, plan)
-    figure.text(BORDER / width, 20 / height, note, fontsize=TEXT_PT, va='bottom', **write)
+    page.text(BORDER, height - 20, escaped(title), fontsize=size, va='top', **write)
+    page.text(BORDER, 20, left_out(scene, oblique, plan), fontsize=TEXT_PT, va='bottom', **write)
     with replace_file(path) as file:
         figure.savefig(file, format='png', dpi=DPI, pil_kwargs={'compress_level': 3})
 
@@ -217,26 +204,23 @@ def left_out(scene: MapScene, oblique: Camera, plan: Camera) -> str:
     return text + '; those that face away are not drawn.'
 
 
-def axes_at(figure: Figure, left: int, bottom: int, width: int, height: int) -> Axes:
-    """Return axes of a size in pixels."""
-    whole = figure.get_size_inches() * DPI
-    return figure.add_axes(
-        (left / whole[0], bottom / whole[1], width / whole[0], height / whole[1])
-    )
-
-
-def draw_oblique(ax: Axes, scene: MapScene, camera: Camera, colouring: Colouring) -> None:
+def draw_oblique(page: Axes, scene: MapScene, camera: Camera) -> None:
     """Draw the discs, the squares of the ground and the trajectory."""
-    low, high = camera.limits
-    image, depth = rendered(camera, scene.discs, scene.colours(colouring))
+    from matplotlib.patches import Rectangle
+
+    image, depth = scene.rendered(camera)
     line = ground_lines(scene, camera, depth)[..., None]
-    image[..., :3] = image[..., :3] * image[..., 3:] + 1.0 - image[..., 3:]
-    image[..., :3] += line * (LINE - image[..., :3])
-    extent = (low[0], high[0], low[1], high[1])
-    ax.imshow(image[..., :3], extent=extent, interpolation='nearest', aspect='auto')
-    draw_way(ax, camera.projected(scene.trajectory))
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xticks=[], yticks=[])
-    ax.spines[:].set_color(GRID)
+    shown = image[..., :3] * image[..., 3:] + 1.0 - image[..., 3:]
+    place_image(page, shown + line * (LINE - shown), BORDER, BELOW)
+    frame = Rectangle((BORDER, BELOW), camera.width, camera.height, fill=False, edgecolor=GRID)
+    page.add_patch(frame)
+    draw_way(page, scene.trajectory, camera, BORDER)
+
+
+def place_image(page: Axes, image: npt.NDArray[Any], left: int, bottom: int) -> None:
+    """Place an image with its lower left corner at a pixel of the page, without resampling."""
+    figure: Any = page.figure
+    figure.figimage(as_bytes(image), left, bottom, origin='upper', zorder=1)
 
 
 def square_m(camera: Camera) -> float:
@@ -244,9 +228,7 @@ def square_m(camera: Camera) -> float:
     return round_length(camera.width / camera.px_per_m / 8.0)
 
 
-def ground_lines(
-    scene: MapScene, camera: Camera, depth: npt.NDArray[np.float32]
-) -> npt.NDArray[np.float32]:
+def ground_lines(scene: MapScene, camera: Camera, depth: Image) -> Image:
     """Return how strongly each pixel shows the lines of the squares of the ground, (H, W)."""
     R = camera.R_view_map @ scene.R_level_map.T
     low, high = camera.limits
@@ -267,52 +249,46 @@ def ground_lines(
     return np.where(within, LINE_ALPHA * lines, 0.0).astype(np.float32)
 
 
-def draw_key(figure: Figure, scene: MapScene, camera: Camera, colouring: Colouring) -> None:
+def draw_key(page: Axes, scene: MapScene, camera: Camera) -> None:
     """Draw scale bar, axes and the meaning of the colours below the oblique view."""
-    ax = axes_at(figure, BORDER, NOTE_PX, camera.width, BELOW - NOTE_PX)
-    ax.set(xlim=(0, camera.width), ylim=(0, BELOW - NOTE_PX))
-    ax.axis('off')
     text: dict[str, Any] = {'fontsize': TEXT_PT, 'color': INK, 'va': 'center'}
-    side = square_m(camera)
-    ax.plot([4, 4 + side * camera.px_per_m], [66, 66], color=INK, linewidth=2.5)
-    ax.text(4, 36, f'{side:g} m, a square of the ground', **text)
-    for name, axis in zip('xyz', camera.R_view_map[:2].T, strict=True):
-        arrow = {'arrowstyle': '->', 'color': INK, 'shrinkA': 0.0, 'shrinkB': 0.0}
-        right, up = axis
-        ax.annotate('', (450 + 36 * right, 46 + 36 * up), (450, 46), arrowprops=arrow)
-        ax.text(450 + 48 * right, 46 + 48 * up, name, ha='center', **text)
-    draw_legend(figure, scene, camera, colouring)
-    at = camera.width - BALL_PX - 12, 46 if colouring.kind == 'normal' else 78
-    ax.text(*at, label_of(colouring.kind), ha='right', **text)
+    side, left, low = square_m(camera), BORDER + 4, NOTE_PX
+    page.plot([left, left + side * camera.px_per_m], [low + 66] * 2, color=INK, linewidth=2.5)
+    page.text(left, low + 36, f'{side:g} m, a square of the ground', **text)
+    arrow = {'arrowstyle': '->', 'color': INK, 'shrinkA': 0.0, 'shrinkB': 0.0}
+    x, y = BORDER + 450, low + 46
+    for name, (right, up) in zip('xyz', camera.R_view_map[:2].T.tolist(), strict=True):
+        page.annotate('', (x + 36 * right, y + 36 * up), (x, y), arrowprops=arrow)
+        page.text(x + 48 * right, y + 48 * up, name, ha='center', **text)
+    edge = BORDER + camera.width - BALL_PX
+    across, along = np.meshgrid(np.linspace(-1.0, 1.0, BALL_PX), np.linspace(1.0, -1.0, BALL_PX))
+    near = np.sqrt(np.maximum(1.0 - across**2 - along**2, 0.0))
+    normal = np.stack([across, along, near], axis=-1) @ camera.R_view_map @ scene.R_level_map.T
+    place_image(page, np.dstack([shaded(normal), near > 0.0]), edge, low + 8)
+    page.text(edge - 12, low + 46, 'normal', ha='right', **text)
     if len(scene.trajectory):
-        draw_way(ax, np.full((min(len(scene.trajectory), 2), 2), -99.0))
-        key = ax.legend(
-            fontsize=TEXT_PT, loc='center left', bbox_to_anchor=(520 / camera.width, 0.5), ncols=3
-        )
-        key.set_frame_on(False)
+        width, height = page.get_xlim()[1], page.get_ylim()[1]
+        at = (BORDER + 520) / width, (low + 50) / height
+        page.legend(fontsize=TEXT_PT, loc='center left', bbox_to_anchor=at, ncols=3, frameon=False)
 
 
-def draw_plan(
-    ax: Axes, scene: MapScene, camera: Camera, colouring: Colouring, origin_m: Array
-) -> None:
+def draw_plan(page: Axes, scene: MapScene, camera: Camera, origin_m: Array, left: int) -> None:
     """Draw the discs from above, with the coordinates of the fixed frame and equal ticks."""
     from matplotlib.ticker import MultipleLocator
 
-    image, _ = rendered(camera, scene.discs, scene.colours(colouring))
-    corners, way = np.stack(camera.limits), camera.projected(scene.trajectory)
-    names = []
+    figure: Any = page.figure
+    page_px = 2 * tuple(figure.get_size_inches() * DPI)
+    ax = figure.add_axes(np.divide((left, BELOW, camera.width, camera.height), page_px))
+    place_image(page, scene.rendered(camera)[0], left, BELOW)
+    draw_way(page, scene.trajectory, camera, left)
+    corners, names = np.stack(camera.limits), []
     for column, axis in enumerate((ax.xaxis, ax.yaxis)):
         row = camera.R_view_map[column]
         number = int(np.abs(row).argmax())
         corners[:, column] = row[number] * corners[:, column] + origin_m[number]
-        way[:, column] = row[number] * way[:, column] + origin_m[number]
         axis.set_major_locator(MultipleLocator(tick_step(camera, origin_m)))
         names.append(f'{"xyz"[number]} (m)')
-    extent = (*corners[:, 0], *corners[:, 1])
-    ax.imshow(image, extent=extent, interpolation='nearest', aspect='auto', zorder=2)
-    draw_way(ax, way)
     ax.set(xlim=corners[:, 0], ylim=corners[:, 1])
-    ax.set_axisbelow(True)
     ax.grid(visible=True, color=GRID, linewidth=0.6)
     ax.spines[:].set_color(GRID)
     ax.tick_params(labelsize=TEXT_PT, colors=INK, length=0.0)
@@ -321,43 +297,26 @@ def draw_plan(
     ax.ticklabel_format(useOffset=False, style='plain')
 
 
-def draw_way(ax: Axes, way: Array) -> None:
-    """Draw a trajectory, (S, 2) in the units of the axes, with its start and its end."""
-    if not len(way):
+def draw_way(page: Axes, trajectory: Array, camera: Camera, left: int) -> None:
+    """Draw a trajectory, (S, 3) m, with its start and its end, on the view at a column."""
+    from matplotlib.transforms import Bbox
+
+    if not len(trajectory):
         return
-    dots: dict[str, Any] = {
-        'zorder': 4,
-        'linestyle': '',
-        'markeredgecolor': 'white',
-        'markeredgewidth': 0.8,
-    }
+    corner = np.array([left, BELOW])
+    way = (camera.projected(trajectory) - camera.limits[0]) * camera.px_per_m + corner
+    dots: dict[str, Any] = {'zorder': 4, 'linestyle': '', 'markeredgecolor': 'white'}
+    name, drawn = 'sensor', []
     if len(way) > 1:
-        ax.plot(*way.T, color='white', linewidth=3.0, zorder=3)
-        ax.plot(*way.T, color=RED, linewidth=1.5, zorder=3, label='trajectory')
-        ax.plot(*way[:1].T, marker='o', color=GREEN, markersize=7.0, label='start', **dots)
-    name = 'end' if len(way) > 1 else 'sensor'
-    ax.plot(*way[-1:].T, marker='s', color=RED, markersize=6.0, label=name, **dots)
-
-
-def draw_legend(figure: Figure, scene: MapScene, camera: Camera, colouring: Colouring) -> None:
-    """Draw a ball with the colours of all normals, or a bar with those of all values."""
-    right = BORDER + camera.width
-    if colouring.kind == 'normal':
-        ax = axes_at(figure, right - BALL_PX, NOTE_PX + 8, BALL_PX, BALL_PX)
-        x, y = np.meshgrid(np.linspace(-1.0, 1.0, BALL_PX), np.linspace(1.0, -1.0, BALL_PX))
-        z = np.sqrt(np.maximum(1.0 - x * x - y * y, 0.0))
-        ball = shaded(np.stack([x, y, z], axis=-1) @ camera.R_view_map @ scene.R_level_map.T)
-        ax.imshow(np.dstack([ball, x * x + y * y <= 1.0]), interpolation='nearest')
-        ax.axis('off')
-    elif colouring.has_scale:
-        from matplotlib.cm import ScalarMappable
-        from matplotlib.colors import Normalize
-
-        ax = axes_at(figure, right - BAR_PX[0] - 16, NOTE_PX + 42, *BAR_PX)
-        values = ScalarMappable(Normalize(colouring.low, colouring.high), 'viridis')
-        figure.colorbar(values, cax=ax, orientation='horizontal')
-        ax.tick_params(labelsize=TEXT_PT, colors=INK)
-        ax.locator_params(nbins=4)
+        name = 'end'
+        drawn += page.plot(*way.T, color='white', linewidth=3.0)
+        drawn += page.plot(*way.T, color=RED, linewidth=1.5, label='trajectory')
+        drawn += page.plot(*way[:1].T, 'o', color=GREEN, markersize=7.0, label='start', **dots)
+    drawn += page.plot(*way[-1:].T, 's', color=RED, markersize=6.0, label=name, **dots)
+    for line in drawn:
+        line.set_clip_box(Bbox.from_bounds(left, BELOW, camera.width, camera.height))
+        if left != BORDER:
+            line.set_label('_')  # the key has each name once
 
 
 def digits_of(camera: Camera, origin_m: Array) -> int:

@@ -143,12 +143,10 @@ def rendered(
     rows, facing = facing_discs(camera, discs)
     opaque = np.ones(len(rows), np.uint8)
     painting.paint(facing, np.column_stack([colours[rows], opaque]).astype('f4'), depth, image)
-    weight = image[..., 3:]
-    image[..., :3] /= np.maximum(255.0 * weight, 1e-6)
-    np.greater(weight, 0.0, out=weight)
+    image /= np.maximum(image[..., 3:], 1e-6)  # the last channel becomes 1 or 0
     image = np.asarray(image[::FINER] + image[1::FINER])
     image = np.asarray(image[:, ::FINER] + image[:, 1::FINER])
-    image[..., :3] /= np.maximum(image[..., 3:], 1.0)
+    image[..., :3] /= 255.0 * np.maximum(image[..., 3:], 1.0)
     image[..., 3] /= FINER**2
     depth = depth[::FINER, ::FINER]
     unit_m = depth / camera.px_per_m if camera.eye_m is not None else 1.0 / camera.px_per_m

@@ -8,9 +8,9 @@ import numpy as np
 from PIL import Image
 import pytest
 
-from surfel_mapper.errors import ConfigError, FileFormatError
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.mapping.surfels import concatenated, Surfels
-from surfel_mapper.viz.discs import Colouring, DrawnDiscs, shaded
+from surfel_mapper.viz.discs import DrawnDiscs, shaded
 from surfel_mapper.viz.picture import (
     draw_map,
     ground_lines,
@@ -19,8 +19,8 @@ from surfel_mapper.viz.picture import (
     square_m,
 )
 
-YELLOW, PURPLE = np.array([[0.993, 0.906, 0.144], [0.267, 0.005, 0.329]])
-"""Both ends of viridis, the colours of planarity 1 and 0."""
+GROUND = np.rint(255.0 * shaded(np.array([0.0, 0.0, 1.0]))) / 255.0
+"""Colour of level ground."""
 
 
 def sheet(height_m, up, planarity, size_m=(20.0, 10.0), centre=(0.0, 0.0)):
@@ -46,7 +46,7 @@ def sheet(height_m, up, planarity, size_m=(20.0, 10.0), centre=(0.0, 0.0)):
 
 
 def drawn(tmp_path, surfels, **options):
-    draw_map(surfels, tmp_path / 'map.png', **{'colouring': 'planarity', **options})
+    draw_map(surfels, tmp_path / 'map.png', **options)
     return np.asarray(Image.open(tmp_path / 'map.png').convert('RGB')) / 255.0
 
 
@@ -59,9 +59,10 @@ def scene_of(*sheets, trajectory=None):
 
 
 def test_a_ceiling_does_not_hide_the_floor(tmp_path):
-    image = drawn(tmp_path, concatenated([sheet(0.0, 1.0, 1.0), sheet(5.0, -1.0, 0.0)]))
+    floor, ceiling = sheet(0.0, 1.0, 1.0), sheet(5.0, -1.0, 0.0)
+    image = drawn(tmp_path, concatenated([floor, ceiling]))
 
-    assert num_pixels(image, YELLOW) > 10 * num_pixels(image, PURPLE)
+    assert num_pixels(image, GROUND) == num_pixels(drawn(tmp_path, floor), GROUND) > 100_000
 
 
 def test_a_lamp_below_the_ceiling_is_cut_away_with_it():
@@ -78,13 +79,10 @@ def test_a_lamp_below_the_ceiling_is_cut_away_with_it():
 def test_level_ground_is_of_one_colour_whatever_its_planarity(tmp_path):
     sheets = sheet(0.0, 1.0, 1.0)
     stripes = np.arange(len(sheets)) % 2.0
-    striped = dataclasses.replace(sheets, planarity=stripes)
+    image = drawn(tmp_path, dataclasses.replace(sheets, planarity=stripes))
 
-    image = drawn(tmp_path, striped, colouring='normal')
-    assert np.array_equal(image, drawn(tmp_path, sheets, colouring='normal'))
-    expected = np.rint(255.0 * shaded(np.array([0.0, 0.0, 1.0]))) / 255.0
-    assert num_pixels(image, expected) > 100_000
-    assert num_pixels(drawn(tmp_path, striped), expected) == 0
+    assert np.array_equal(image, drawn(tmp_path, sheets))
+    assert num_pixels(image, GROUND) > 100_000
 
 
 def test_light_is_that_of_the_level_frame(tmp_path):
@@ -92,15 +90,17 @@ def test_light_is_that_of_the_level_frame(tmp_path):
     R = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     level = sheet(0.0, 1.0, 1.0)
     camera = dataclasses.replace(level, position=level.position @ R.T, normal=level.normal @ R.T)
-    expected = np.rint(255.0 * shaded(np.array([0.0, 0.0, 1.0]))) / 255.0
 
-    assert num_pixels(drawn(tmp_path, camera, colouring='normal'), expected) > 100_000
+    assert num_pixels(drawn(tmp_path, camera), GROUND) > 100_000
 
 
 def test_a_roof_hides_the_ground(tmp_path):
-    image = drawn(tmp_path, concatenated([sheet(0.0, 1.0, 1.0), sheet(5.0, 1.0, 0.0)]))
+    roof = sheet(5.0, 1.0, 1.0)
+    roof.normal[:] = 0.6, 0.0, 0.8
+    floor = sheet(0.0, 1.0, 1.0)
+    open_air, roofed = (drawn(tmp_path, s) for s in (floor, concatenated([floor, roof])))
 
-    assert num_pixels(image, PURPLE) > 3 * num_pixels(image, YELLOW)
+    assert num_pixels(roofed, GROUND) < 0.5 * num_pixels(open_air, GROUND)
 
 
 def test_the_plan_has_the_longer_side_upwards_and_is_no_mirror_image():
@@ -136,7 +136,7 @@ def test_most_of_a_picture_is_the_map_although_a_few_surfels_are_far(tmp_path):
     assert scene.left_out(plan) == 1 <= outside < 0.05 * len(near)
     assert f'are {outside} on the left, 1 on the right' in left_out(scene, oblique, plan)
     image = drawn(tmp_path, concatenated([near, far]))
-    assert num_pixels(image, YELLOW) > 0.25 * image[..., 0].size
+    assert num_pixels(image, GROUND) > 0.25 * image[..., 0].size
 
 
 def test_a_trajectory_beyond_the_map_is_in_view_or_the_note_says_so():
@@ -180,31 +180,13 @@ def test_squares_of_the_ground_lie_on_it_and_behind_all_that_stands_on_it():
         assert ((strength > 0.1) == (on_line & is_seen)).all()
 
 
-@pytest.mark.parametrize('colouring', ['height', 'num_scans'])
-def test_every_column_colours_the_map(tmp_path, colouring):
-    rng = np.random.default_rng(1)
-    surfels = sheet(0.0, 1.0, 1.0)
-    surfels = dataclasses.replace(
-        surfels,
-        thickness=rng.uniform(0.0, 0.1, len(surfels)),
-        num_scans=rng.integers(1, 9, len(surfels)),
-    )
-    assert np.ptp(drawn(tmp_path, surfels, colouring=colouring), axis=2).max() > 0.2
-    assert Colouring.over(colouring, [DrawnDiscs.of(surfels)]).has_scale
-
-
-def test_an_unknown_colouring_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match='colouring'):
-        drawn(tmp_path, sheet(0.0, 1.0, 1.0), colouring='mood')
-
-
 def test_surfels_without_a_normal_are_left_out(tmp_path):
     odd = sheet(1.0, 1.0, np.nan)
     odd.normal[:] = np.nan
 
     image = drawn(tmp_path, concatenated([sheet(0.0, 1.0, 1.0), odd]))
 
-    assert num_pixels(image, YELLOW) > 10_000
+    assert num_pixels(image, GROUND) > 10_000
 
 
 @pytest.mark.parametrize('num', [0, 1])
