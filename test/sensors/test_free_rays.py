@@ -96,6 +96,7 @@ def test_infinite_points_free_the_space_before_them_and_missing_ones_do_not(noth
                 'layers.tsdf.voxel_size_m': 0.2,
                 'layers.tsdf.truncation_m': 0.6,
                 'layers.tsdf.max_range_m': 20.0,
+                'layers.tsdf.carve_m': 20.0,
             }
         )
     )
@@ -124,6 +125,7 @@ def test_rays_without_a_return_are_deskewed_by_the_time_of_their_column(threads,
         'layers.tsdf.voxel_size_m': 0.2,
         'layers.tsdf.truncation_m': 0.6,
         'layers.tsdf.max_range_m': 20.0,
+        'layers.tsdf.carve_m': 20.0,
     }
     mapper = Mapper(Config.from_mapping(settings))
     scan, rays = organised(np.inf, PATCH, transpose=transpose)

@@ -61,12 +61,7 @@ LEAST_SHARE = 0.02
 """Least share of the weight of a cell at the ends of its cylinder."""
 
 MOST_FREED = 2
-"""
-A ray ends after more voxels in a row that other rays of the scan have freed.
-
-After one fewer if it begins at the range up to which rays free: there rays lie denser than at the
-surfaces behind.
-"""
+"""A ray ends after more voxels in a row that other rays of the scan have freed."""
 
 FADING = 4
 """Ratio of the rates at which the weight in front of a surface fades and its distance moves. A
@@ -191,7 +186,7 @@ def free_rays(cells, start, origin, limits, bits, table, keys, number, freed):
         k, tz, uz, sz, nz = walk(pz, -z, 0.0, end - near, 1)
         if number + (nx + ny + nz) // (1 << bits) + 4 > most:
             return number, cell
-        num_freed, block, most_freed = 0, -1, MOST_FREED - (end == far)
+        num_freed, block = 0, -1
         a, b, c = i >> bits, j >> bits, (k >> bits) + 1
         for _ in range(nx + ny + nz + 1):
             if i >> bits != a or j >> bits != b or k >> bits != c:
@@ -200,7 +195,7 @@ def free_rays(cells, start, origin, limits, bits, table, keys, number, freed):
             voxel = (i & mask) | (j & mask) << bits | (k & mask) << 2 * bits
             word, bit = freed[block, voxel >> 6], np.int64(1) << (voxel & 63)
             num_freed = num_freed + 1 if word & bit else 0
-            if num_freed > most_freed:
+            if num_freed > MOST_FREED:
                 break
             freed[block, voxel >> 6] = word | bit
             if tx <= ty and tx <= tz:
