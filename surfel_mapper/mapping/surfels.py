@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 import logging
+import math
 from pathlib import Path
 from typing import Any, NamedTuple, overload
 
@@ -37,7 +38,21 @@ GOOD_THICKNESS_M, GOOD_SIGMA_RAD, GOOD_SCANS = 0.028, 0.13, 3
 one of two surfaces only: of its surfels within the first two limits up to 19 % are off by more
 than 10 deg."""
 
+NOISE_SQ = 0.01**2
+"""Smallest variance of points about their plane that normal_sigma assumes, m^2: also a thin surfel
+has the errors of range and pose that its points share."""
+
+REPEATED = 3.0
+"""Number of points that count as one for normal_sigma, as points side by side share errors: in
+one-plane voxels of a hall it is then within a factor of two of the measured angle."""
+
+RIGHT_ANGLE = math.pi / 2.0
+"""Largest normal_sigma, rad: the normal is undetermined."""
+
 Columns = dict[str, npt.NDArray[Any]]
+
+Quality = tuple[npt.NDArray[np.float64], ...]
+"""Thickness, normal_sigma and radius, (K,) each."""
 
 
 class OneSurfel(NamedTuple):
@@ -55,6 +70,41 @@ class OneSurfel(NamedTuple):
     radius: float
     num_scans: int
     size: float
+
+
+class QualityColumn:
+    """
+    A column of Surfels that follows from eigenvalues and counts.
+
+    Its first reading derives all three, which most callers never read. Only operations that every
+    machine rounds alike are used.
+
+    Source: Anderson 1963 (Asymptotic theory for principal component analysis) for the standard
+    error of an eigenvector.
+    """
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def __get__(self, surfels: Surfels, owner: type[Surfels]) -> npt.NDArray[np.float64]:
+        """Return the column, (K,)."""
+        quality = surfels.quality
+        if quality is None:
+            e0, e1, e2 = np.ascontiguousarray(surfels.eigenvalues.T)
+            n = surfels.num_points.astype(np.float64)
+            is_determined = n > 3.0  # three parameters of a plane
+            with np.errstate(divide='ignore', invalid='ignore'):
+                variance = np.where(is_determined, e0 * (n - 1.0) / (n - 3.0), np.nan)
+                noise_sq = np.fmax(variance, NOISE_SQ)
+                first, second = e1 - noise_sq, e2 - noise_sq
+                first_sq, second_sq = first * first, second * second
+                spread = REPEATED * noise_sq * (e1 * second_sq + e2 * first_sq)
+                sigma = np.sqrt(spread / ((n - 1.0) * (first_sq * second_sq)))
+                sigma = np.where((first > 0.0) & (sigma < RIGHT_ANGLE), sigma, RIGHT_ANGLE)
+                sigma = np.where(is_determined & (e2 > 0.0), sigma, np.nan)
+                quality = np.sqrt(variance), sigma, np.sqrt(2.0 * (e1 + e2))
+            object.__setattr__(surfels, 'quality', quality)
+        return quality[self._number]
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -103,6 +153,8 @@ class Surfels:
         Covariance of the points, xx xy xz yy yz zz, if asked for.
     channels : mapping of str to (K,) float64
         Means of the channels of the map: ``intensity``; ``red``, ``green``, ``blue`` in 0 to 255.
+    quality : tuple of (K,) float64, optional
+        thickness, normal_sigma and radius, if known without the eigenvalues.
 
     Examples
     --------
@@ -127,11 +179,13 @@ class Surfels:
     voxel_index: npt.NDArray[np.int32]
     num_scans: npt.NDArray[np.int64]
     size: npt.NDArray[np.float64]
-    thickness: npt.NDArray[np.float64]
-    normal_sigma: npt.NDArray[np.float64]
-    radius: npt.NDArray[np.float64]
     covariance: npt.NDArray[np.float64] | None = None
     channels: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
+    quality: Quality | None = None
+
+    thickness = QualityColumn(0)
+    normal_sigma = QualityColumn(1)
+    radius = QualityColumn(2)
 
     @classmethod
     def from_message(cls, msg: Any) -> Surfels:
@@ -340,15 +394,16 @@ class Surfels:
             **arrays,
             covariance=None if self.covariance is None else self.covariance[rows],
             channels={name: values[rows] for name, values in self.channels.items()},
+            quality=self.quality and tuple([values[rows] for values in self.quality]),
         )
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """All arrays but covariance and channels, in the order of declaration."""
+        """All arrays but covariance, channels and quality, in the order of declaration."""
         return tuple([getattr(self, name) for name in ARRAYS])
 
 
-ARRAYS = tuple(f.name for f in fields(Surfels) if f.name not in ('covariance', 'channels'))
+ARRAYS = tuple([f.name for f in fields(Surfels)][:-3])
 """Names of the arrays that all surfels have."""
 
 
@@ -360,6 +415,9 @@ def concatenated(tables: Sequence[Surfels]) -> Surfels:
     covariances = [table.covariance for table in tables if table.covariance is not None]
     if len(covariances) == len(tables):
         columns['covariance'] = np.concatenate(covariances)
+    if any(table.quality for table in tables):
+        qualities = [(table.thickness, table.normal_sigma, table.radius) for table in tables]
+        columns['quality'] = tuple(map(np.concatenate, zip(*qualities, strict=True)))
     channels = {
         name: np.concatenate([table.channels[name] for table in tables])
         for name in tables[0].channels
@@ -410,24 +468,11 @@ def derive(
     )
     covariances = np.empty((num if covariance else 0, 6))
     size = np.broadcast_to(voxel_size_m, num)  # of eight bytes
-    shape = np.empty(num), np.empty(num), np.empty(num)
     if num:  # readers of files import this module, and need no compiler
-        from surfel_mapper.mapping.kernels.surfels import derive_quality, derive_surfels
+        from surfel_mapper.mapping.kernels.surfels import derive_surfels
 
         derive_surfels(*slabs, chosen, voxel_size_m, bits, (*arrays, covariances))
-        derive_quality(arrays[4], arrays[5], shape)
-    return Surfels(*arrays, size, *shape, covariance=covariances if covariance else None)
-
-
-def quality(
-    eigenvalues: npt.NDArray[np.float64], num_points: npt.NDArray[np.int64]
-) -> dict[str, Any]:
-    """Return thickness, normal_sigma and radius of eigenvalues (K, 3) and counts (K,)."""
-    from surfel_mapper.mapping.kernels.surfels import derive_quality
-
-    columns: dict[str, Any] = {name: np.empty(len(num_points)) for name in QUALITY[:3]}
-    derive_quality(eigenvalues, num_points, tuple(columns.values()))
-    return columns
+    return Surfels(*arrays, size, covariance=covariances if covariance else None)
 
 
 def surfel_columns(surfels: Surfels) -> Columns:

@@ -27,7 +27,7 @@ from surfel_mapper.errors import CloudFormatError, MapError
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import check_possible, pack_keys, ScanMoments, within_reach
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import COVARIANCE, surfel_columns, Surfels
+from surfel_mapper.mapping.surfels import COVARIANCE, QUALITY, surfel_columns, Surfels
 from surfel_mapper.messages.pointcloud2 import (
     append_fields,
     CloudBytes,
@@ -126,9 +126,7 @@ def surfels_in(msg: Any) -> Surfels:
         eigenvalues=np.full((len(count), 3), np.nan),
         num_points=count,
         voxel_index=np.stack([columns.get(name, unknown) for name in VOXEL], axis=1),
-        thickness=columns.get('thickness', nan).astype(np.float64),
-        normal_sigma=columns.get('normal_sigma', nan).astype(np.float64),
-        radius=columns.get('radius', nan).astype(np.float64),
+        quality=tuple([columns.get(name, nan).astype(np.float64) for name in QUALITY[:3]]),
         num_scans=columns.get('num_scans', np.zeros(len(count))).astype(np.int64),
         size=columns.get('size', nan).astype(np.float64),
         covariance=stacked(COVARIANCE) if columns.keys() >= {*COVARIANCE} else None,

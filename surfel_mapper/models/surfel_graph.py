@@ -25,7 +25,7 @@ from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.kernels.layout import INDEX_BITS
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import quality, Surfels
+from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.kernels.surfel_classes import (
     classify,
     classify_sparse,
@@ -208,7 +208,7 @@ class SurfelGraph:
     def surfels(self) -> Surfels:
         """Return all voxels as surfels, in the order of their rows."""
         rows = np.flatnonzero(self.key >= 0)
-        eigenvalues, num_points = self.eigenvalues[rows], self.count[rows]
+        eigenvalues = self.eigenvalues[rows]
         e0, e1, e2 = eigenvalues.T
         total = np.where(e2 > 0.0, e0 + e1 + e2, np.nan)
         return Surfels(
@@ -217,11 +217,10 @@ class SurfelGraph:
             planarity=2.0 * (e1 - e0) / total,
             curvature=e0 / total,
             eigenvalues=eigenvalues,
-            num_points=num_points,
+            num_points=self.count[rows],
             voxel_index=unpack_keys(self.key[rows]),
             num_scans=self.num_scans[rows],
             size=np.full(len(rows), self.map.voxel_size_m),
-            **quality(eigenvalues, num_points),
         )
 
     def _forgotten(self) -> RemovedVoxels:

@@ -12,7 +12,7 @@ import pytest
 
 from surfel_mapper import SurfelMap, Surfels
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.mapping.surfels import surfel_columns
+from surfel_mapper.mapping.surfels import concatenated, surfel_columns
 from surfel_mapper.messages.map_cloud import moment_cloud
 from surfel_mapper.messages.pointcloud2 import from_columns
 
@@ -84,6 +84,18 @@ def test_covariances_come_with_a_message_that_has_them(has_moments):
     found = Surfels.from_message(message(cloud))
 
     np.testing.assert_array_equal(found.covariance, surfels.covariance.astype(np.float32))
+
+
+def test_the_quality_of_a_message_follows_its_selected_and_joined_rows():
+    surfels = some_map().surfels(5)
+
+    found = Surfels.from_message(message(from_columns(surfel_columns(surfels))))
+
+    joined = concatenated([found[:3], found[3:]])
+    for name in FLOATS[:3]:
+        np.testing.assert_array_equal(
+            getattr(joined, name), getattr(surfels, name).astype(np.float32), err_msg=name
+        )
 
 
 def test_a_message_of_an_earlier_version_has_no_quality():

@@ -37,9 +37,7 @@ def sheet(height_m, up, planarity, size_m=(20.0, 10.0), centre=(0.0, 0.0)):
         eigenvalues=np.tile([0.0, 0.25 / 12.0, 0.25 / 12.0], (num, 1)),
         num_points=np.full(num, 9),
         voxel_index=np.floor(position / 0.5).astype(np.int32),
-        thickness=np.zeros(num),
-        normal_sigma=np.full(num, 0.01),
-        radius=np.full(num, 0.5 / 3.0**0.5),
+        quality=(np.zeros(num), np.full(num, 0.01), np.full(num, 0.5 / 3.0**0.5)),
         num_scans=np.ones(num, np.int64),
         size=np.full(num, 0.5),
     )

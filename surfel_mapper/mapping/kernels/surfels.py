@@ -1,15 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Derive surfels from the moments of voxels: mean, eigenvalues, normal, shape and its quality.
+Derive surfels from the moments of voxels: mean, eigenvalues, normal and shape.
 
 Moments are first moved, in exact arithmetic, from the voxel centre to the lattice point nearest to
 the mean. The scatter is taken there, so nothing cancels: identical points give a scatter of
 exactly 0 anywhere in the voxel. Voxels are gathered in chunks that stay in the cache and are
 decomposed with vector instructions.
-
-Source: Anderson 1963 (Asymptotic theory for principal component analysis) for the standard error
-of an eigenvector.
 """
 
 import math
@@ -45,17 +42,6 @@ LINE = LINE_BYTES // 8
 EXACT_BITS = 54
 """A second moment of n points of b bits is below n 4^(b - 1), so float64 holds it exactly for
 n < 2^(54 - 2 b), with a margin of two."""
-
-NOISE_SQ = 0.01**2
-"""Smallest variance of points about their plane that normal_sigma assumes, m^2: also a thin surfel
-has the errors of range and pose that its points share."""
-
-REPEATED = 3.0
-"""Number of points that count as one for normal_sigma, as points side by side share errors: in
-one-plane voxels of a hall it is then within a factor of two of the measured angle."""
-
-RIGHT_ANGLE = math.pi / 2.0
-"""Largest normal_sigma, rad: the normal is undetermined."""
 
 # Rows of the chunk of moments: count, sums, products and views as in a row of the slab.
 N = 0
@@ -118,44 +104,6 @@ def derive_surfels(rows, stamps, chosen, voxel_size, bits, outputs):
         write_scans(start, num, chosen, moments, changes, outputs[7])
         if len(covariance):
             write_covariances(start, num, moments, scatter, unit, covariance)
-
-
-@inlined(error_model='numpy')
-def quality_of(e0, e1, e2, n):
-    """
-    Return thickness (m), normal_sigma (rad) and radius (m) of a surfel; see Surfels.
-
-    e0, e1, e2  float64, m^2, eigenvalues of the covariance, ascending
-    n           float64, number of points
-    """
-    freedom = n - 3.0  # of n points about their plane
-    variance = e0 * (n - 1.0) / freedom if freedom > 0.0 else math.nan
-    noise_sq = variance if variance > NOISE_SQ else NOISE_SQ
-    first, second = e1 - noise_sq, e2 - noise_sq
-    first_sq, second_sq = first * first, second * second
-    spread = REPEATED * noise_sq * (e1 * second_sq + e2 * first_sq)
-    sigma = math.sqrt(spread / ((n - 1.0) * (first_sq * second_sq)))
-    sigma = sigma if (first > 0.0) & (sigma < RIGHT_ANGLE) else RIGHT_ANGLE
-    sigma = sigma if (freedom > 0.0) & (e2 > 0.0) else math.nan
-    return math.sqrt(variance), sigma, math.sqrt(2.0 * (e1 + e2))
-
-
-@kernel(error_model='numpy')
-def derive_quality(eigenvalues, num_points, outputs):
-    """
-    Derive the quality of surfels from their eigenvalues.
-
-    Apart from derive_surfels, since models have eigenvalues without rows of a slab.
-
-    eigenvalues  (K, 3) float64, m^2
-    num_points   (K,) int64
-    outputs      thickness (K,) m, normal_sigma (K,) rad, radius (K,) m
-    """
-    thickness, normal_sigma, radius = outputs
-    for i in range(len(num_points)):
-        e0, e1, e2 = eigenvalues[i, 0], eigenvalues[i, 1], eigenvalues[i, 2]
-        quality = quality_of(e0, e1, e2, np.float64(num_points[i]))
-        thickness[i], normal_sigma[i], radius[i] = quality
 
 
 @inlined()
