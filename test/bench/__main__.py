@@ -8,6 +8,7 @@ import argparse
 import ast
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from datetime import date
 from importlib import import_module
 import json
 from pathlib import Path
@@ -80,6 +81,9 @@ def parser() -> argparse.ArgumentParser:
         metavar='NAME=VALUE',
         help='for paper: a setting of the models, such as min_density_radius=3; repeatable',
     )
+    result.add_argument(
+        '--record', type=Path, metavar='DIR', help='add the run to the file of each bench in DIR'
+    )
     return result
 
 
@@ -125,6 +129,17 @@ def rounded(row: Row) -> Row:
     return {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}
 
 
+def record(folder: Path, rows: Sequence[Row], about: Row) -> None:
+    """Add rows, with the machine and command of the run, to the files of their benches."""
+    for bench in dict.fromkeys(row['bench'] for row in rows):
+        path = folder / f'{bench}.json'
+        runs = json.loads(path.read_text(encoding='utf-8')) if path.exists() else []
+        own = [row for row in rows if row['bench'] == bench]
+        figures = [{k: v for k, v in row.items() if k not in ('bench', 'load')} for row in own]
+        runs.append({**about, 'load': own[0]['load'], 'rows': figures})
+        path.write_text(f'{json.dumps(runs, indent=1)}\n', encoding='utf-8')
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benches of the command line."""
     args = parser().parse_args(arguments)
@@ -137,9 +152,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(', '.join(f'{name} {value}' for name, value in machine.items()))
     print(f'window {chosen.window}, {chosen.scans} scans timed, {chosen.num_points} points\n')
     settings = {'window': chosen.window, 'points': chosen.num_points}
-    rows = [{**settings, **row, **machine} for row in run(names, chosen)]
+    rows = run(names, chosen)
     for row in rows:
-        print(json.dumps(row))
+        print(json.dumps({**settings, **row, **machine}))
+    if args.record is not None:
+        words = ' '.join(sys.argv[1:] if arguments is None else arguments)
+        command = f'python -m test.bench {words.partition(" --record")[0]}'
+        about = {'command': command, 'date': date.today().isoformat(), **machine}
+        record(args.record, rows, about)
     return 0
 
 
