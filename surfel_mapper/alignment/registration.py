@@ -124,6 +124,8 @@ class RegistrationResult:
         pose is near the first start and no search was needed.
     level : int
         Level of the map that overlap and fit refer to.
+    companions : float
+        Share of the cells that move along with the sensor, in [0, 1]; see alignment/companions.py.
 
     """
 
@@ -140,6 +142,7 @@ class RegistrationResult:
     is_found: bool = False
     seen_through: float = math.nan
     level: int = 0
+    companions: float = 0.0
 
     @property
     def support(self) -> float:

@@ -32,9 +32,13 @@ import numpy.typing as npt
 from surfel_mapper.alignment.kernels.planes import continuation_keys, fill_planes
 from surfel_mapper.alignment.kernels.registration import (
     cell_keys,
+    MEAN,
+    NORMAL,
     number_rows,
     PLANE,
+    SPREAD,
     sum_equations,
+    VARIANCE,
 )
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import Transform
@@ -127,6 +131,24 @@ class SurfelPlanes:
             cells, pose, rows, self._planes, width_m * width_m, hessian, gradient
         )
         return hessian, gradient, met / max(len(cells), 1), fit / max(met, 1)
+
+    def distances(
+        self, cells: npt.NDArray[np.float64], T_map_sensor: Transform
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """
+        Return the distance of cells (K, 3) from their planes at a pose, its variance, the normals.
+
+        The variance is inf where there is no usable plane.
+        """
+        rows = self.rows_at(cells, T_map_sensor)
+        none = np.full((1, PLANE), 0.0)
+        none[0, VARIANCE] = math.inf
+        planes = np.concatenate([self._planes, none])[rows]
+        gap = cells @ T_map_sensor[:3, :3].T + T_map_sensor[:3, 3] - planes[:, MEAN:NORMAL]
+        normal = planes[:, NORMAL:VARIANCE]
+        distance_m = (gap * normal).sum(axis=1)
+        along_sq = np.maximum((gap * gap).sum(axis=1) - distance_m**2, 0.0)
+        return distance_m, planes[:, VARIANCE] + along_sq * planes[:, SPREAD], normal
 
     def rows_at(
         self, cells: npt.NDArray[np.float64], T_map_sensor: Transform

@@ -135,8 +135,9 @@ def surrounded_text(summary: Mapping[str, Any]) -> str:
     if spent is None or spent['scans'] < MOST_SURROUNDED:
         return ''
     return (
-        f'in {spent["scans"]} of {summary["scans"]["received"]} scans ({spent["seconds"]:.1f} s) '
-        'most of what is seen seems to move along with the sensor: their poses may be wrong'
+        f'in {spent["scans"]} of {summary["scans"]["received"]} scans '
+        f'({spent["first_s"]:.3f} to {spent["last_s"]:.3f} s) '
+        'much of what is seen seems to move along with the sensor: their poses may be wrong'
     )
 
 

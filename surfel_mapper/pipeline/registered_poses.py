@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.alignment.companions import LEAST_SHARE
 from surfel_mapper.alignment.place_search import PlaceSearch
 from surfel_mapper.alignment.registration import Registration, RegistrationResult
 from surfel_mapper.alignment.surfel_planes import means
@@ -449,11 +450,12 @@ class RegisteredPoses:
             return False
         T_map_middle = placed[0].registration.T_map_sensor
         moves = self._surroundings.move_along(sighting.cells, T_map_middle, surfel_map)
+        moves |= placed[0].registration.companions >= LEAST_SHARE
         if moves:
             self._drops.warn(
                 'surrounded',
-                f'scan at {sighting.stamp_ns / 1e9:.6f} s: more of it is new than its motion '
-                'explains; most of what it sees seems to move along, and its pose may be wrong',
+                f'scan at {sighting.stamp_ns / 1e9:.6f} s: much of what it sees seems to move '
+                'along, and its pose may be wrong',
             )
         return moves
 

@@ -21,7 +21,7 @@ from surfel_mapper.mapping.moments import point_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 SCANS = 10
-"""Number of scans over which motion and new voxels are averaged."""
+"""Number of scans whose medians are compared: a single turn shows much that is new."""
 
 NEW_AT_REST = 0.04
 """Share of new voxels that vehicles which pass a sensor at rest explain."""
@@ -75,5 +75,5 @@ class SurroundingMotion:
         self._previous = T_map_body
         if len(self._latest) < SCANS:
             return False
-        new, way = np.mean(self._latest, axis=0)
+        new, way = np.median(self._latest, axis=0)
         return bool(new > NEW_AT_REST + NEW_A_VOXEL * way)

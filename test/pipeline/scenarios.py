@@ -91,6 +91,12 @@ def scenarios() -> list[Scenario]:
             course=street_course(street, 8.0),
             movers=lambda time_s: trucks(street, NINE, 8.0, time_s),
         ),
+        Scenario(
+            name='9 trucks that come',
+            world=street,
+            course=street_course(street, 8.0),
+            movers=lambda time_s: trucks(street, NINE, 8.0, time_s, away_m=coming_m(time_s)),
+        ),
     ]
 
 
@@ -100,17 +106,28 @@ def street_course(street: World, speed_m_s: float) -> Callable[[float], Transfor
     return lambda time_s: drive.T_odom_sensor(round(1e9 * time_s))
 
 
+def coming_m(time_s: float) -> float:
+    """Return the distance at which trucks are still away that come within 2 s, m."""
+    return max(30.0 - 15.0 * time_s, 0.0)
+
+
 def trucks(
     street: World,
     places: tuple[tuple[float, float], ...],
     speed_m_s: float,
     time_s: float,
+    away_m: float = 0.0,
 ) -> list[Primitive]:
-    """Return trucks that move along with a vehicle, each with a sway of 0.3 m of its own."""
+    """
+    Return trucks that move along with a vehicle, each with a sway of 0.3 m of its own.
+
+    They are behind their positions by a distance, those ahead on the own lane before them.
+    """
     found = []
     for number, (x, y) in enumerate(places):
         sway = 0.3 * math.sin(0.7 * time_s + 1.9 * number)
-        xyz = (speed_m_s * time_s + 0.85 + x + sway, y, 0.5 * TRUCK_M[2] + 0.4)
+        off_m = sway + (away_m if y == 0.0 < x else -away_m)
+        xyz = (speed_m_s * time_s + 0.85 + x + off_m, y, 0.5 * TRUCK_M[2] + 0.4)
         pose = compose(street.T_world_start, pose_matrix(xyz, (0.0, 0.0, 0.0, 1.0)))
         found.append(
             Primitive(

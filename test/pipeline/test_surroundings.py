@@ -3,7 +3,8 @@
 """
 Trucks on all sides that move along.
 
-From the first scan on they are mistaken for the world, and the summary says so.
+From the first scan on they are mistaken for the world, and the summary says so. Trucks that come
+later are left out, and the summary names these scans too.
 """
 
 from dataclasses import replace
@@ -67,3 +68,13 @@ def test_some_trucks_that_move_along_or_pass_are_not():
         summary = mapped('3 trucks', at_rest=at_rest)[0].summary()
         assert summary['registration']['tracking']['surrounded']['scans'] < MOST_SURROUNDED
         assert uncertain_text(summary) == ''
+
+
+def test_trucks_that_come_do_not_pull_the_poses_along():
+    mapper, errors_m = mapped('9 trucks that come', num_scans=44)
+    assert len(errors_m) == 44
+    assert max(errors_m) < 0.1  # 2.4 m if all cells decide
+    summary = mapper.summary()
+    spent = summary['registration']['tracking']['surrounded']
+    assert spent['scans'] >= 20
+    assert f'{spent["first_s"]:.3f} to {spent["last_s"]:.3f} s' in uncertain_text(summary)
