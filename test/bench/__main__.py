@@ -7,18 +7,13 @@ from __future__ import annotations
 import argparse
 import ast
 from collections.abc import Sequence
-from dataclasses import fields, replace
 from datetime import date
 from importlib import import_module
 import json
 from pathlib import Path
 import sys
 from time import perf_counter
-from typing import Any
 
-import yaml
-
-from surfel_mapper.config import ModelsConfig
 from surfel_mapper.memory import keep_freed_memory
 from test.bench.machine import facts, load
 from test.bench.options import cache_directory, Options
@@ -54,7 +49,6 @@ def parser() -> argparse.ArgumentParser:
         '--only', action='append', choices=BENCHES, metavar='NAME', help='this one; repeatable'
     )
     result.add_argument('--scans', type=int, metavar='N', help='scans timed (default 100)')
-    result.add_argument('--quick', action='store_true', help='shorter windows, fewer scans')
     result.add_argument(
         '--peers', action='store_true', help='compare with Open3D, small_gicp, KISS-ICP as well'
     )
@@ -74,34 +68,16 @@ def parser() -> argparse.ArgumentParser:
         '--frames', type=int, metavar='N', help='for paper: of each data set (default 10)'
     )
     result.add_argument(
-        '--models',
-        action='append',
-        type=setting,
-        default=[],
-        metavar='NAME=VALUE',
-        help='for paper: a setting of the models, such as min_density_radius=3; repeatable',
-    )
-    result.add_argument(
         '--record', type=Path, metavar='DIR', help='add the run to the file of each bench in DIR'
     )
     return result
 
 
-def setting(text: str) -> tuple[str, Any]:
-    """Return name and value of a setting of the models."""
-    name, _, value = text.partition('=')
-    if name not in {field.name for field in fields(ModelsConfig)} or not value:
-        raise argparse.ArgumentTypeError(f'{text!r}, expected NAME=VALUE of ModelsConfig')
-    return name, yaml.safe_load(value)
-
-
 def options(args: argparse.Namespace) -> Options:
     """Return the options that the arguments ask for."""
-    models = dict(args.models)
-    result = Options(peers=args.peers, cache=args.cache, data=tuple(args.data), models=models)
-    result = result.quick() if args.quick else result
-    result = result if args.frames is None else replace(result, frames=args.frames)
-    return result if args.scans is None else replace(result, scans=args.scans)
+    numbers = {name: getattr(args, name) for name in ('scans', 'frames')}
+    chosen = {name: number for name, number in numbers.items() if number is not None}
+    return Options(peers=args.peers, cache=args.cache, data=tuple(args.data), **chosen)
 
 
 def run(names: Sequence[str], chosen: Options) -> list[Row]:

@@ -40,9 +40,6 @@ RATE_HZ = 20.0
 SECONDS = 15.0
 TIMEOUT_S = 300.0
 
-BUDGET_VOXEL_M = 0.5
-LATENCY_BUDGET_MS = {'budget_p50_ms': 40.0, 'budget_p99_ms': 50.0}
-
 Listen = Callable[[Callable[[], bool]], None]
 """Takes messages until a condition holds."""
 
@@ -75,14 +72,13 @@ def street_over_dds(options: Options) -> Iterator[Street | None]:
 def latency_rows(options: Options, street: Street, size_m: float) -> Iterator[Row]:
     """Yield a row for a lidar with the defaults of the middleware, and one with the profile."""
     mount = list(street.simulation.drive.base_to_sensor)
-    budgets = LATENCY_BUDGET_MS if size_m == BUDGET_VOXEL_M else {}
-    seconds = SECONDS * options.scans / 100  # --quick takes a quarter of the time
+    seconds = SECONDS * options.scans / 100
     with Node(size_m, mount, options.window, {}) as node, listening() as listener:
         node.wait_for('ready:')
         publish(options, listener.listen_until, 20)  # fills caches
         for what, profile in (('live', False), ('with profile', True)):
             row = measure(options, node, listener, seconds, profile=profile)
-            yield {'what': what, 'voxel_m': size_m, **row, **budgets}
+            yield {'what': what, 'voxel_m': size_m, **row}
 
 
 def measure(

@@ -3,11 +3,10 @@
 """
 The same exact windowed map in plain numpy, without compiled kernels.
 
-Its integers equal those of SurfelMap, views included (test_numpy_map.py; the bench compares them
-too). It is optimised: runs of consecutive points in one voxel are summed by differences of a
-running sum, which leaves a sixth to a third of the keys to sort; eviction keeps its rows and
-needs no search. Most of its time goes to numpy.linalg.eigh. Limits of indices and counts are not
-checked.
+Its integers equal those of SurfelMap, views included, as the bench checks. It is optimised: runs
+of consecutive points in one voxel are summed by differences of a running sum, which leaves a sixth
+to a third of the keys to sort; eviction keeps its rows and needs no search. Most of its time goes
+to numpy.linalg.eigh. Limits of indices and counts are not checked.
 
 Imports numpy only, because peers use it in environments without the package.
 """

@@ -4,11 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import os
 from pathlib import Path
-from typing import Any
 
 WARM_SCANS = 5
 """Number of scans mapped into a full window before timing starts; by then kernels are loaded."""
@@ -43,8 +41,6 @@ class Options:
         Data sets of users: folders of depth images, bags.
     frames : int
         Frames of each data set, at most.
-    models : mapping of str to value
-        Settings of the models.
 
     """
 
@@ -57,7 +53,6 @@ class Options:
     cache: Path = field(default_factory=cache_directory)
     data: tuple[Path, ...] = ()
     frames: int = 10
-    models: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def num_points(self) -> int:
@@ -68,7 +63,3 @@ class Options:
     def untimed(self) -> int:
         """Scans before the first that is timed."""
         return self.window + WARM_SCANS
-
-    def quick(self) -> Options:
-        """Return options for runs of some seconds, for use while working."""
-        return replace(self, scans=25, window=25, frames=2)

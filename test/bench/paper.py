@@ -12,8 +12,7 @@ of the Gaussians by that of the row.
 
 Data sets: the folders sevenscenes and slambook2 of SURFEL_MAPPER_TEST_DATA, and those of --data:
 folders of TUM RGB-D, 7-Scenes, Replica or ScanNet, and bags of clouds, such as cow_and_lady.
-``--models NAME=VALUE`` changes a setting of all rows, such as min_density_radius=3; voxels are
-those of the paper, 4 cm for fr1_teddy and 3 cm else, unless ``voxel_size_m`` is among them.
+Voxels are those of the paper, 4 cm for fr1_teddy and 3 cm else.
 """
 
 from __future__ import annotations
@@ -71,9 +70,7 @@ def run(options: Options) -> Iterator[Row]:
     runs = 1 if options.scans < Options().scans else 3
     with one_core():
         for name, frames in data_sets(options):
-            size_m = float(
-                options.models.get('voxel_size_m', TEDDY_M if 'teddy' in name else VOXEL_M)
-            )
+            size_m = TEDDY_M if 'teddy' in name else VOXEL_M
             yield from rows_of(name, list(frames), size_m, (options, runs))
 
 
@@ -127,7 +124,7 @@ def rows_of(
 ) -> Iterator[Row]:
     """Yield the rows of a data set."""
     options, runs = how
-    config = replace(ModelsConfig(**options.models), voxel_size_m=size_m)
+    config = ModelsConfig(voxel_size_m=size_m)
     means = {
         profile: mean([ours(points, replace(config, **changes), runs) for points in frames])
         for profile, changes in PROFILES.items()

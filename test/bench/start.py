@@ -28,11 +28,11 @@ RATE_HZ, SECONDS = 10.0, {'bare': 40.0, 'cold': 40.0, 'warm': 5.0}
 
 REPORT = re.compile(r'scans received \d+, mapped (\d+)')
 STARTS = (
-    ('bare', 'first', {}),
-    ('cold', 'second', {'budget_first_cpu_s': 20.0}),
-    ('warm', 'second', {'budget_ready_cpu_s': 2.0}),
+    ('bare', 'first'),
+    ('cold', 'second'),
+    ('warm', 'second'),
 )
-"""Name, directory of compiled kernels, and budgets of each start."""
+"""Name and directory of compiled kernels of each start."""
 
 
 def run(options: Options) -> list[Row]:
@@ -42,10 +42,10 @@ def run(options: Options) -> list[Row]:
         if not street:
             return []
         mount = list(street.simulation.drive.base_to_sensor)
-        for way, kernels, budgets in STARTS:
+        for way, kernels in STARTS:
             caches = {'NUMBA_CACHE_DIR': f'{cache}/{kernels}', 'PYTHONPYCACHEPREFIX': cache}
             row = start(options, mount, caches, way)
-            rows.append({'what': f'start {way}', **row, **budgets})
+            rows.append({'what': f'start {way}', **row})
     return rows
 
 

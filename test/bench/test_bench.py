@@ -12,7 +12,7 @@ import pytest
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.messages.pointcloud2 import from_columns
 from test.bench import __main__ as bench
-from test.bench import paper, quality, real, robot
+from test.bench import quality, real, robot
 from test.bench.options import Options
 from test.models.scenes import sheet
 from test.offline.test_depth_folders import tum
@@ -100,43 +100,16 @@ def test_the_table_of_the_paper_has_rows_for_frames_of_the_user(options, monkeyp
     assert rows[4]['precision_mm'] < 6.0
 
 
-def test_settings_of_the_models_apply_to_all_rows(options, monkeypatch, tmp_path, capsys):
-    monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
-    tum(tmp_path / 'fr1_teddy')
-    words = ['--data', str(tmp_path / 'fr1_teddy'), '--frames', '1']
-    strict = ['--models', 'min_density_radius=3', '--models', 'voxel_size_m=0.05']
-    chosen = bench.options(bench.parser().parse_args([*words, *strict]))
-    rows = bench.run(['paper'], chosen)
-    assert [row['voxel_m'] for row in rows] == [0.05] * 3
-    assert rows[0]['planes'] == 0.0  # by the paper, a full sheet has 2
-    for text in ('radius=3', 'min_points', 'min_points='):
-        with pytest.raises(SystemExit):
-            bench.parser().parse_args(['--models', text])
-    assert 'expected NAME=VALUE of ModelsConfig' in capsys.readouterr().err
-
-
-def test_a_rectangle_of_open3d_has_points_of_the_spacing_on_its_middle():
-    box = [[1.0, 2.0, 3.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.4, 0.2, 0.07]]
-    points = paper.rectangle(box, 0.1)
-    assert sorted(np.unique(points[:, 1])) == pytest.approx([1.85, 1.95, 2.05, 2.15])
-    assert sorted(np.unique(points[:, 2])) == pytest.approx([2.95, 3.05])
-    assert len(points) == 8
-    assert (points[:, 0] == 1.0).all()
-
-
 def test_every_bench_is_a_module_that_says_what_it_is():
     for name in bench.BENCHES:
         assert bench.summary(name).endswith('.')
 
 
 def test_the_command_line_chooses_size_and_benches(tmp_path):
-    args = bench.parser().parse_args(
-        ['--only', 'real', '--quick', '--scans', '7', '--cache', str(tmp_path)]
-    )
+    args = bench.parser().parse_args(['--only', 'real', '--scans', '7', '--cache', str(tmp_path)])
     chosen = bench.options(args)
     assert args.only == ['real']
     assert (chosen.scans, chosen.cache, chosen.peers) == (7, tmp_path, False)
-    assert chosen.window < Options().window
     assert bench.options(bench.parser().parse_args([])) == Options()
 
 
@@ -165,16 +138,10 @@ def test_references_tell_one_plane_from_two_and_from_undetermined_ones():
     ]
 
 
-def test_quality_without_recordings_has_no_rows(options, monkeypatch):
-    monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
-    assert bench.run(['quality'], options) == []
-
-
 def test_the_floor_of_the_robot_is_measured_over_dds(options, monkeypatch):
     pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
     monkeypatch.setattr(robot, 'FLOORS', robot.FLOORS[:1])
     monkeypatch.setattr(robot, 'CASES', ())
     (row,) = bench.run(['robot'], options)
-    cells = [row[name] for name in ('case', 'hz', 'clouds', 'dropped')]
-    assert cells == ['bare subscriber', '10', 9, 0]
+    assert [row[name] for name in ('case', 'hz', 'clouds')] == ['bare subscriber', '10', 9]
     assert 0.0 < row['p50_ms'] <= row['p99_ms']

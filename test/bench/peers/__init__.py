@@ -25,8 +25,6 @@ class PeerSpec:
         Module of its class.
     requires : tuple of str
         Its requirements for pip.
-    less : str
-        Work that it leaves out.
     python : str
         Version of Python that it needs, if another: 3.10.
 
@@ -35,7 +33,6 @@ class PeerSpec:
     name: str
     module: str
     requires: tuple[str, ...]
-    less: str | None = None
     python: str | None = None
 
 
