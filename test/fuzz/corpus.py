@@ -239,11 +239,6 @@ def shown() -> list[bytes]:
     return [b'\0' + obj, b'\1' + stl, b'\2' + glb]
 
 
-def kitti_times() -> list[bytes]:
-    """Return seconds."""
-    return [b'0.0\n0.1\n0.2\n', b'1e0\n2E+1\n']
-
-
 def settings() -> list[bytes]:
     """Return files of settings, with and without the keys of ROS."""
     lines = [f'  {k}: {v!r}' for k, v in list(Config().to_mapping().items())[:20]]

@@ -126,15 +126,6 @@ def trajectory(data: bytes) -> None:
         refused(lambda path, f=format_: read_trajectory(path, f), 'poses.txt', data)
 
 
-def kitti_times(data: bytes) -> None:
-    """Read the stamps beside poses."""
-    times = Path(folder().name, 'times.txt')
-    times.write_bytes(data)
-    line = b'1 0 0 0 0 1 0 0 0 0 1 0\n'
-    refused(lambda path: read_trajectory(path, 'kitti'), 'poses.txt', line * data.count(b'\n'))
-    times.unlink()
-
-
 def settings(data: bytes) -> None:
     """Read a file of settings."""
     refused(load_config, 'input.yaml', data)

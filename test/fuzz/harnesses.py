@@ -36,10 +36,8 @@ HARNESSES = {
     'parquet': Harness(files.parquet, corpus.parquet, 40),
     'state_bytes': Harness(files.state_bytes, corpus.state_bytes, 75),
     'trajectory': Harness(files.trajectory, corpus.trajectory, 200),
-    'kitti_times': Harness(files.kitti_times, corpus.kitti_times, 200),
     'settings': Harness(files.settings, corpus.settings, 150),
     'chain': Harness(files.chain, corpus.chain, 150),
     'shown': Harness(point_files.shown, corpus.shown, 150),
-    'packets': Harness(point_files.packets, corpus.noise, 100),
     'map_url': Harness(files.map_url, corpus.map_url, 500),
 }

@@ -22,7 +22,6 @@ NEEDED = {
     'parquet': 'pyarrow',
     'pcd': 'lzf',
     'mcap': 'mcap',
-    'packets': 'ouster.sdk',
     'map_url': 'rclpy',
 }
 

@@ -5,10 +5,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 import json
-import math
 import sys
 
 from test.bench.machine import facts
@@ -17,13 +15,9 @@ from test.bench.report import Row, table
 from test.soak import core
 
 BLOCKS = 20
-NODE_BLOCK = 5000
 
 ROAD = 300
 """Scans of the road that is driven up and down."""
-
-SIZES = {8192: (32, 256), 131072: (64, 2048)}
-"""Beams and columns of the lidar by points of a scan."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -33,36 +27,21 @@ def parser() -> argparse.ArgumentParser:
         description='Drive up and down the street and watch memory and times.',
     )
     result.add_argument('--scans', type=int, default=1_000_000, metavar='N', help='%(default)s')
-    result.add_argument('--node', action='store_true', help='through the node, over DDS')
-    result.add_argument('--block', type=int, default=50_000, metavar='N', help='%(default)s a row')
-    result.add_argument('--minutes', type=float, default=math.inf, help='at most; %(default)s')
-    result.add_argument('--points', type=int, default=8192, choices=SIZES, help='%(default)s')
     return result
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the soaks of the command line."""
     args = parser().parse_args(arguments)
-    beams, columns = SIZES[args.points]
-    options = replace(Options(), scans=ROAD, beams=beams, columns=columns)
+    options = Options(scans=ROAD, beams=32, columns=256)
     print(', '.join(f'{name} {value}' for name, value in facts().items()))
     rows: list[Row] = []
-    for row in driven(args, options):
+    for row in core.run(args.scans, -(-args.scans // BLOCKS), options):
         rows.append(row)
         print(json.dumps(row), flush=True)
     print(table(rows))
     print(verdict(rows))
     return 0
-
-
-def driven(args: argparse.Namespace, options: Options) -> Iterator[Row]:
-    """Return the rows of the drive that is asked for."""
-    if not args.node:
-        block = min(-(-args.scans // BLOCKS), args.block)
-        return core.run(args.scans, block, options, args.minutes * 60.0)
-    from test.soak import node
-
-    return node.run(args.scans, min(args.block, NODE_BLOCK), options, args.minutes * 60.0)
 
 
 def verdict(rows: Sequence[Row]) -> str:

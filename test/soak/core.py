@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-import math
 from time import perf_counter
 
 import numpy as np
@@ -42,9 +41,9 @@ CONFIG = {
 }
 
 
-def run(num_scans: int, block: int, options: Options, most_s: float = math.inf) -> Iterator[Row]:
+def run(num_scans: int, block: int, options: Options) -> Iterator[Row]:
     """
-    Yield a row for every block of scans, up to a number of scans or a time.
+    Yield a row for every block of scans, up to a number of scans.
 
     Raises
     ------
@@ -61,17 +60,13 @@ def run(num_scans: int, block: int, options: Options, most_s: float = math.inf) 
     mapper.warm_up()
     times: list[float] = []
     latest: deque[RawCloud] = deque(maxlen=mapper.config.window.max_scans)
-    start = perf_counter()
     for number, turn, place in there_and_back(num_scans, options.scans):
         latest.append(messages[place])
         stamp_ns = (number + 1) * PERIOD_NS
         times.append(mapped(mapper, messages[place], poses[place], turn, stamp_ns))
-        is_last = number == num_scans - 1 or perf_counter() - start > most_s
-        if len(times) == block or is_last:
+        if len(times) == block or number == num_scans - 1:
             yield row(number + 1, times, mapper)
             times = []
-        if is_last:
-            break
     check(mapper, latest)
 
 
