@@ -36,13 +36,13 @@ def node_on_defaults(folder, *arguments):
         node.kill()
 
 
-def publish(peer, node, first_ns, reliability, *, profile, promised, sizes, kind='cloud'):
+def publish(peer, node, first_ns, reliability, *, profile, promised, sizes):
     """Run a publisher; return the number of messages received of each size."""
     env = {key: value for key, value in os.environ.items() if key not in FASTDDS_VARIABLES}
     if profile:
         env['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(PROFILE)
     command = [sys.executable, str(Path(__file__).with_name('plain_publisher.py'))]
-    command += [reliability, str(NUMBER), str(first_ns), kind]
+    command += [reliability, str(NUMBER), str(first_ns)]
     received = {}
     peer.diagnosis({'state': 'active'})
     with subprocess.Popen(
@@ -66,7 +66,7 @@ def publish_size(peer, publisher, size, is_promised):
     assert publisher.stdout.readline().strip() == str(size)
     try:
         expected = {'scans.received': before + NUMBER}
-        peer.diagnosis(expected, timeout_s=20.0 if is_promised else 1.0)
+        peer.diagnosis(expected, timeout_s=60.0 if is_promised else 1.0)
     except AssertionError:
         return int(peer.diagnosis()[1]['scans.received']) - before
     return NUMBER

@@ -3,11 +3,10 @@
 """
 Publish clouds as an ordinary driver does: rclpy and its defaults, nothing of this package.
 
-``python plain_publisher.py reliable|best_effort NUMBER FIRST_STAMP_NS cloud|depth`` publishes,
-once the topic has a subscriber, NUMBER messages at 10 Hz for each size in bytes read from stdin,
-and confirms each size on stdout. Depth images have 640 pixels of 16 bits a row, and each comes
-with its camera info. A reliable publisher waits until the messages that it keeps have arrived,
-as on a loaded machine its queue overflows.
+``python plain_publisher.py reliable|best_effort NUMBER FIRST_STAMP_NS`` publishes, once the topic
+has a subscriber, NUMBER messages at 10 Hz for each size in bytes read from stdin, and confirms
+each size on stdout. A reliable publisher waits until the messages that it keeps have arrived, as
+on a loaded machine its queue overflows.
 """
 
 from array import array
@@ -21,10 +20,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
-
-COLUMNS = 640
-"""Width of images."""
+from sensor_msgs.msg import PointCloud2, PointField
 
 DEPTH = 10
 
@@ -53,23 +49,6 @@ def cloud(stamp_ns: int, num_bytes: int) -> PointCloud2:
     return message
 
 
-def depth_image(stamp_ns: int, num_bytes: int) -> Image:
-    """Return an image of a wall."""
-    rows = num_bytes // (2 * COLUMNS)
-    message = Image(height=rows, width=COLUMNS, encoding='16UC1', step=2 * COLUMNS)
-    message.data = array('B', (2000).to_bytes(2, 'little') * (rows * COLUMNS))
-    message.header.frame_id = 'odom'
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-    return message
-
-
-def camera_info(image: Image) -> CameraInfo:
-    """Return the calibration of the camera of an image."""
-    info = CameraInfo(header=image.header, height=image.height, width=image.width)
-    info.k = [525.0, 0.0, 319.5, 0.0, 525.0, 239.5, 0.0, 0.0, 1.0]
-    return info
-
-
 def meet(node: Node, publisher: Publisher) -> None:
     """
     Return when the mapper knows the publisher, as its answer to a later client shows.
@@ -88,27 +67,20 @@ def meet(node: Node, publisher: Publisher) -> None:
     node.destroy_client(client)
 
 
-def main(reliability: str, number: str, first_ns: str, kind: str) -> None:
+def main(reliability: str, number: str, first_ns: str) -> None:
     """Publish messages of each size."""
     rclpy.init()
     node = Node('plain_lidar')
     qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy[reliability.upper()])
-    infos = None
-    if kind == 'cloud':
-        make, publisher = cloud, node.create_publisher(PointCloud2, '/points', qos)
-    else:
-        infos = node.create_publisher(CameraInfo, '/depth/camera_info', qos)
-        make, publisher = depth_image, node.create_publisher(Image, '/depth/image', qos)
+    publisher = node.create_publisher(PointCloud2, '/points', qos)
     meet(node, publisher)
     stamp_ns = int(first_ns)
     for size in sys.stdin:
-        message = make(stamp_ns, int(size))
+        message = cloud(stamp_ns, int(size))
         next_s = time.monotonic()
         for count in range(int(number)):
             stamp_ns += 10**8
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-            if infos is not None:
-                infos.publish(camera_info(message))
             publisher.publish(message)
             if count % DEPTH == DEPTH - 1:
                 publisher.wait_for_all_acked(LONGEST_WAIT)

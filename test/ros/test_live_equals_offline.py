@@ -75,24 +75,6 @@ def test_live_equals_offline_on_a_real_bag(start, tmp_path, capsys, data_folder)
     compare(start, bag, tmp_path, capsys, 22, 5, **{'window.max_scans': 9})
 
 
-def test_the_demo_reports_live_equal_to_offline(domain, tmp_path):
-    lidar = ['--scans', '8', '--beams', '16', '--columns', '256']
-    done = subprocess.run(
-        [sys.executable, str(ROOT / 'examples' / 'demo.py'), '--output', 'out', *lidar],
-        cwd=tmp_path,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=4 * TIMEOUT_S,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert 'They are equal to the last bit.' in done.stdout
-    for line in ('picture  out/offline/map.png', 'figures  out/offline/summary.json'):
-        assert line in done.stdout
-        assert (tmp_path / line.split()[1]).is_file()
-    assert (tmp_path / 'out' / 'live' / 'map.ply').is_file()
-
-
 def test_the_demo_uses_the_settings_that_info_suggests(tmp_path, capsys):
     bag = tmp_path / 'street'
     lidar = ['--scans', '2', '--beams', '8', '--columns', '64']

@@ -13,7 +13,6 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
-from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool
 
@@ -130,38 +129,6 @@ def test_bad_clouds_are_counted_and_valid_ones_mapped(start, peer):
     assert node.stop() == 0
 
 
-def test_a_stamp_that_goes_back_is_mapped_or_resets_the_map(start, peer):
-    start('node', *ARGUMENTS)
-    peer.advertise('/odom', '/points')
-    first, second = drive(2)
-    send(peer, [second])
-    peer.diagnosis({'scans.mapped': 1})
-    send(peer, [first])
-    peer.diagnosis({'scans.mapped': 2})
-    long_ago = START_NS - 10 * 10**9
-    send(peer, [(cloud(long_ago, room(seed=5)), odometry(long_ago, (0, 0, 0)))])
-
-    _, values = peer.diagnosis({'scans.mapped': 3, 'resets': 1})
-
-    assert values['scans.received'] == '3'
-    assert values['window_scans'] == '1'
-
-
-def test_pose_stamped_and_remapped_clouds_are_mapped(start, peer):
-    start(
-        *('node', *ARGUMENTS, '-p', 'pose.source:=pose', '-p', 'frames.base_to_sensor:=[]'),
-        *('-p', 'frames.base:=lidar', '-r', 'points:=/lidar/points', '-r', 'pose:=/where'),
-    )
-    poses = peer.node.create_publisher(PoseStamped, '/where', 10)
-    peer.spin_until(poses.get_subscription_count)
-    peer.advertise('/lidar/points')
-    for points, moved in drive(2):
-        poses.publish(PoseStamped(header=moved.header, pose=moved.pose.pose))
-        peer.publish('/lidar/points', points)
-
-    peer.diagnosis({'scans.mapped': 2})
-
-
 def test_clear_empties_the_map_and_pause_drops_clouds(start, peer):
     node = start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
@@ -182,26 +149,6 @@ def test_clear_empties_the_map_and_pause_drops_clouds(start, peer):
     _, values = peer.diagnosis({'scans.mapped': 3})
     assert values['window_scans'] == '1'
     assert node.is_running()
-
-
-def test_a_failed_save_states_the_reason(start, peer, tmp_path):
-    (tmp_path / 'file').write_text('in the way')
-    node = start('node', *ARGUMENTS, '-p', f'output.directory:={tmp_path / "file"}')
-
-    answer = peer.call('save_map')
-
-    assert not answer.success
-    assert str(tmp_path / 'file') in answer.message
-    assert peer.call('clear').success
-    assert node.is_running()
-
-
-def test_the_diagnostics_report_missing_clouds(start, peer):
-    start('node', *ARGUMENTS)
-    status, values = peer.diagnosis({'state': 'active'})
-    assert status.level == b'\1'
-    assert status.message.startswith('no cloud on /points yet: it has no publisher')
-    assert values['scans.received'] == '0'
 
 
 @pytest.mark.parametrize(
@@ -241,8 +188,9 @@ def test_a_missing_tf2_msgs_ends_the_node_with_the_install_command(domain, capfd
     assert 'sudo apt install ros-jazzy-tf2-msgs' in capfd.readouterr().err
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('when', ['loading kernels', 'ready:'])
+@pytest.mark.parametrize(
+    ('number', 'when'), [(signal.SIGINT, 'loading kernels'), (signal.SIGTERM, 'ready:')]
+)
 def test_a_signal_ends_the_node_cleanly_at_any_time(start, number, when):
     node = start('node', *ARGUMENTS)
     node.wait_for_output(when)

@@ -21,7 +21,6 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
 from surfel_mapper import MapMirror, Surfels
-from surfel_mapper.filters import Chain
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.scan_normals import ADDED
 from surfel_mapper.messages.surfel_markers import normal_colors, SEGMENTS, shades
@@ -47,22 +46,17 @@ def digest_of(peer):
     return peer.call('save_map').message.rpartition('digest ')[2]
 
 
-@pytest.mark.parametrize('columns', [(), ('intensity',)])
-def test_a_mirror_equals_the_map_of_the_node(start, peer, tmp_path, columns):
-    sums = {'map.intensity': 'true'} if columns else {}
-    node = start_node(
-        start, peer, **sums, **{'publish.moments': 'true', 'output.directory': tmp_path / 'maps'}
-    )
-    mirror = MapMirror(0.5, columns)
+def test_a_mirror_equals_the_map_of_the_node(start, peer, tmp_path):
+    settings = {'map.intensity': 'true', 'publish.moments': 'true'}
+    node = start_node(start, peer, **settings, **{'output.directory': tmp_path / 'maps'})
+    mirror = MapMirror(0.5, ('intensity',))
     for topic, take, qos in (
         ('changed', mirror.change, MANY),
         ('normals', mirror.replace, LATCHED),
     ):
         peer.node.create_subscription(PointCloud2, f'{BASE}/{topic}', take, qos)
     peer.spin_until(lambda: peer.node.count_publishers(f'{BASE}/changed'))
-    messages = drive(9)
-    if columns:
-        messages = [(with_intensity(points), pose) for points, pose in messages]
+    messages = [(with_intensity(points), pose) for points, pose in drive(9)]
 
     def is_up_to_date():
         digest = digest_of(peer)
@@ -92,33 +86,6 @@ def with_intensity(points):
     points.row_step = points.width * points.point_step
     points.data = array('B', np.hstack([old, old[:, start : start + 4]]).tobytes())
     return points
-
-
-def test_changed_minus_removed_equals_the_map(start, peer):
-    start_node(start, peer)
-    changed = peer.collect(PointCloud2, f'{BASE}/changed', MANY)
-    removed = peer.collect(PointCloud2, f'{BASE}/removed', MANY)
-    messages = drive(8)
-    send(peer, messages)
-    peer.spin_until(lambda: len(changed) == len(removed) == len(messages))
-
-    def voxels(message, size_m=0.5):
-        return {tuple(index) for index in np.floor(to_scan(message).points / size_m).tolist()}
-
-    known = set()
-    for now, gone in zip(changed, removed, strict=True):
-        assert stamp_of(now) == stamp_of(gone)
-        columns = to_scan(gone).columns
-        if columns:
-            index = np.stack([columns[f'voxel_{axis}'] for axis in 'xyz'], axis=1)
-            assert {tuple(row) for row in index.tolist()} == voxels(gone)
-        known = (known | voxels(now)) - voxels(gone)
-    surfels = mapped(messages)[1].map.surfels(5)
-    expected = {tuple(row) for row in np.floor(surfels.position.astype('f4') / 0.5).tolist()}
-    assert known == expected
-    assert peer.call('clear').success
-    peer.spin_until(lambda: len(removed) > len(messages))
-    assert voxels(removed[-1]) == expected
 
 
 def test_adaptive_surfels_are_published_with_their_changes(start, peer):
@@ -217,24 +184,6 @@ def test_surfels_have_mean_intensity_and_covariance_if_configured(start, peer):
     np.testing.assert_allclose(radius, surfels.radius, rtol=1e-3, atol=1e-4)
 
 
-def test_filtered_is_the_scan_after_the_chain_with_the_columns_added(start, peer, tmp_path):
-    chain = '- range_limit: {min_m: 2}\n- surface_normal: {keep_eigen_values: 1}\n'
-    (tmp_path / 'chain.yaml').write_text(chain)
-    node = start_node(start, peer, filters=tmp_path / 'chain.yaml')
-    messages = drive(2)
-    found = peer.collect(PointCloud2, f'{BASE}/filtered')
-    send(peer, messages)
-    peer.spin_until(lambda: len(found) == 2, what=lambda: node.output)
-    for (sent, _), message in zip(messages, found, strict=True):
-        assert message.header == sent.header
-        expected = Chain.load(tmp_path / 'chain.yaml').apply(to_scan(sent))
-        scan = to_scan(message)
-        np.testing.assert_array_equal(scan.points, expected.points)
-        assert 0 < len(scan) < len(to_scan(sent))
-        np.testing.assert_array_equal(scan.columns['normal_y'], expected.columns['normals'][:, 1])
-        np.testing.assert_array_equal(scan.columns['eigValues'], expected.columns['eigValues'])
-
-
 def test_scan_normals_keep_every_field_of_the_cloud(start, peer):
     node = start_node(start, peer)
     messages = drive(4)
@@ -290,8 +239,9 @@ def test_markers_follow_colour_limit_and_clearing(start, peer):
     peer.spin_until(lambda: {m.action for m in markers[-1].markers} == {Marker.DELETE})
 
 
-def test_the_grid_is_published_and_latched(start, peer):
+def test_the_grid_is_published_latched_and_returned_on_request(start, peer):
     start_node(start, peer, **{'grid.size_m': 20.0})
+    assert set(peer.call('get_grid', GetMap).map.data) == {-1}
     send(peer, drive(3))
     peer.diagnosis({'scans.mapped': 3})
     client = peer.parameters()
@@ -299,8 +249,13 @@ def test_the_grid_is_published_and_latched(start, peer):
     assert done.results[0].successful
     grids = peer.collect(OccupancyGrid, f'{BASE}/grid', LATCHED)
     peer.spin_until(lambda: grids)
-    grid = grids[-1]
+    for grid in (grids[-1], peer.call('get_grid', GetMap).map):
+        check_grid(grid)
+
+
+def check_grid(grid):
     assert (grid.header.frame_id, grid.info.resolution) == ('odom', 0.5)
+    assert stamp_of(grid) == START_NS + 2 * PERIOD_NS
     assert (grid.info.width, grid.info.height) == (40, 40)
     cost = np.array(grid.data).reshape(40, 40)
     origin = grid.info.origin.position
@@ -309,19 +264,3 @@ def test_the_grid_is_published_and_latched(start, peer):
     assert 0 <= cost[row, column] < 50
     assert cost[int((3.3 - origin.y) / 0.5), column] == 100
     assert cost[0, 0] == -1
-
-
-def test_the_grid_is_returned_on_request(start, peer):
-    start_node(start, peer, **{'grid.size_m': 20.0})
-    before = peer.call('get_grid', GetMap).map
-    assert set(before.data) == {-1}
-    send(peer, drive(3))
-    peer.diagnosis({'scans.mapped': 3})
-    grid = peer.call('get_grid', GetMap).map
-    assert (grid.header.frame_id, stamp_of(grid)) == ('odom', START_NS + 2 * PERIOD_NS)
-    assert (grid.info.width, grid.info.height) == (40, 40)
-    cost = np.array(grid.data).reshape(40, 40)
-    origin = grid.info.origin.position
-    column = int((0.9 - origin.x) / 0.5)
-    assert 0 <= cost[int((0.0 - origin.y) / 0.5), column] < 50
-    assert cost[int((3.3 - origin.y) / 0.5), column] == 100

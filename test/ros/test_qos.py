@@ -22,7 +22,7 @@ from surfel_mapper.ros.subscription_executor import FOLLOW_S, SubscriptionExecut
 from test.ros.live import Peer, reliably, START_NS
 from test.ros.ordinary import node_on_defaults, NUMBER, publish
 
-SIZES = (200_000, 800_000, 2_000_000, 4_000_000, 8_000_000)
+SIZES = (200_000, 2_000_000, 8_000_000)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10)
 

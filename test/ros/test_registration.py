@@ -146,14 +146,6 @@ def test_diagnostics_name_the_reason_and_the_remedy_without_a_place(start, peer,
     assert node.stop() == 0
 
 
-def test_a_missing_map_ends_the_node_with_a_message(start):
-    node = start('node', *arguments(map__load='nowhere.npz'))
-
-    assert node.wait() == 1
-    assert 'nowhere.npz' in node.output
-    assert 'Traceback' not in node.output
-
-
 def test_covariance_is_huge_without_information():
     information = np.diag([1e4, 0.0, 1e4, 1e6, 1e6, 1e6])
 

@@ -11,7 +11,6 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from geometry_msgs.msg import Point32, PolygonStamped
 from nav_msgs.srv import LoadMap
 from rclpy.parameter import Parameter
-from std_srvs.srv import Trigger
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError, PoseError
@@ -197,15 +196,3 @@ def test_a_failed_load_states_the_reason_and_changes_nothing(peer, node, start, 
     )
     assert load('map') == ANSWERS.RESULT_INVALID_MAP_METADATA
     assert 'voxel_size_m 0.5, expected 0.25 as configured' in other.output
-
-
-def test_concurrent_requests_are_answered_while_clouds_are_mapped(peer, node):
-    feed(peer, 1)
-    client = peer.client(Trigger, 'save_map')
-    answers = [client.call_async(Trigger.Request()) for _ in range(8)]
-    for points, pose in drive(4)[1:]:
-        send(peer, [(points, pose)])
-    peer.spin_until(lambda: all(answer.done() for answer in answers))
-
-    assert all(answer.result().success for answer in answers)
-    peer.diagnosis({'scans.mapped': 4})

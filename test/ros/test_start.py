@@ -25,17 +25,21 @@ from test.ros.driving import ARGUMENTS, drive, mapped, send
 from test.ros.live import NODE
 from test.test_threads import may_run_in_real_time
 
+LONGEST_S = 3600.0
+
 MANY = QoSProfile(depth=200, durability=DurabilityPolicy.VOLATILE)
 
 
+@pytest.mark.timeout(LONGEST_S)  # compiling takes 20 s of a core that other programs use too
 def test_a_node_without_compiled_kernels_says_what_it_compiles_and_drops_no_cloud(
     start_anew, peer, tmp_path, monkeypatch
 ):
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
     node = start_anew('node', *ARGUMENTS)
     reports = peer.subscribe(DiagnosticArray, '/diagnostics')
+    peer.spin_until(lambda: node.check() or 'ready:' in node.output, LONGEST_S)
     changed = peer.collect(PointCloud2, f'{NODE}/changed', MANY)
-    peer.advertise('/odom', '/points')  # returns when the node has subscribed
+    peer.advertise('/odom', '/points')
     messages = drive(6)
     send(peer, messages)
     peer.spin_until(lambda: len(changed) == 6)
@@ -49,21 +53,12 @@ def test_a_node_without_compiled_kernels_says_what_it_compiles_and_drops_no_clou
         r'compiling kernels, once on this machine: 1 of \d \(adding scans\)', node.output
     )
     assert re.search(r'\d+ kernels compiled in [\d.]+ s', node.output)
+    # none is compiled by a scan, beyond those that the node and `compile --config` announce
+    assert not re.search(r'once on this machine$', node.output, re.MULTILINE)
     updates, _ = mapped(messages)
     assert [each.width for each in changed] == [len(update.changed) for update in updates]
     _, values = peer.diagnosis({'scans.mapped': 6})
     assert 'scans.dropped.overload' not in values
-
-
-def test_with_cached_kernels_the_first_scan_is_published(start, peer):
-    start('node', *ARGUMENTS)
-    changed = peer.collect(PointCloud2, f'{NODE}/changed', MANY)
-    peer.advertise('/odom', '/points')
-    messages = drive(2)
-    send(peer, messages)
-    peer.spin_until(lambda: len(changed) == 2)
-    updates, _ = mapped(messages)
-    assert [each.width for each in changed] == [len(update.changed) for update in updates]
 
 
 def threads_of_fast_dds():

@@ -56,8 +56,11 @@ def num_complete(arrays):
     return sum(marker.action == Marker.DELETEALL for marker in markers)
 
 
-def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
-    start_node(start, peer, **SETTINGS)
+def test_the_sphere_around_a_lidar_comes_as_mesh_slice_and_distances(start, peer):
+    rates = {'esdf.rate_hz': 10.0, 'esdf.slice_rate_hz': 10.0, 'esdf.max_m': 1.0}
+    start_node(start, peer, **SETTINGS, **rates)
+    esdf = peer.collect(PointCloud2, f'{BASE}/esdf', LATCHED)
+    esdf_slices = peer.collect(OccupancyGrid, f'{BASE}/esdf_slice', LATCHED)
     meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
     slices = peer.collect(OccupancyGrid, f'{BASE}/tsdf_slice', LATCHED)
     directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
@@ -91,16 +94,10 @@ def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
     assert len(distance) > 50
     assert distance.min() > RADIUS_M - 0.4
     assert (cost == 0).sum() > 500  # the space that rays passed through
+    check_distances(peer, esdf, esdf_slices)
 
 
-def test_distances_to_obstacles_come_as_cloud_and_slice(start, peer):
-    rates = {'esdf.rate_hz': 10.0, 'esdf.slice_rate_hz': 10.0, 'esdf.max_m': 1.0}
-    start_node(start, peer, **SETTINGS, **rates)
-    clouds = peer.collect(PointCloud2, f'{BASE}/esdf', LATCHED)
-    slices = peer.collect(OccupancyGrid, f'{BASE}/esdf_slice', LATCHED)
-    directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
-    peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
-    peer.publish('/points', cloud(START_NS, RADIUS_M * directions))
+def check_distances(peer, clouds, slices):
     peer.spin_until(lambda: clouds and clouds[-1].width > 1000)
     assert [field.name for field in clouds[-1].fields] == ['x', 'y', 'z', 'distance']
     assert clouds[-1].header.frame_id == 'odom'
