@@ -144,12 +144,6 @@ def test_formats_are_a_list_with_commas(inputs, tmp_path, capsys, verb, formats)
     assert f'--formats LIST comma-separated, of {formats}, ' in text
 
 
-def test_models_are_written_in_each_format_of_the_list(inputs, tmp_path):
-    output = tmp_path / 'out'
-    assert main([*command('extract', inputs), '-o', str(output), '--formats', 'obj,json']) == 0
-    assert {'models.obj', 'models.json'} <= {path.name for path in output.iterdir()}
-
-
 @pytest.mark.parametrize('verb', sorted(set(VERBS) - {'node', 'filters', 'compile'}))
 def test_verbs_are_quiet_or_verbose_but_not_both(verb, capsys):
     with pytest.raises(SystemExit):

@@ -53,19 +53,6 @@ def test_a_map_of_a_simulated_street_is_near_its_truth(street, capsys):
     }
 
 
-def test_every_format_has_the_same_errors(street, capsys):
-    bag, output = street
-    found = [
-        evaluated(capsys, output / f'map.{name}', '--truth', bag, '--max-distance', '0.5')
-        for name in FORMATS.split(',')
-    ]
-    for result in found[1:]:
-        for name in ('position_m', 'normal_deg'):
-            for figure in ('mean', 'p95'):
-                assert result[name][figure] == pytest.approx(found[0][name][figure], abs=1e-3)
-        assert result['surfels'] == found[0]['surfels']
-
-
 def test_a_map_against_itself_is_equal_to_the_bit(street, capsys):
     extras.load('pyarrow')
     _, output = street
@@ -121,20 +108,6 @@ def test_the_poses_of_a_replay_are_those_of_the_simulation(street, capsys):
         assert result[kind]['rotation_deg']['max'] < 1e-5
 
 
-def test_a_trajectory_that_is_moved_as_a_whole_has_no_error(street, capsys, tmp_path):
-    _, output = street
-    lines = (output.parent / 'poses.tum').read_text().splitlines()
-    moved = [lines[0]]
-    for line in lines[1:]:
-        stamp, x, *rest = line.split()
-        moved.append(' '.join([stamp, repr(float(x) + 100.0), *rest]))
-    (tmp_path / 'moved.tum').write_text('\n'.join([*moved, '']))
-
-    result = evaluated(capsys, tmp_path / 'moved.tum', '--truth', output.parent / 'poses.tum')
-
-    assert result['absolute']['translation_m']['max'] < 1e-6
-
-
 def test_the_report_says_it_in_a_few_lines(street, capsys):
     bag, output = street
     for arguments in ([output], [output.parent / 'poses.tum']):
@@ -162,14 +135,6 @@ def test_a_file_that_is_no_map_or_truth_is_refused_by_name(street, tmp_path, cap
     assert main(['evaluate', str(tmp_path / name), '--truth', str(bag)]) == 1
 
 
-def test_trajectories_without_common_times_are_refused(street, tmp_path, capsys):
-    _, output = street
-    (tmp_path / 'early.tum').write_text('1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n')
-    truth = str(output.parent / 'poses.tum')
-    assert main(['evaluate', str(tmp_path / 'early.tum'), '--truth', truth]) == 1
-    assert '0 poses within 0.01 s of one another' in capsys.readouterr().err
-
-
 def test_poses_without_times_are_compared_by_their_numbers(tmp_path, capsys):
     poses = [pose_matrix((k, 0.2 * k * k, 0.0), (0.0, 0.0, 0.0, 1.0)) for k in range(6)]
     np.savetxt(tmp_path / 'truth.txt', [pose[:3].ravel() for pose in poses])
@@ -193,9 +158,3 @@ def test_a_bag_is_mapped_as_by_replay_and_compared(street, capsys):
     assert same['position_m']['max'] == 0.0
     finer = evaluated(capsys, bag, '--truth', bag, '--voxel-size', '0.25')
     assert finer['surfels'] > same['surfels']
-
-
-def test_a_directory_without_map_and_scans_is_refused(tmp_path, street, capsys):
-    bag, _ = street
-    assert main(['evaluate', str(tmp_path), '--truth', str(bag)]) == 1
-    assert f'{tmp_path}: no map in this directory' in capsys.readouterr().err

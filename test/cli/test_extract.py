@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 
-import numba
 import numpy as np
 import pytest
 
@@ -64,16 +63,6 @@ def test_a_map_becomes_models_of_its_surfels(tmp_path, capsys):
     assert json.loads((again / 'models.json').read_text())['planes'] == planes
 
 
-@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='kernels are interpreted in this run')
-def test_an_empty_cloud_becomes_empty_models(tmp_path, capsys):
-    write_cloud(tmp_path / 'none.ply', np.empty((0, 3), np.float32))
-    out = str(tmp_path / 'out')
-    assert main(['extract', str(tmp_path / 'none.ply'), '--output', out, '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found['planes'] == 0
-    assert found['precision_rms_m'] is None
-
-
 @pytest.mark.parametrize('name', ['room.json', 'missing.ply', 'missing.npz'])
 def test_a_file_that_is_no_cloud_is_refused_by_name(tmp_path, capsys, name):
     if name == 'room.json':
@@ -106,11 +95,6 @@ def test_settings_are_checked_before_anything_is_read(tmp_path, capsys, setting,
     assert message in capsys.readouterr().err
 
 
-def test_a_file_that_does_not_exist_is_named_so(tmp_path, capsys):
-    assert main(['extract', str(tmp_path / 'nothere'), '--output', str(tmp_path)]) == 1
-    assert f'{tmp_path / "nothere"}: no such file' in capsys.readouterr().err
-
-
 def plane(tmp_path):
     rng = np.random.default_rng(1)
     points = np.column_stack([*rng.uniform(0.0, 0.4, (2, 20_000)), np.ones(20_000)])
@@ -130,17 +114,6 @@ def test_normals_face_the_viewpoint_of_a_pcd(tmp_path):
         normals = normals_of(tmp_path / 'a.pcd', tmp_path / f'out_{z}')
         assert normals
         np.testing.assert_allclose(normals, sign, atol=1e-3)
-
-
-def test_points_of_every_format_become_models(tmp_path):
-    points = plane(tmp_path)
-    np.savez(tmp_path / 'a.npz', points=points)
-    np.savetxt(tmp_path / 'a.XYZ', points)
-    points.tofile(tmp_path / 'a.bin')
-
-    for name, options in (('a.npz', []), ('a.XYZ', []), ('a.bin', ['--bin-columns', '3'])):
-        normals = normals_of(tmp_path / name, tmp_path / f'out_{name}', *options)
-        np.testing.assert_allclose(normals, -1.0, atol=1e-3)
 
 
 def test_a_bag_is_mapped_as_by_replay_first(tmp_path, capsys, caplog):

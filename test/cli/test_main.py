@@ -78,11 +78,7 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
         (('replay', 'a', '--ouptut', 'b'), 'no option --ouptut, did you mean --output?'),
         (('replay', 'a', '--poses-from', 'identiy'), ', did you mean identity?'),
         (('replay', 'a', '--seconds', '3'), 'error: no option --seconds\n'),
-        (('info', 'a', '--jsn'), 'no option --jsn, did you mean --json?'),
-        (('--versoin',), 'no option --versoin, did you mean --version?'),
-        (('extract', 'a', '--ouptut', 'b'), 'no option --ouptut, did you mean --output?'),
         (('extract', '--voxl-size=0.2'), 'no option --voxl-size, did you mean --voxel-size?'),
-        (('simulate', '--sede', '3', 'street'), 'no option --sede, did you mean --seed?'),
         (('merge', 'a', '-output=b'), 'no option -output, did you mean --output?'),
         (('replay', 'a', '--po', 'b'), 'ambiguous option: --po could match --pose-topic, '),
         (('info', 'a', 'b'), 'too many arguments: b'),
@@ -90,7 +86,6 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
         (('view', 'a', '--at', '1', '2', 'nan'), "--at: 'nan', expected a finite number"),
         (('view', 'a', '--port', '0'), "--port: '0', expected a whole number of 1 or more"),
         (('view', 'a', '--port', '65535'), "--port: '65535', expected a port up to 65534"),
-        (('view', 'a', '--port', '70000'), "--port: '70000', expected a port up to 65534"),
     ],
 )
 def test_a_mistyped_word_is_answered_with_the_nearest(arguments, says, capsys):

@@ -3,7 +3,6 @@
 """``surfel-mapper replay`` writes map, picture and summary, or states why it refuses."""
 
 import json
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -145,17 +144,6 @@ def test_the_exit_code_is_0_if_95_percent_of_the_scans_are_mapped(tmp_path, num_
     assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == code
 
 
-@pytest.mark.parametrize(
-    'text', ['pose: {source: guess}', 'map: {voxel_size: 1}', 'map: {voxel_size_m: -1}']
-)
-def test_a_bad_configuration_is_refused(bag, tmp_path, capsys, text):
-    config = settings_file(tmp_path, text)
-
-    assert main(['replay', str(bag), '--config', config, '--output', str(tmp_path / 'out')]) == 1
-    assert capsys.readouterr().err.startswith('surfel-mapper replay: ')
-    assert not (tmp_path / 'out').exists()
-
-
 def test_a_damaged_bag_leaves_an_earlier_result_whole(tmp_path, capsys):
     bag, output = write_rosbag2(tmp_path / 'drive', drive(), 'sqlite3'), tmp_path / 'out'
     assert main(['replay', str(bag), '--output', str(output)]) == 0
@@ -208,17 +196,6 @@ def test_an_invalid_truth_is_refused_before_the_work(bag, tmp_path, capsys):
     assert main(['replay', str(bag), '--output', str(output), '--truth', str(bag)]) == 1
     assert 'not a simulated bag' in capsys.readouterr().err
     assert not output.exists()
-
-
-def test_warnings_go_to_stderr_only(tmp_path, capsys, caplog):
-    entries = drive()
-    entries[4][3].point_step = 15
-    bag = write_rosbag2(tmp_path / 'drive', entries)
-    with caplog.at_level(logging.WARNING):
-        assert main(['replay', str(bag), '--json', '--output', str(tmp_path / 'out')]) == 4
-
-    assert '/points: ' in caplog.text
-    assert json.loads(capsys.readouterr().out)['scans']['mapped'] == NUM_SCANS - 1
 
 
 REAL = ['hall_os0_full', 'hall_os0_long']

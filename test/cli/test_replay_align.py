@@ -79,14 +79,3 @@ def test_alignment_on_the_way_shows_in_the_poses(bag, settings, tmp_path):
 
     assert summary['milliseconds']['align']['median'] > 0.0
     assert relative_errors(found, true[:NUM_SCANS], NUM_SCANS - 1)[0] < 0.02
-
-
-def test_one_scan_cannot_be_aligned(bag, settings, tmp_path, capsys):
-    arguments = ['--config', settings, '--output', str(tmp_path / 'out'), '--align', '--window']
-    config = tmp_path / 'one.yaml'
-    config.write_text('pose: {source: odometry}\nframes: {base: lidar}\nwindow: {max_scans: 1}\n')
-    arguments[1] = str(config)
-
-    assert main(['replay', str(bag), *arguments]) == 1
-
-    assert '1 scans in the map' in capsys.readouterr().err

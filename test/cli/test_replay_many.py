@@ -116,36 +116,11 @@ def test_merging_finished_maps_is_mapping_them_together(alone, both, tmp_path, c
     assert json.loads(capsys.readouterr().out)['digest'] == total.digest()
 
 
-def test_maps_that_do_not_fit_are_refused(alone, bags, tmp_path, capsys):
-    config = tmp_path / 'small.yaml'
-    config.write_text('map: {voxel_size_m: 0.2}')
-    arguments = ['replay', bags[0], '--config', str(config), '--formats', 'parquet']
-    assert main([*arguments, '--output', str(tmp_path / 'small'), *TF]) in DONE
-
-    maps = [str(alone[0]), str(tmp_path / 'small')]
-    assert main(['merge', *maps, '--output', str(tmp_path / 'sum')]) == 1
-
-    said = capsys.readouterr().err
-    assert 'small: moments of voxel size 0.2 m' in said
-    assert not (tmp_path / 'sum' / 'map').exists()
-
-
 @pytest.mark.parametrize('place', ['nowhere', 'empty'])
 def test_a_directory_without_a_map_is_refused_by_name(tmp_path, capsys, place):
     (tmp_path / 'empty').mkdir()
     assert main(['merge', str(tmp_path / place), '--output', str(tmp_path / 'sum')]) == 1
     assert f'{place}: no map; expected' in capsys.readouterr().err
-
-
-def test_an_output_that_holds_something_else_is_left_alone(bags, tmp_path, capsys):
-    (tmp_path / 'map').mkdir()
-    (tmp_path / 'map' / 'thesis.txt').write_text('mine')
-
-    formats = ['--overwrite', '--formats', 'tiles']
-    assert main(['replay', *bags, '--output', str(tmp_path), *formats, *TF]) == 1
-
-    assert 'holds something else' in capsys.readouterr().err
-    assert (tmp_path / 'map' / 'thesis.txt').read_text() == 'mine'
 
 
 def test_tiles_poses_and_formats_are_written_where_asked(bags, both, tmp_path):

@@ -81,13 +81,10 @@ def test_an_existing_bag_is_replaced_only_with_overwrite(tmp_path, capsys):
     ('options', 'says'),
     [
         (('--beams', '0'), 'beams: 0, expected'),
-        (('--columns', '-1'), 'columns: -1, expected'),
         (('--rate', '-10'), 'rate_hz: -10.0, expected'),
-        (('--rate', 'nan'), 'rate_hz: nan, expected'),
         (('--speed', '-1'), 'speed_m_s: -1.0, expected'),
         (('--noise', '-0.1'), 'range_noise_m: -0.1, expected'),
         (('--max-range', '0'), 'range_m'),
-        (('--seed', '-1'), 'seed: -1, expected'),
     ],
 )
 def test_values_out_of_bounds_are_refused_and_nothing_is_written(options, says, tmp_path, capsys):
@@ -106,8 +103,6 @@ def test_values_out_of_bounds_are_refused_and_nothing_is_written(options, says, 
         ('street', '--output', 'x', '--storage', 'tape'),
         ('street', '--output', 'x', '--scans', '3', '--duration', '1'),
         ('street', '--output', 'x', '--scans', 'many'),
-        ('street', '--output', 'x', '--scans', '0'),
-        ('street', '--output', 'x', '--duration', '0'),
         ('street', '--output', 'x', '--duration', 'inf'),
     ],
 )

@@ -133,17 +133,6 @@ def test_shards_after_a_gap_are_left_out_when_it_is_stopped(tmp_path):
         map_bags(bags, LastFirst(), stopped=after(1))
 
 
-def test_several_bags_make_the_sum_of_their_maps(tmp_path):
-    first, config = written(tmp_path, 'plain')
-    second, _ = written(tmp_path, 'faults')
-    expected = in_one_go(first, config).map
-    expected.merge(in_one_go(second, config).map)
-
-    bags = [shards_of(first, config, 2.0), shards_of(second, config, 2.0)]
-
-    assert map_bags(bags, Workers()).mapper.map == expected
-
-
 def test_a_frozen_map_is_refused(tmp_path):
     bag, config = written(tmp_path, 'plain')
     with pytest.raises(ConfigError, match='several processes begin with empty maps'):

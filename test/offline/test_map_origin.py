@@ -17,7 +17,6 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.evaluation.map_files import load_discs
 from surfel_mapper.files import pcd, ply
-from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.trajectory import read_trajectory, write_tum
 from surfel_mapper.offline.replay import ReplayOptions
 from surfel_mapper.offline.request import Request
@@ -125,22 +124,6 @@ def test_maps_are_compared_in_outer_coordinates(near, far, name):
         rtol=0,
         atol=FLOAT_M if name == 'map.ply' else 2e-9,
     )
-
-
-def test_maps_of_two_origins_are_merged(bag, far, tmp_path):
-    extras.load('pyarrow')
-    other = replayed(bag, tmp_path / 'other', '400512 5399488 250', UTM)
-    command = ['merge', str(out_of(far)), str(out_of(other)), '--output', str(tmp_path / 'both')]
-
-    assert main(command) == 0
-
-    expected = load_map(out_of(far) / 'map.npz')[0]
-    expected.merge(expected.copy())  # both have the same scans at the same places
-    summary = json.loads((tmp_path / 'both' / 'summary.json').read_text())
-    assert summary['digest'] == expected.digest()
-    merged, alone = load_discs(tmp_path / 'both', 5), load_discs(out_of(far), 5)
-    assert len(merged) >= len(alone)
-    np.testing.assert_allclose(merged.position.mean(axis=0), UTM, atol=20.0)
 
 
 def test_models_are_extracted_in_outer_coordinates(far, tmp_path):

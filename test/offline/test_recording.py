@@ -82,9 +82,8 @@ def bag(tmp_path_factory):
         ({'duration_s': 99.0, 'every': 99}, [0]),
     ],
 )
-@pytest.mark.parametrize('source', ['tf', 'odometry'])
-def test_a_part_maps_its_scans_at_their_poses(bag, span, numbers, source):
-    mapper = mapped(bag, {'pose.source': source}, **span)
+def test_a_part_maps_its_scans_at_their_poses(bag, span, numbers):
+    mapper = mapped(bag, **span)
 
     assert mapper.counters.mapped == len(numbers)
     assert mapper.map.digest() == digest_of(numbers)
@@ -104,14 +103,6 @@ def test_a_part_maps_its_scans_at_their_poses(bag, span, numbers, source):
 def test_an_impossible_part_is_refused(bag, span, says):
     with pytest.raises(BagError, match=says):
         mapped(bag, **span)
-
-
-def test_parts_add_up_to_the_whole(bag):
-    first, second = mapped(bag, duration_s=0.25), mapped(bag, start_s=0.25)
-
-    first.map.merge(second.map)
-
-    assert first.map.digest() == digest_of(range(6))
 
 
 REAR_M = (-1.0, 0.5, 0.25)
@@ -335,13 +326,3 @@ def test_scans_whose_poses_are_not_known_are_refused(tmp_path, number, format_, 
 
     with pytest.raises(BagError, match=says):
         mapped(folder, poses=file, **request_)
-
-
-def test_stopping_ends_after_the_scan_at_hand(bag):
-    config = Config.from_mapping(all_scans())
-    with open_recording(Request(path=bag), config) as recording:
-        mapper = Mapper(recording.config)
-        for _ in recording.replay(mapper, stopped=lambda: mapper.counters.mapped == 2):
-            pass
-
-    assert mapper.map.digest() == digest_of([0, 1])

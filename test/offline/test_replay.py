@@ -14,8 +14,6 @@ from surfel_mapper import Config, Mapper, replay, Scan
 from surfel_mapper.cli.main import main
 from surfel_mapper.errors import (
     AlignmentError,
-    BagError,
-    ConfigError,
     DependencyError,
     FileFormatError,
     MapError,
@@ -24,7 +22,7 @@ from surfel_mapper.files import parquet
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.offline.outputs import ScanTrajectory
-from surfel_mapper.offline.replay import ReplayOptions, started_mapper
+from surfel_mapper.offline.replay import ReplayOptions
 from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import as_text
 from test import extras
@@ -111,25 +109,6 @@ def test_a_stopped_replay_writes_the_scans_so_far(bag, tmp_path):
     assert not (tmp_path / 'none').exists()
 
 
-@pytest.mark.parametrize(
-    ('options', 'config', 'error', 'says'),
-    [
-        ({'formats': ('stl',)}, None, ConfigError, "formats: 'stl', expected some of ply"),
-        ({'formats': ('glb',)}, None, ConfigError, 'layers.models.enabled: true'),
-        ({}, {'frames.fixed': 'map'}, BagError, 'none of 6 clouds of /points was mapped'),
-    ],
-)
-def test_wrong_options_are_refused_and_leave_nothing(bag, tmp_path, options, config, error, says):
-    with pytest.raises(error, match=says):
-        replay(
-            bag,
-            output=tmp_path / 'out',
-            config=Config.from_mapping(config or {}),
-            options=ReplayOptions(**options),
-        )
-    assert not (tmp_path / 'out').exists()
-
-
 def contents(directory):
     return {path.name for path in directory.iterdir()}
 
@@ -172,31 +151,6 @@ def test_the_map_is_written_before_an_alignment_that_fails(bag, tmp_path):
 
     assert contents(tmp_path / 'out') == {'map.ply', 'map.npz', 'trajectory.tum'}
     assert load_map(tmp_path / 'out')[0].num_points > 0
-
-
-def test_the_default_output_can_be_read_back(bag, tmp_path, capsys, caplog):
-    extras.load('pyarrow')
-    out, half = tmp_path / 'out', tmp_path / 'half'
-    digest = replay(bag, output=out).summary['digest']
-    replay(Request(path=bag, start_s=0.25), output=half)
-
-    assert main(['evaluate', str(out), '--truth', str(out / 'map.npz')]) == 0
-    assert 'equal to the bit' in capsys.readouterr().out
-    models = ['--output', str(tmp_path / 'models'), '--overwrite']
-    for path in (out, out / 'map.npz'):
-        assert main(['extract', str(path), *models]) == 0
-    assert main(['extract', str(out / 'map.ply'), *models]) == 1
-    assert 'surfels of a map, not points of a cloud' in capsys.readouterr().err
-
-    assert main(['merge', str(out), '--output', str(tmp_path / 'one'), '--json']) == 0
-    assert json.loads(capsys.readouterr().out)['digest'] == digest
-    twice = '3 of its 6 scans have stamps of scans in'
-    assert twice not in caplog.text
-    assert main(['merge', str(half / 'map.npz'), str(out), '--output', str(tmp_path / 'two')]) == 0
-    assert twice in caplog.text
-
-    loaded = {'map.mode': 'frozen', 'map.load': str(out), 'pose.source': 'registration'}
-    assert started_mapper(Config.from_mapping(loaded)).map.digest() == digest
 
 
 def test_the_stages_are_parts_of_the_wall_time(bag, tmp_path):
