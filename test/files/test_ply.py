@@ -116,25 +116,20 @@ HEADER = 'ply\nformat binary_little_endian 1.0\n'
     ('content', 'expected'),
     [
         ('', 'not a PLY file'),
-        ('solid stl\nend_header\n', 'not a PLY file'),
         (HEADER + 'element vertex 1\nproperty float x\n', 'not a PLY file'),
         (HEADER + 'end_header\n', 'no elements, expected'),
         (HEADER + 'element vertex 1\nend_header\n', 'of 0 properties'),
-        (HEADER + 'element vertex 1\nproperty half x\nend_header\n', 'not a PLY whose'),
         (
             HEADER + 'element vertex 1\nproperty list uchar int x\nend_header\n',
             'at least one number',
         ),
-        (HEADER + 'element vertex one\nproperty float x\nend_header\n', 'not a PLY whose'),
         (HEADER + 'element vertex -1\nproperty float x\nend_header\n', '-1 x vertex'),
         (HEADER + 'element face 1\nproperty float x\nend_header\n', '1 x face'),
-        (HEADER + 'element vertex 1\n' + 'property float x\n' * 2 + 'end_header\n', 'not a '),
         ('ply\nformat latin 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n', 'a PLY'),
         (
             'ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n',
             '1 rows, expected 2 points',
         ),
-        ('ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\na\n', 'float'),
         (
             'ply\nformat binary_big_endian 2.0\nelement vertex 1\nproperty int x\nend_header\n',
             'version 2.0',

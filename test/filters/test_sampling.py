@@ -48,21 +48,6 @@ def test_random_sampling_keeps_all_or_nothing_at_the_limits():
 
 
 @pytest.mark.parametrize(
-    ('name', 'settings'),
-    [
-        ('random_sampling', {'probability': 0.5}),
-        ('max_point_count', {'max_points': 1000}),
-        ('fix_step_sampling', {'start_step': 1000, 'end_step': 1000}),
-    ],
-)
-def test_chance_follows_the_seed_and_the_stamp(name, settings):
-    first = rows(name, line(), **settings, seed=1).tolist()
-    assert rows(name, line(), **settings, seed=1).tolist() == first
-    assert rows(name, line(stamp_ns=2), **settings, seed=1).tolist() != first
-    assert rows(name, line(), **settings, seed=2).tolist() != first
-
-
-@pytest.mark.parametrize(
     ('number', 'count'), [(5, 1000), (1000, 1000), (1001, 1000), (NUMBER, 999), (3, 0)]
 )
 def test_max_point_count_keeps_that_number(number, count):

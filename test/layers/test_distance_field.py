@@ -68,14 +68,6 @@ def test_the_mesh_is_what_the_scan_saw_where_it_was_taken():
     assert summary['blocks'] == mapper.tsdf.blocks.num_blocks > 0
 
 
-def test_without_the_layer_there_is_none():
-    mapper = mapper_with(**{'layers.tsdf.enabled': False})
-    (update,) = insert(mapper, 1)
-    assert mapper.tsdf is None
-    assert 'tsdf' not in update.milliseconds
-    assert 'tsdf' not in mapper.summary()
-
-
 def test_with_when_final_scans_are_fused_as_they_leave_the_window():
     mapper = mapper_with(**{'layers.tsdf.when_final': True, 'window.max_scans': 2})
     for number in range(1, 4):

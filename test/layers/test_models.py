@@ -50,26 +50,6 @@ def assert_up_to_date(mapper):
     assert groups(mapper.models) == groups(live(mapper.map.copy(), mapper.config.models))
 
 
-def test_a_street_has_its_ground_and_its_walls(street):
-    mapper = mapper_with(layers__models__extract_period_s=0.0)
-    updates = feed(mapper, *street)
-    assert all(update.models is not None for update in updates)
-    assert all('models' in update.milliseconds for update in updates)
-    model = mapper.models.model
-    largest = max(model.patches, key=lambda patch: patch.num_points)
-    assert abs(largest.normal[2]) > 0.98
-    upright = [plane for plane in model.planes if abs(plane.normal[2]) < 0.1]
-    assert sum(plane.grid.area_m2(2) > 5.0 for plane in upright) >= 2
-    assert mapper.summary()['models'] == {
-        'planes': len(model.planes),
-        'surfaces': len(model.surfaces),
-        'gaussians': len(model.gaussians),
-        'bytes': model.size_bytes,
-    }
-    assert mapper.counters.summary()['milliseconds']['models']['median'] > 0.0
-    assert_up_to_date(mapper)
-
-
 def test_models_follow_by_the_stamps_of_the_scans():
     mapper = mapper_with(layers__models__extract_period_s=1.0)
     points = np.random.default_rng(0).uniform(-5, 5, (500, 3)).astype(np.float32)
@@ -123,13 +103,3 @@ def test_models_follow_a_map_that_is_cleared_or_restored(street):
     mapper.restore(saved, [])
     assert_up_to_date(mapper)
     assert len(mapper.models.surfels) == saved.num_voxels
-
-
-def test_without_the_setting_there_are_none(street):
-    mapper = mapper_with(layers__models__enabled=False)
-    scans, poses = street
-    (update,) = feed(mapper, scans[:1], poses[:1])
-    assert mapper.models is None
-    assert update.models is None
-    assert 'models' not in mapper.summary()
-    assert 'models' not in update.milliseconds

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from surfel_mapper import (
     Config,
     diff,
-    DistanceField,
     estimate_normals,
     load_config,
     Mapper,
@@ -27,7 +26,6 @@ from surfel_mapper import (
     Trajectory,
 )
 from surfel_mapper.errors import ConfigError, DependencyError, FileFormatError, MapError
-from surfel_mapper.pipeline import Mapper as PipelineMapper
 from test import extras
 
 ORIGIN = [1.0, 1.0, 3.0]
@@ -233,7 +231,6 @@ MISTAKES = {
         ValueError,
         "points: 'here', expected numbers",
     ),
-    'no path of poses': (lambda _: Trajectory.load(None), TypeError, 'path: None, expected a str'),
     'a list of bags': (lambda _: replay(['a', 'b']), TypeError, 'path: .*expected a str or Path'),
     'a dict for a file of settings': (
         lambda _: load_config({'map': 1}),
@@ -268,11 +265,6 @@ MISTAKES = {
         ConfigError,
         r'a dict, expected a Config: Config\.from_mapping\(settings\)',
     ),
-    'settings to replay': (
-        lambda _: replay('bag', config={'map.voxel_size_m': 0.5}),
-        ConfigError,
-        r'config: a dict, expected a Config or the path',
-    ),
     'no number of points': (
         lambda m: m.surfels('5'),
         TypeError,
@@ -291,22 +283,7 @@ MISTAKES = {
         IndexError,
         r'a mask of 3, expected one of \d+ surfels',
     ),
-    'a frame as sensor': (
-        lambda _: estimate_normals(POINTS, viewpoint='lidar'),
-        ValueError,
-        "viewpoint: 'lidar', expected numbers",
-    ),
     'nothing to save to': (lambda m: m.save(None), TypeError, 'path: None'),
-    'points for a scan': (
-        lambda _: PipelineMapper().add_scan(POINTS),
-        TypeError,
-        'a ndarray, expected a Scan',
-    ),
-    'settings of a field by name': (
-        lambda _: DistanceField({'voxel_size_m': 0.1}),
-        TypeError,
-        'config: a dict, expected a TsdfConfig',
-    ),
 }
 
 

@@ -22,7 +22,6 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import QUALITY, surfel_columns
 from surfel_mapper.messages.pointcloud2 import (
     append_fields,
@@ -310,7 +309,6 @@ def test_a_number_that_is_not_finite_makes_a_cloud_not_dense(value):
         {},
         {'x': np.zeros(3), 'y': np.zeros(4)},
         {'x': np.zeros((3, 1, 1))},
-        {'x': np.zeros((3, 0))},
         {'x': np.float64(1.0)},
         {'': np.zeros(3)},
         {'x': np.zeros(3, np.int64)},
@@ -365,16 +363,6 @@ def test_messages_of_rclpy_decode_and_take_the_bytes():
     np.testing.assert_array_equal(scan.points, points)
     np.testing.assert_array_equal(scan.columns['ring'], ring)
     assert (scan.stamp_ns, scan.frame_id) == (5_000_000_006, 'lidar')
-
-
-def test_surfels_have_intensity_and_colour_if_the_map_has_them():
-    surfel_map = SurfelMap(0.5, columns=('intensity', 'rgb'))
-    columns = {'intensity': np.array([1.0, 2.0]), 'rgb': np.array([[255, 0, 7], [255, 0, 7]])}
-    surfel_map.add([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1]], columns=columns)
-    found = surfel_columns(surfel_map.surfels())
-    assert list(found)[-2:] == ['intensity', 'rgb']
-    assert found['intensity'].tolist() == [1.5]
-    assert found['rgb'].view(np.uint32).tolist() == [0xFF0007]
 
 
 names = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=9)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import Config, WindowConfig
-from surfel_mapper.errors import AlignmentError, ConfigError
+from surfel_mapper.errors import AlignmentError
 from surfel_mapper.geometry import q_xyzw
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
@@ -222,11 +222,6 @@ def test_windows_without_points_are_refused_and_stay(drive):
 def test_fewer_than_two_scans_are_refused(drive, number):
     with pytest.raises(AlignmentError, match=f'{number} scans'):
         mapped(drive, number=number)[0].align()
-
-
-def test_aligning_by_itself_needs_points():
-    with pytest.raises(ConfigError, match=r'align.every_scans: 5, but window.keep_points'):
-        Config.from_mapping({'align.every_scans': 5})
 
 
 def test_frames_are_found_in_the_map_as_it_was_corrected(drive):

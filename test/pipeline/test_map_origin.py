@@ -84,15 +84,6 @@ def test_auto_is_no_origin_near_that_of_the_frame():
     assert found.map.digest() == mapped('', (100.0, -200.0, 0.0)).map.digest()
 
 
-def test_without_an_origin_utm_is_beyond_the_range_of_the_map():
-    mapper = Mapper(config_of(SETTINGS))
-    mapper.add_pose('utm', 'base_link', 0, UTM, (0, 0, 0, 1))
-    mapper.add_scan(Scan(points=np.ones((9, 3)), stamp_ns=0, frame_id='lidar'))
-    list(mapper.insert_ready())
-
-    assert mapper.map.num_points == 0
-
-
 def test_poses_of_the_fixed_frame_in_another_are_shifted_too():
     # the tree is base_link -> utm, as some localisations publish it
     expected = mapped(number=1)

@@ -123,13 +123,6 @@ def test_after_a_long_pause_no_message_is_lost():
     assert mapper.counters.resets == 0
 
 
-def test_no_scan_waits_for_the_end_after_a_pause_of_the_only_sensor():
-    mapper = mapper_with(pose__source='identity')
-    stamps_s = [100.0, 100.1, 1100.0, 1100.1, 1100.2]
-    updates = insert(mapper, *map(scan_at, stamps_s))
-    assert [update.stamp_ns / 1e9 for update in updates] == stamps_s
-
-
 @pytest.mark.parametrize('steps_s', [[70] * 6, [70, 95, 64, 120, 61, 90], [10, 300, 20, 30]])
 def test_every_scan_of_a_sensor_that_stops_to_scan_is_mapped(steps_s):
     mapper = mapper_with(pose__source='identity')

@@ -356,16 +356,6 @@ def test_scans_of_another_room_are_not_placed_on_a_frozen_map():
     assert 'its initial pose is unknown, and searched for in the map; ' in apart.reason
 
 
-def test_an_initial_pose_ends_the_search():
-    mapper = frozen()
-    assert feed(mapper, [scan_at(0)]) == []
-
-    mapper.start_from('odom', TRUE[:3, 3], q_xyzw(TRUE))
-
-    (update,) = feed(mapper, [scan_at(1)])
-    np.testing.assert_allclose(update.T_map_sensor, pose_at(1), atol=3e-3)
-
-
 @pytest.mark.parametrize(
     ('frame_id', 'q', 'reason'),
     [

@@ -178,14 +178,6 @@ def test_offsets_of_topics_are_added_to_the_stamps_of_their_scans():
     assert stamps_ns == [4_100_000_000, 4_200_000_000]
 
 
-def test_an_offset_of_the_clock_is_added_to_the_stamps_of_scans():
-    mapper = mapper_with(input__time_offset_s=-37.0)
-    add_pose(mapper, 4.0, x=0.0)
-    add_pose(mapper, 4.4, x=4.0)
-    (update,) = insert(mapper, scan_at(41.1))
-    assert (update.stamp_ns, update.T_map_sensor[0, 3]) == (4_100_000_000, pytest.approx(1.0))
-
-
 def test_a_stamp_that_goes_back_far_clears_the_map_and_says_so(caplog):
     mapper = mapper_with(
         pose__source='identity', frames__base_to_sensor=(), input__reset_after_s=1.0
@@ -324,13 +316,3 @@ def test_a_sweep_with_a_gap_of_poses_in_its_middle_waits_for_them(threads, caplo
     assert [update.stamp_ns for update in mapper.insert_ready()] == [round(1.09 * S)]
     assert dropped(mapper) == {'no_pose': 1}
     assert 'in a gap of 0.060 s' in caplog.text
-
-
-def test_a_pose_that_comes_late_into_a_gap_is_used():
-    mapper = mapper_with(pose__max_gap_s=0.5)
-    add_pose(mapper, 1.0)
-    add_pose(mapper, 1.8, x=8.0)
-    mapper.add_scan(scan_at(1.5))
-    assert list(mapper.insert_ready()) == []
-    add_pose(mapper, 1.4, x=4.0)
-    assert [update.T_map_sensor[0, 3] for update in mapper.insert_ready()] == [pytest.approx(5.0)]

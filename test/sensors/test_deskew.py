@@ -45,7 +45,6 @@ EPOCH_S = START_NS / 1e9 + OFFSETS_MS / 1e3
         (OFFSETS_NS.astype(np.uint32), {}, 0),
         (OFFSETS_NS.astype(np.float32), {}, 8),  # of 8 ns is a step of float32 at 1e8
         ((OFFSETS_MS / 1e3).astype(np.float32), {}, 8),
-        (OFFSETS_MS / 1e3, {}, 1),
         (EPOCH_S, {}, 240),  # of 238 ns is a step of float64 at 1.7e9 s
         ((START_NS + OFFSETS_NS).astype(np.uint64), {}, 0),
         ((START_NS + OFFSETS_NS).astype(np.float64), {}, 256),
@@ -53,10 +52,8 @@ EPOCH_S = START_NS / 1e9 + OFFSETS_MS / 1e3
         (OFFSETS_MS.astype(np.uint16), {'unit': 'ms'}, 0),
         ((OFFSETS_MS * 1000).astype(np.uint32), {}, 0),
         (OFFSETS_MS.astype(np.uint16), {}, 0),
-        ((OFFSETS_MS * 1.0).astype(np.float32), {}, 0),
         (START_NS // 1000 + OFFSETS_MS * 1000, {}, 1000),
         (OFFSETS_NS + START_NS + 37 * 10**9, {'reference': 'first'}, 0),
-        (EPOCH_S - 3600.0, {'reference': 'first'}, 240),
         (EPOCH_S, {'unit': 's', 'reference': 'epoch'}, 240),
     ],
 )
@@ -134,10 +131,8 @@ def test_invalid_points_do_not_affect_the_times():
         (sweep(np.zeros(2)), {'field': 'when'}, 'no field when among t'),
         (sweep(np.zeros((2, 3))), {}, 'field t: 3 values a point'),
         (sweep(np.array([0.0, 5.0])), {'unit': 's'}, 'times from 0.0 to 5.0 .* 1.5 s from'),
-        (sweep(np.array([0, 5 * 10**9])), {}, 'times from 0 to 5000000000'),
         (sweep(np.full(2, 2**63 + 1, np.uint64)), {}, 'deskew.unit auto'),
         (sweep(OFFSETS_MS / 1e3), {'reference': 'epoch'}, 'deskew.reference epoch'),
-        (sweep(np.float32(EPOCH_S)), {}, 'float32'),
         (sweep(37.0 + OFFSETS_MS / 1e3), {}, '37.099 .* deskew.reference first takes'),
         (sweep(EPOCH_S + 37.0), {}, 'deskew.reference first takes'),
         (sweep(np.full(2, 2**64 - 1, np.uint64)), {}, 'times from 9223372036854775807'),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.geometry import compose, inverse, pose_matrix, rotation_angle
+from surfel_mapper.geometry import compose, inverse, rotation_angle
 from surfel_mapper.simulation import Drive, Lidar, Simulation, World
 from surfel_mapper.simulation.drive import START_NS
 
@@ -57,22 +57,6 @@ def test_a_vehicle_at_rest_keeps_its_pose():
     later = drive.T_odom_base(START_NS + 10**10)
     np.testing.assert_array_equal(later, drive.T_odom_base(START_NS))
     assert not drive.twist(START_NS).any()
-
-
-def test_a_pose_read_from_a_message_is_the_pose_of_the_drive_to_the_last_bit():
-    drive = Drive(start=World.street(length_m=1.0).start)
-    xyz, q_xyzw = drive.pose(START_NS + 987_654_321)
-    T_odom_base = pose_matrix(xyz.tolist(), q_xyzw.tolist())
-    np.testing.assert_array_equal(T_odom_base, drive.T_odom_base(START_NS + 987_654_321))
-    mount = drive.base_to_sensor
-    T_odom_sensor = compose(T_odom_base, pose_matrix(mount[:3], mount[3:]))
-    np.testing.assert_array_equal(T_odom_sensor, drive.T_odom_sensor(START_NS + 987_654_321))
-
-
-def test_the_lidar_is_mounted_askew():
-    T_base_sensor = Drive(start=LEVEL).T_base_sensor
-    assert 0.02 < rotation_angle(T_base_sensor) < 0.1
-    assert np.linalg.norm(T_base_sensor[:3, 3]) > 1.5
 
 
 def test_stamps_follow_the_rate_and_the_start(street):

@@ -116,12 +116,10 @@ def test_65535_mm_is_no_depth_and_no_free_space():
         (lambda: from_depth(SMALL, np.zeros((80, 60), np.float32)), r'\(80, 60\), expected'),
         (lambda: from_depth(SMALL, np.zeros((60, 80), np.int32)), 'int32, expected float32'),
         (lambda: from_points(VLP16, np.zeros((5, 2))), r'expected \(N, 3\)'),
-        (lambda: from_points(VLP16, np.zeros((5, 3), int)), r'expected \(N, 3\) float'),
         (lambda: from_points(VLP16, np.zeros((5, 3)), labels=np.zeros(4, int)), 'labels: '),
         (lambda: blank().with_images(color=np.zeros((60, 81, 3), np.uint8)), 'color: '),
         (lambda: blank().with_images(color=np.zeros((60, 80, 3))), 'float64, expected uint8'),
         (lambda: blank().with_images(label=np.full((60, 80), 1 << 24)), 'label: '),
-        (lambda: blank().with_images(label=np.zeros((60, 80))), 'label: float64'),
         (lambda: blank().with_images(mask=np.zeros((60,))), 'mask: '),
     ],
 )
@@ -139,14 +137,11 @@ def blank():
     [
         (lambda: CameraModel(columns=0, rows=2, fx=1, fy=1, cx=1, cy=1), 'columns: 0'),
         (lambda: CameraModel(columns=4, rows=2, fx=0, fy=1, cx=1, cy=1), 'fx: 0'),
-        (lambda: CameraModel(columns=4, rows=2, fx=math.nan, fy=1, cx=1, cy=1), 'fx: nan'),
         (lambda: CameraModel(columns=4, rows=2, fx=1, fy=1, cx=5, cy=1), 'cx: 5'),
-        (lambda: CameraModel(columns=4, rows=2, fx=1, fy=1, cx=1, cy=3), 'cy: 3'),
         (lambda: LidarModel(max_range_m=math.inf), 'max_range_m: inf, expected more .*, finite'),
         (lambda: LidarModel(min_range_m=0.0), 'min_range_m: 0'),
         (lambda: LidarModel(min_range_m=9.0, max_range_m=8.0), 'max_range_m: 8'),
         (lambda: LidarModel(rows=1), 'rows: 1'),
-        (lambda: LidarModel(vertical_fov_deg=0.0), 'vertical_fov_deg: 0'),
         (lambda: LidarModel(vertical_fov_top_deg=95.0), 'vertical_fov_top_deg: 95'),
         (
             lambda: LidarModel(rows=2, beam_elevations_deg=(1.0, 2.0)),

@@ -92,15 +92,6 @@ def test_light_is_that_of_the_level_frame(tmp_path):
     assert num_pixels(drawn(tmp_path, camera), GROUND) > 100_000
 
 
-def test_a_roof_hides_the_ground(tmp_path):
-    roof = sheet(5.0, 1.0, 1.0)
-    roof.normal[:] = 0.6, 0.0, 0.8
-    floor = sheet(0.0, 1.0, 1.0)
-    open_air, roofed = (drawn(tmp_path, s) for s in (floor, concatenated([floor, roof])))
-
-    assert num_pixels(roofed, GROUND) < 0.5 * num_pixels(open_air, GROUND)
-
-
 def test_the_plan_has_the_longer_side_upwards_and_is_no_mirror_image():
     for size_m in ((40.0, 10.0), (10.0, 40.0)):
         scene = scene_of(sheet(0.0, 1.0, 1.0, size_m=size_m))
@@ -192,13 +183,6 @@ def test_a_map_of_few_surfels_is_a_picture(tmp_path, num):
     few = sheet(0.0, 1.0, 1.0).select(np.arange(num))
 
     assert drawn(tmp_path, few, trajectory=np.zeros((num, 3))).min() < 0.5
-
-
-def test_the_same_map_gives_the_same_file(tmp_path):
-    draw_map(sheet(0.0, 1.0, 0.5), tmp_path / 'a.png', 'a')
-    draw_map(sheet(0.0, 1.0, 0.5), tmp_path / 'b.png', 'a')
-
-    assert (tmp_path / 'a.png').read_bytes() == (tmp_path / 'b.png').read_bytes()
 
 
 def test_a_file_that_cannot_be_written_is_an_error(tmp_path):

@@ -151,26 +151,6 @@ def test_discs_have_no_dot_and_are_seen_from_their_front(tmp_path):
     assert set(front.tolist()) == {2}
 
 
-def test_the_panels_are_collapsed_but_that_of_time(tmp_path):
-    from rerun import chunk as reader
-
-    ground_map().save(tmp_path / 'map.npz')
-    shown(tmp_path, tmp_path / 'map.npz')
-    file = reader.RrdReader(str(tmp_path / 'shown.rrd'))
-    (store,) = file.blueprints()
-    states = {}
-    for chunk in file.stream(store=store).to_chunks():
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            if name.endswith('PanelBlueprint:state'):
-                states[chunk.entity_path] = batch.column(name)[-1].as_py()[0]
-    assert states == {
-        '/blueprint_panel': 2,  # collapsed
-        '/selection_panel': 2,
-        '/time_panel': 3,  # expanded
-    }
-
-
 def hidden(tmp_path):
     """Return the paths that the blueprint of the recording of a view hides, below its view."""
     from rerun import chunk as reader
