@@ -61,7 +61,8 @@ def files_of(path: Path) -> list[Path]:
     if not path.is_file():
         raise BagError(f'{path}: no such file or directory; expected a bag or scans')
     if not is_storage(path) and not is_ros1(path):
-        raise BagError(f'{path}: {path.suffix or "no ending"} is not read; expected {readable()}')
+        ending = path.suffix or 'a name without an ending'
+        raise BagError(f'{path}: {ending} is not read; expected {readable()}')
     return [path]
 
 

@@ -15,6 +15,7 @@ from datetime import datetime, timezone
 import itertools
 import json
 from pathlib import Path
+import shlex
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import add_bin_columns, CUT
@@ -133,18 +134,20 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
             lines += offered(offer, is_choice) if offer.clouds == clouds else []
     if not made:
         lines += ['', 'no poses; if the clouds are in a fixed frame, use --poses-from identity']
-    return '\n'.join([*lines, '', replay_line(content['replay'])])
+    return '\n'.join([*lines, '', replay_line(content['replay'], Path(content['bag']))])
 
 
-def replay_line(replay: dict[str, Any]) -> str:
-    """Return the source of poses that a replay takes, and why, or why it is refused."""
+def replay_line(replay: dict[str, Any], path: Path) -> str:
+    """Return the source of poses of a replay and its command, or why it is refused."""
     if 'refused' in replay:
         return f'a replay without options is refused: {replay["refused"]}'
     deskewed = ', deskewed' if replay['deskewed'] else ''
     why = f': {replay["poses_reason"]}' if replay['poses_reason'] else ''
     line = f'replay takes poses from {replay["poses_from"]}{deskewed}{why}'
-    not_deskewed = replay['deskew_reason']
-    return f'{line}\nnot deskewed: {not_deskewed}' if not_deskewed else line
+    if replay['deskew_reason']:
+        line += f'\nnot deskewed: {replay["deskew_reason"]}'
+    name = path.resolve().name.split('.')[0]
+    return f'{line}\n  surfel-mapper replay {shlex.quote(str(path))} --output {name}_map'
 
 
 def chosen(path: Path) -> dict[str, Any]:
@@ -192,12 +195,13 @@ def folder_report(content: dict[str, Any]) -> str:
     columns = ', '.join(content['columns']) or 'none'
     damaged = ''.join(f'damaged: {error}\n' for error in content['damaged'])
     read = 'first scan that can be read' if damaged else 'first scan'
+    times = content['times_from'].replace('none: ', 'none in the files, taken as ')
     return (
         f'{content["bag"]}: {content["format"]}, {content["scans"]} '
         f'{"scan" if content["scans"] == 1 else "scans"}, '
-        f'{content["seconds"]:.1f} s; times: {content["times_from"]}\n'
-        f'  {read}: {content["points"]} points; columns beside x y z: {columns}\n{damaged}\n'
-        f'{replay_line(content["replay"])}'
+        f'{content["seconds"]:.1f} s; times: {times}\n'
+        f'  {read}: {content["points"]} points; further columns: {columns}\n{damaged}\n'
+        f'{replay_line(content["replay"], Path(content["bag"]))}'
     )
 
 

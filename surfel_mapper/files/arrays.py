@@ -59,7 +59,9 @@ def read_points(path: str | Path) -> Columns:
         if Path(path).suffix.lower() == '.npy':
             return columns_of(path, np.load(file, allow_pickle=False))
         if is_map(Path(path)):
-            raise FileFormatError(f'{path}: a map, expected points; merge and extract take it')
+            raise FileFormatError(
+                f'{path}: a map, expected points; merge, extract, evaluate and view read maps'
+            )
         with np.load(file, allow_pickle=False) as archive:
             return columns_of_arrays(path, {name: archive[name] for name in archive.files})
 

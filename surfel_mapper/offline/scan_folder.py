@@ -222,8 +222,8 @@ class ScanFolder:
             points, columns = self._read_file(self.files[number])
             if columns.keys() >= SURFEL_COLUMNS:
                 raise BagError(
-                    f'{self.files[number]}: surfels of a map, expected scans; merge, extract, '
-                    'evaluate and view take them, and map.load begins with map.npz'
+                    f'{self.files[number]}: surfels of a map, expected scans; extract, evaluate '
+                    'and view read them; set map.load to a map.npz to go on from a map'
                 )
         else:
             points, columns = self.dataset.scan(number)

@@ -3,6 +3,7 @@
 """``surfel-mapper info`` prints the topics of a bag and settings that work unchanged."""
 
 import json
+import shlex
 
 import numpy as np
 import pytest
@@ -112,19 +113,30 @@ def test_names_of_columns_cannot_write_to_the_terminal(tmp_path, capsys):
     )
     assert main(['info', str(folder)]) == 0
     text = capsys.readouterr().out
-    assert 'columns beside x y z: \\x1b[31m' in text
+    assert 'further columns: \\x1b[31m' in text
     assert 'scans\\x1b[2J: scans in files' in text
     assert '\x1b' not in text
 
 
 @pytest.mark.parametrize(
-    ('names', 'times'), [(['12.5', '12.6'], 'names'), (['first', 'second'], 'none: 10 Hz')]
+    ('names', 'times', 'words'),
+    [
+        (['12.5', '12.6'], 'names', 'names'),
+        (['first', 'second'], 'none: 10 Hz', 'none in the files, taken as 10 Hz'),
+    ],
 )
-def test_a_folder_of_scans_says_where_its_times_come_from(names, times, tmp_path, capsys):
+def test_a_folder_of_scans_says_where_its_times_come_from(names, times, words, tmp_path, capsys):
     for name in names:
         np.ones((2, 4), np.float32).tofile(tmp_path / f'{name}.bin')
     assert main(['info', str(tmp_path)]) == 0
-    assert capsys.readouterr().out.splitlines()[0].endswith(f'2 scans, 0.1 s; times: {times}')
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].endswith(f'2 scans, 0.1 s; times: {words}')
+    assert shlex.split(lines[-1])[1:] == [
+        'replay',
+        str(tmp_path),
+        '--output',
+        f'{tmp_path.name}_map',
+    ]
     assert main(['info', '--json', str(tmp_path)]) == 0
     assert json.loads(capsys.readouterr().out)['times_from'] == times
 
