@@ -20,8 +20,7 @@ products, the second ones, or the first two words.
 A bucket of the hash table of a map has eight entries. Compilers turn the loop over them into a
 chain of 16 conditional moves, and a look-up takes 1.2 times as long.
 
-A search for neighbours counts how many of up to 32 distances are below each of them, and goes on
-with the nearest of 16 points.
+A search for neighbours goes on with the nearest of 16 points.
 
 Interpreted, the functions work on arrays; compiled, the sums are a type of their own. Compilers do
 not find these instructions in loops, so they are spelled in the language of LLVM here, as are
@@ -38,9 +37,6 @@ from surfel_mapper.kernels.layout import BITS, COUNT_BITS, HIGH_BITS
 
 WORDS = 8
 """Words of the sums of a voxel, and entries of a bucket."""
-
-FLOATS = 32
-"""Number of floats that are compared at once."""
 
 NUMBERS = 16
 """Number of distances of which the least is found at once."""
@@ -124,16 +120,6 @@ def place_of_half(words, at, lower):
     return np.int64(equal.argmax() if equal.any() else WORDS)
 
 
-def num_below(floats, limit):
-    """
-    Return the number of floats[:32] that are below a limit.
-
-    floats  (32,) float32, no nan
-    limit   float32
-    """
-    return np.int64(np.count_nonzero(floats[:FLOATS] < limit))
-
-
 def place_of_least(numbers, passed):
     """
     Return the place of the least of numbers[:16] that are not passed over; 15 if all are.
@@ -199,11 +185,6 @@ def _type_of_number(context):
 @type_callable(place_of_half)
 def _type_of_place(context):
     return lambda words, at, lower: types.int64
-
-
-@type_callable(num_below)
-def _type_of_number_below(context):
-    return lambda floats, limit: types.int64
 
 
 @type_callable(place_of_least)
@@ -275,22 +256,6 @@ def _emit_place_of_half(context, builder, signature, arguments):
     equal = builder.icmp_unsigned('==', lower, _spread(builder, arguments[2]))
     of_zero_too = ir.Constant(ir.IntType(1), 0)
     return builder.zext(builder.cttz(builder.bitcast(equal, _MASK), of_zero_too), _WORD)
-
-
-@lower_builtin(num_below, types.Array, types.float32)
-def _emit_num_below(context, builder, signature, arguments):
-    struct = context.make_array(signature.args[0])(context, builder, arguments[0])
-    eight = ir.VectorType(ir.FloatType(), WORDS)
-    address = builder.bitcast(struct.data, eight.as_pointer())
-    limit = builder.insert_element(ir.Constant(eight, ir.Undefined), arguments[1], _HALF_WORD(0))
-    limit = builder.shuffle_vector(limit, limit, _indices([0] * WORDS))
-    bits = _HALF_WORD(0)
-    for group in range(FLOATS // WORDS):  # eight at once: compilers have one instruction for that
-        floats = builder.load(builder.gep(address, [_HALF_WORD(group)]), align=4)
-        below = builder.bitcast(builder.fcmp_ordered('<', floats, limit), _MASK)
-        shifted = builder.shl(builder.zext(below, _HALF_WORD), _HALF_WORD(WORDS * group))
-        bits = builder.or_(bits, shifted)
-    return builder.zext(builder.ctpop(bits), _WORD)
 
 
 @lower_builtin(place_of_least, types.Array, types.Integer)

@@ -20,9 +20,9 @@ import math
 import numpy as np
 
 from surfel_mapper.filters.kernels.search_tree import FIRST, LEAF, PARENT, RIGHT
-from surfel_mapper.filters.kernels.smallest import keep_least, largest, sort, VECTORS
+from surfel_mapper.filters.kernels.smallest import largest, select, sort
 from surfel_mapper.kernels.compiling import inlined, kernel, U
-from surfel_mapper.kernels.lanes import FLOATS, place_of_least
+from surfel_mapper.kernels.lanes import place_of_least
 
 GATHERED = 256
 """Maximum number of leaves gathered for one leaf; if there are more, its points are searched for
@@ -125,16 +125,15 @@ def search(xs, ys, zs, links, boxes, node, x, y, z, k, bound, buffers, apart, st
     Search from a leaf upwards; return the number of neighbours and the bound.
 
     buffers  squares (C,) float64, out: squared distances of the neighbours; C at least
-             k + 2 LEAF, a multiple of VECTORS;
-             indices (C,) int32, out: their indices in the order of the tree;
-             floats (FLOATS,) float32, overwritten
+             k + 2 LEAF;
+             indices (C,) int32, out: their indices in the order of the tree
     """
-    squares, indices, floats = buffers
+    squares, indices = buffers
     full = U(len(squares) - LEAF)
     base = U(links[FIRST, node]) * U(LEAF)
     count = scan(xs, ys, zs, base, x, y, z, bound, U(0), squares, indices, apart)
     if count > k:
-        bound = keep_least(squares, indices, count, k, bound, floats)
+        bound = select(squares, indices, count, k)
         count = k
     while links[PARENT, node] >= 0:
         node, stack[0] = sibling_of(links, node)
@@ -149,7 +148,7 @@ def search(xs, ys, zs, links, boxes, node, x, y, z, k, bound, buffers, apart, st
                 base = U(links[FIRST, branch]) * U(LEAF)
                 count = scan(xs, ys, zs, base, x, y, z, bound, count, squares, indices, apart)
                 if count > full:
-                    bound = keep_least(squares, indices, count, k, bound, floats)
+                    bound = select(squares, indices, count, k)
                     count = k
             else:
                 lower = branch + 1
@@ -210,11 +209,10 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
     xyz, order, links, boxes, leaves = tree
     xs, ys, zs = xyz[0], xyz[1], xyz[2]
     k = U(near.shape[1])
-    size = (max(U(2) * k, k + U(32)) + U(LEAF + VECTORS - 1)) & ~U(VECTORS - 1)
+    size = max(U(2) * k, k + U(32)) + U(LEAF)
     full = size - U(LEAF)
     squares, indices, apart = np.empty(size), np.empty(size, np.int32), np.empty(LEAF)
-    floats = np.empty(FLOATS, np.float32)
-    buffers = squares, indices, floats
+    buffers = squares, indices
     stack, sides = np.empty(128, np.int64), np.empty((6, GATHERED))
     low_x, low_y, low_z = sides[0], sides[1], sides[2]
     high_x, high_y, high_z = sides[3], sides[4], sides[5]
@@ -247,7 +245,7 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
                 visited |= U(1) << at
                 at = U(place_of_least(apart, visited))
                 if count > k:
-                    bound = keep_least(squares, indices, count, k, bound, floats)
+                    bound = select(squares, indices, count, k)
                     count = k
                 num_close = U(0)
                 for i in range(U(1), U(num_near)):
@@ -259,10 +257,10 @@ def find_nearest(tree, block, within_sq, ordered, near, squared):
                             xs, ys, zs, close[i], x, y, z, bound, count, squares, indices, apart
                         )
                         if count > full:
-                            bound = keep_least(squares, indices, count, k, bound, floats)
+                            bound = select(squares, indices, count, k)
                             count = k
             if count > k:
-                bound = keep_least(squares, indices, count, k, bound, floats)
+                bound = select(squares, indices, count, k)
             else:
                 bound = largest(squares, k) if count == k else within_sq
             count = min(count, k)
