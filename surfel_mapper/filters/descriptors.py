@@ -212,50 +212,6 @@ class Sphericality(Filter):
 
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TimeSlice(Filter):
-    """Keep the points measured within a time interval of their scan."""
-
-    start_s: float = parameter(0.0, 'Start of the interval, s.')
-    end_s: float = parameter(math.inf, 'End of the interval, not included, s.')
-    since: str = parameter(
-        'first',
-        'Times count from the first point of the scan, from the stamp of the scan, or are taken '
-        'as they are (zero).',
-        choices=('first', 'stamp', 'zero'),
-    )
-    column_name: str = parameter('', 'Column of the times; empty: the first usual name present.')
-    unit_s: float = parameter(0.0, 'Unit of the times, s; 0: integers are ns, others s.', low=0.0)
-
-    def check(self) -> None:
-        """Refuse an empty interval."""
-        if not self.start_s < self.end_s:
-            raise ConfigError(
-                f'{self.name}: end_s: {self.end_s:g}, expected more than start_s '
-                f'({self.start_s:g})'
-            )
-
-    def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; those without a time do not."""
-        seconds = self.seconds(scan)
-        return np.asarray((seconds >= self.start_s) & (seconds < self.end_s))
-
-    def seconds(self, scan: Scan) -> npt.NDArray[np.float64]:
-        """Return the times of the points since the chosen origin, s."""
-        names = [name for name in TIME_COLUMNS if name in scan.columns]
-        times = self.column(scan, self.column_name or (names[0] if names else 'time'))
-        whole = times.dtype.kind in 'iu'
-        unit_s = self.unit_s or (1e-9 if whole else 1.0)
-        times = times.astype(np.int64 if whole else np.float64)
-        if self.since == 'first' and len(times):
-            times = times - (times.min() if whole else np.nanmin(times))
-        elif self.since == 'stamp':  # subtracted as integers: float64 cannot hold ns since 1970
-            stamp = scan.stamp_ns if unit_s == 1e-9 else scan.stamp_ns / 1e9 / unit_s
-            times = times - (round(stamp) if whole else stamp)
-        return np.asarray(times * unit_s)
-
-
-@register
-@dataclass(frozen=True, slots=True, kw_only=True)
 class LabelMask(Filter):
     """Drop, or keep, the points that have one of some labels."""
 

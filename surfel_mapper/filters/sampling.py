@@ -29,7 +29,7 @@ import numpy as np
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.base import Filter, FiniteFilter, generator, Mask, parameter, select
 from surfel_mapper.filters.columns import DENSITIES, NORMALS, with_normals
-from surfel_mapper.filters.kernels.sampling import choose, choose_farthest
+from surfel_mapper.filters.kernels.sampling import choose
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
@@ -298,25 +298,3 @@ def normals_of(filter_: Filter, scan: Scan) -> Points:
     if normals.shape != (len(scan), 3):
         raise FilterError(f'{NORMALS}: shape {normals.shape}, expected (N, 3)')
     return normals.astype(np.float64)
-
-
-@register
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FarthestPointSampling(FiniteFilter):
-    """Keep a number of points, each the farthest from those chosen before."""
-
-    num_points: int = parameter(1000, 'Number of points that stay.', low=1, high=UINT32_MAX)
-
-    def apply_finite(self, scan: Scan) -> Scan:
-        """
-        Return the points chosen, in their order; the first point of the scan is always one.
-
-        Each choice compares all points with the last one chosen: 1000 of 131,072 take 0.2 s.
-
-        Source: Eldar et al. 1997, The farthest point strategy for progressive image sampling.
-        """
-        if len(scan) <= self.num_points:
-            return scan
-        chosen = np.zeros(len(scan), np.bool_)
-        choose_farthest(coordinates(scan), self.num_points, chosen)
-        return select(scan, chosen)

@@ -143,41 +143,6 @@ def sweep(**columns):
     return scan_of(np.zeros((4, 3)), stamp_ns=NS, **columns)
 
 
-@pytest.mark.parametrize(
-    ('column', 'settings'),
-    [
-        (np.array([0, 20, 50, 70], np.uint32) * 10**6, {}),  # ns since the first point
-        (np.array([1.0, 1.02, 1.05, 1.07]), {}),  # s
-        (NS + np.array([0, 20, 50, 70]) * 10**6, {}),  # ns since 1970, exact
-        (
-            NS + np.array([-70, -50, -20, 0]) * 10**6,
-            {'since': 'stamp', 'start_s': -0.055, 'end_s': -0.01},
-        ),
-        (np.array([0, 20, 50, 70], np.uint16), {'unit_s': 1e-3}),
-        (np.array([0.0, 20.0, 50.0, 70.0], np.float32), {'unit_s': 1e-3, 'since': 'zero'}),
-    ],
-)
-def test_time_slice_keeps_points_from_a_time_on_until_another(column, settings):
-    settings = {'start_s': 0.02, 'end_s': 0.06, **settings}
-    scan = sweep(time=column)
-    expected = [1, 2]
-    assert rows_kept('time_slice', scan, **settings) == expected
-
-
-def test_time_slice_counts_its_start_in_and_its_end_out():
-    scan = sweep(t=np.array([0, 1, 2, 3], np.uint32) * 10**9)
-    assert rows_kept('time_slice', scan, start_s=1.0, end_s=3.0) == [1, 2]
-
-
-def test_time_slice_takes_the_first_usual_column_or_the_one_named():
-    scan = sweep(stamps=[0.0, 1.0, 2.0, np.nan])
-    assert rows_kept('time_slice', scan, column_name='stamps', start_s=1.0) == [1, 2]
-    with pytest.raises(FilterError, match="needs the column 'time'; the points have stamps"):
-        filter_of('time_slice').apply(scan)
-    with pytest.raises(ConfigError, match='end_s: 1, expected more than start_s'):
-        filter_of('time_slice', start_s=1.0, end_s=1.0)
-
-
 def test_label_mask_drops_or_keeps_points_with_certain_labels():
     scan = sweep(label=np.array([3, 1, 4, 1], np.uint16), object=[1, 2, 1, 2])
     assert rows_kept('label_mask', scan, labels=[1, 9]) == [0, 2]

@@ -40,8 +40,6 @@ COMPANIONS = {
     ('add_descriptor', 'num_components'): lambda value: {'values': (0.0,) * min(value, 9)},
     ('range_limit', 'min_m'): lambda value: {'max_m': math.inf},
     ('range_limit', 'max_m'): lambda value: {'min_m': 0.0},
-    ('time_slice', 'start_s'): lambda value: {'end_s': math.inf},
-    ('time_slice', 'end_s'): lambda value: {'start_s': -math.inf},
     ('field_of_view', 'azimuth_min_deg'): lambda value: {'azimuth_max_deg': value + 1.0},
     ('field_of_view', 'azimuth_max_deg'): lambda value: {'azimuth_min_deg': value - 1.0},
     ('field_of_view', 'elevation_min_deg'): lambda value: {'elevation_max_deg': 90.0},
@@ -52,8 +50,6 @@ COMPANIONS = {
 JOINT = {
     ('add_descriptor', 'num_components'),
     ('range_limit', 'min_m'),
-    ('time_slice', 'start_s'),
-    ('time_slice', 'end_s'),
     ('field_of_view', 'azimuth_min_deg'),
     ('field_of_view', 'azimuth_max_deg'),
 }

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import FilterError
-from surfel_mapper.filters.kernels.sampling import choose_farthest
 from surfel_mapper.filters.sampling import resistance
 from test.filters.examples import filter_of, kept, random_scan, scan_of
 
@@ -219,30 +218,3 @@ def test_rotations_are_measured_by_a_length(norm, length):
     forces = np.hstack([arms, normals])
     held = np.linalg.eigvalsh(forces.T @ forces)[3:]  # nothing holds x, y and turns about z
     np.testing.assert_allclose(np.linalg.eigvalsh(found.T @ found), held, atol=1e-12)
-
-
-def slow_farthest(points, number):
-    chosen = [0]
-    while len(chosen) < number:
-        apart = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(axis=1)
-        if apart.max() == 0.0:
-            break
-        chosen.append(int(np.argmax(apart)))
-    return sorted(chosen)
-
-
-@pytest.mark.parametrize('number', [1, 2, 17, 60])
-@pytest.mark.parametrize('compiled', [True, False])
-def test_farthest_points_equal_the_slow_choice(number, compiled):
-    points = np.random.default_rng(9).normal(size=(60, 3))
-    chosen = np.zeros(60, np.bool_)
-    (choose_farthest if compiled else choose_farthest.py_func)(points, number, chosen)
-    assert np.flatnonzero(chosen).tolist() == slow_farthest(points, number)
-    assert kept('farthest_point_sampling', points, num_points=number) == slow_farthest(
-        points, number
-    )
-
-
-def test_farthest_points_are_places():
-    points = np.repeat([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]], 20, axis=0)
-    assert kept('farthest_point_sampling', points, num_points=10) == [0, 20, 40]
