@@ -23,8 +23,7 @@ import zlib
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, FLOOR_BYTES
-from surfel_mapper.errors import CloudFormatError, ConfigError
+from surfel_mapper.errors import CloudFormatError
 
 TRANSPORTS = ('compressed', 'compressedDepth')
 """Last part of the name of a topic of compressed images."""
@@ -32,17 +31,8 @@ TRANSPORTS = ('compressed', 'compressedDepth')
 DEPTH_HEADER = np.dtype([('format', '<i4'), ('quantum', '<f4', 2)])
 """Header of compressedDepth: the two numbers convert quantised inverse depth to metres."""
 
-MAX_PIXELS = 1 << 26
-"""Larger images are refused: 8192 x 8192 pixels."""
-
-GREY_BYTES, COLOR_BYTES, CONVERTED_BYTES = 6, 10, 14
-"""
-Memory per pixel of grey images, of colours, and of those converted to colours (1 bit, palette,
-alpha): as decoded, converted, as bytes and as an array. Measured: 3 to 6, 9.4, 11 to 13.5.
-"""
-
-SCANS_BYTES = 6
-"""More of a JPEG of several scans, of which the decoder keeps all coefficients."""
+MAX_PIXELS = 1 << 25
+"""Larger images are refused: 8192 x 4096 pixels, which need 0.3 GB while they are decoded."""
 
 JPEG_MAGIC, START_OF_SCAN = b'\xff\xd8', b'\xff\xda'
 """First bytes of a JPEG; mark before each of its scans, which no compressed data contains."""
@@ -153,12 +143,12 @@ def pixels_of(
 
     try:
         with Image.open(io.BytesIO(data), formats=formats) as image:
+            check_scans(data, topic)
             width, height = image.size
-            pixel_bytes = bytes_of(image.mode, checked_scans(data, topic))
-            check_size(width, height, len(data), topic, size, pixel_bytes)
+            check_size(width, height, topic, size)
             shown = image if image.mode in ENCODINGS else image.convert('RGB')
             pixels = np.asarray(shown)
-    except (CloudFormatError, ConfigError):
+    except CloudFormatError:
         raise
     except (*DAMAGED, Image.DecompressionBombError) as error:
         expected = ' or '.join(formats)
@@ -167,34 +157,19 @@ def pixels_of(
     return encoding, np.ascontiguousarray(pixels, '<u2' if encoding == '16UC1' else 'u1')
 
 
-def checked_scans(data: bytes, topic: str) -> int:
+def check_scans(data: bytes, topic: str) -> None:
     """
-    Return the scans of a JPEG, 0 of others; raise CloudFormatError for more than encoders write.
+    Raise CloudFormatError if a JPEG has more scans than encoders write.
 
     Each scan of 23 bytes makes the decoder pass over all pixels: 76 kB took over a minute.
     """
     number = data.count(START_OF_SCAN) if data.startswith(JPEG_MAGIC) else 0
     if number > MAX_SCANS:
         raise CloudFormatError(f'{topic}: a JPEG of {number} scans, expected at most {MAX_SCANS}')
-    return number
 
 
-def bytes_of(mode: str, num_scans: int) -> int:
-    """Return the memory that decoding takes per pixel, of an image in a mode of Pillow."""
-    plain = COLOR_BYTES if mode == 'RGB' else GREY_BYTES
-    decoded = plain if mode in ENCODINGS else CONVERTED_BYTES
-    return decoded + SCANS_BYTES * (num_scans > 1)
-
-
-def check_size(
-    width: int,
-    height: int,
-    num_bytes: int,
-    topic: str,
-    size: tuple[int, int] | None,
-    pixel_bytes: int,
-) -> None:
-    """Raise CloudFormatError if an image has another size than its camera, or too many pixels."""
+def check_size(width: int, height: int, topic: str, size: tuple[int, int] | None) -> None:
+    """Raise CloudFormatError if an image is not of its calibration, or too large."""
     if size is not None and (width, height) != size:
         raise CloudFormatError(
             f'{topic}: image of {width} x {height} pixels, the calibration is for '
@@ -202,7 +177,3 @@ def check_size(
         )
     if width * height > MAX_PIXELS:
         raise CloudFormatError(f'{topic}: {width} x {height} pixels, more than {MAX_PIXELS}')
-    needed = width * height * pixel_bytes
-    floor = FLOOR_BYTES if size is None else max(FLOOR_BYTES, needed)
-    budget = Budget(topic, num_bytes, CloudFormatError, floor=floor)
-    budget.take(needed, f'image of {width} x {height} pixels')
