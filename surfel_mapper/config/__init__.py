@@ -46,7 +46,6 @@ from surfel_mapper.config.stages import MapConfig as MapConfig
 from surfel_mapper.config.stages import OutputConfig as OutputConfig
 from surfel_mapper.config.stages import PoseConfig as PoseConfig
 from surfel_mapper.config.stages import PublishConfig as PublishConfig
-from surfel_mapper.config.stages import ViewerConfig as ViewerConfig
 from surfel_mapper.config.stages import WindowConfig as WindowConfig
 from surfel_mapper.config.tables import allowed as allowed
 from surfel_mapper.config.tables import FIRST as FIRST

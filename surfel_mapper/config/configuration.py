@@ -41,7 +41,6 @@ from surfel_mapper.config.stages import (
     OutputConfig,
     PoseConfig,
     PublishConfig,
-    ViewerConfig,
     WindowConfig,
 )
 from surfel_mapper.config.yaml_files import read_yaml
@@ -78,7 +77,6 @@ class Config:
     input: InputConfig = field(default_factory=InputConfig)
     deskew: DeskewConfig = field(default_factory=DeskewConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
-    viewer: ViewerConfig = field(default_factory=ViewerConfig)
     grid: GridConfig = field(default_factory=GridConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     tsdf: TsdfConfig = field(default_factory=TsdfConfig)

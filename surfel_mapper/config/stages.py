@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import ClassVar
 
 from surfel_mapper.arguments import is_unit
 from surfel_mapper.config.settings import read_number, setting, Stage
@@ -28,8 +27,6 @@ MAX_ORIGIN_M = 1e9
 """Limit of a coordinate of map.origin, m: float64 resolves 0.1 micrometres there."""
 
 MARKER_COLORS = ('planarity', 'normal', 'age')
-
-VIEWER_COLORS = ('normal', 'height', 'planarity', 'intensity', 'rgb', 'age')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -390,26 +387,6 @@ class PublishConfig(Stage):
                 f'{stage}.marker_color: age is known of voxels, expected another colour with '
                 f'{stage}.adaptive'
             )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ViewerConfig(Stage):
-    """The page on which a node shows its map in a browser; needs rerun."""
-
-    enabled: bool = setting(
-        False,
-        'Serve a page with the map at http://127.0.0.1:PORT, for this machine only.',
-    )
-    port: int = setting(
-        9090, 'Port of the page; the data are on the next one.', low=1024, high=65534
-    )
-
-    # No settings: callers of the library may change the fields.
-    rate_hz: float = 2.0
-    """At most this many scans are shown, Hz."""
-
-    color: ClassVar[str] = 'normal'
-    """Colour of the surfels."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,7 +10,6 @@ from contextlib import suppress
 from functools import partial
 import threading
 import time
-from typing import TYPE_CHECKING
 
 from surfel_mapper.compilation import CompileStage, run_stages
 from surfel_mapper.config import Config
@@ -29,9 +28,6 @@ from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.outputs import Outputs
 from surfel_mapper.ros.pose_outputs import registration_outputs
 from surfel_mapper.ros.services import Services
-
-if TYPE_CHECKING:
-    from surfel_mapper.ros.live_viewer import LiveViewer
 
 LATEST = 200
 """Scans whose latencies are kept for the percentiles: 10 s at 20 Hz."""
@@ -94,7 +90,6 @@ class Session:
         self.latencies_s: deque[float] = deque(maxlen=LATEST)
         self._changing = threading.Lock()  # transitions and settings come from two threads
         self._is_active = False
-        self._viewer = self._opened_viewer()
         self.thread.start(self._on_update)
 
     def activate(self) -> None:
@@ -131,8 +126,6 @@ class Session:
         self._writer.close()
         with self.mapper.guarded('the end of the outputs'):
             self.outputs.close()
-            if self._viewer is not None:
-                self._viewer.close()
         log = self._node.get_logger()
         with self.mapper.guarded('the end of the input'):
             self.mapper.finish()
@@ -145,16 +138,6 @@ class Session:
             except Exception as error:  # MemoryError too
                 log.error(f'the map could not be saved: {error or repr(error)}')
         log.info(report(self.mapper))
-
-    def _opened_viewer(self) -> LiveViewer | None:
-        """Return the page of the map, if it is wanted; rerun is loaded only then."""
-        if not self.config.viewer.enabled:
-            return None
-        from surfel_mapper.ros.live_viewer import LiveViewer
-
-        viewer = LiveViewer(self.mapper)
-        self._node.get_logger().info(f'the map is shown at {viewer.address}')
-        return viewer
 
     def _start_timers(self) -> None:
         """Start publishing at rates; called with the lock held."""
@@ -169,9 +152,6 @@ class Session:
                 f'{self.mapper.map.num_voxels} voxels'
             )
         self.outputs.publish_update(update)
-        with self.mapper.guarded('showing a scan'):
-            if self._viewer is not None:
-                self._viewer.add(update)
         with self.mapper.guarded('publishing of the pose'):
             if self.registration is not None:
                 self.registration.publish(update)
