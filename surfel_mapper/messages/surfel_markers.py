@@ -20,8 +20,6 @@ import numpy.typing as npt
 
 from surfel_mapper.geometry import face_normals
 from surfel_mapper.mapping.ages import Ages
-from surfel_mapper.messages.kernels.discs import draw_discs, draw_normals
-from surfel_mapper.messages.kernels.triangles import draw_triangles
 from surfel_mapper.messages.markers import ADD, DELETE, LINE_LIST, Marker, TRIANGLE_LIST
 
 if TYPE_CHECKING:
@@ -99,13 +97,10 @@ def surfel_markers(
 
     """
     rows = np.flatnonzero(np.isfinite(surfels.normal[:, 0]))  # nan in all of it, or in none
-    drawn = (surfels.position, surfels.normal)
-    discs = np.empty((len(rows) * 3 * (SEGMENTS - 2), 3))
-    disc_colors = np.empty((len(discs), 4), np.float32)
+    position, normal = surfels.position[rows], surfels.normal[rows]
     radius = disc_radius(surfels.eigenvalues[rows], surfels.size[rows])
-    draw_discs(drawn, rows, radius, colors[rows], CIRCLE, discs, disc_colors)
-    lines = np.empty((2 * len(rows), 3))
-    draw_normals(drawn, rows, 0.5 * voxel_size_m, lines)
+    discs = disc_triangles(position, normal, radius, CIRCLE)
+    lines = np.stack([position, position + 0.5 * voxel_size_m * normal], axis=1)
     action = ADD if len(rows) else DELETE
     return [
         Marker(
@@ -115,8 +110,8 @@ def surfel_markers(
             action=action,
             frame_id=frame_id,
             stamp_ns=stamp_ns,
-            points=discs,
-            colors=disc_colors,
+            points=discs.reshape(-1, 3),
+            colors=np.repeat(colors[rows], discs.shape[1], axis=0),
         ),
         Marker(
             ns='normals',
@@ -127,9 +122,34 @@ def surfel_markers(
             stamp_ns=stamp_ns,
             scale=(0.02 * voxel_size_m, 0.0, 0.0),
             color=NORMAL_COLOR,
-            points=lines,
+            points=lines.reshape(-1, 3),
         ),
     ]
+
+
+def disc_triangles(
+    position: npt.NDArray[np.float64],
+    normal: npt.NDArray[np.float64],
+    radius: npt.NDArray[np.float64],
+    circle: npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    """
+    Return the corners (K, 3 (S - 2), 3) of triangles that make up discs, counter-clockwise.
+
+    The corners (S, 2) of the circle are turned by two axes that are orthogonal to each normal.
+
+    Source: Duff et al. 2017, Building an orthonormal basis, revisited, for the axes.
+    """
+    x, y, z = normal.T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    u = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    v = np.stack([b, sign + y * y * a, -y], axis=1)
+    c, s = circle.T[:, None, :, None] * radius[:, None, None]
+    corners = position[:, None] + (c * u[:, None] + s * v[:, None])
+    fan = [corner for k in range(1, len(circle) - 1) for corner in (0, k, k + 1)]
+    return np.asarray(corners[:, fan])
 
 
 def disc_radius(
@@ -211,9 +231,12 @@ def mesh_marker(mesh: Mesh, *, number: int, stamp_ns: int, frame_id: str) -> Mar
         Of the mesh.
 
     """
-    points, colors = np.empty((3 * len(mesh), 3)), np.empty((3 * len(mesh), 4), np.float32)
-    light = LIGHT / np.linalg.norm(LIGHT)
-    draw_triangles(mesh.vertices, mesh.triangles, mesh.colors, light, points, colors)
+    corners = mesh.vertices[mesh.triangles]
+    colors = np.ones((len(mesh), 3, 4), np.float32)
+    if len(mesh.colors):
+        colors[..., :3] = mesh.colors[mesh.triangles] / np.float32(255.0)
+    else:
+        colors[..., :3] = shade(corners)[:, None, None]
     return Marker(
         ns='mesh',
         id=number,
@@ -221,8 +244,8 @@ def mesh_marker(mesh: Mesh, *, number: int, stamp_ns: int, frame_id: str) -> Mar
         action=ADD if len(mesh) else DELETE,
         frame_id=frame_id,
         stamp_ns=stamp_ns,
-        points=points,
-        colors=colors,
+        points=corners.reshape(-1, 3),
+        colors=colors.reshape(-1, 4),
     )
 
 

@@ -38,8 +38,6 @@ REFERENCES = {
     'mapping/kernels/rows.py': 'mapping/kernels/test_rows.py',
     'mapping/kernels/surfels.py': 'mapping/kernels/test_surfels.py',
     'mapping/kernels/voxels.py': 'mapping/test_surfel_map.py',
-    'messages/kernels/discs.py': 'messages/test_surfel_markers.py',
-    'messages/kernels/triangles.py': 'messages/test_surfel_markers.py',
     'models/kernels/bisection.py': 'models/kernels/test_bisection.py',
     'models/kernels/charts.py': 'models/test_fitting.py',
     'models/kernels/coverage.py': 'models/test_coverage.py',

@@ -7,7 +7,6 @@ import pytest
 
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
-from surfel_mapper.messages.kernels.discs import draw_discs
 from surfel_mapper.messages.markers import (
     ADD,
     DELETE,
@@ -18,6 +17,7 @@ from surfel_mapper.messages.markers import (
 from surfel_mapper.messages.surfel_markers import (
     disc_colors,
     disc_radius,
+    disc_triangles,
     mesh_marker,
     normal_colors,
     SEGMENTS,
@@ -25,7 +25,6 @@ from surfel_mapper.messages.surfel_markers import (
     surfel_markers,
 )
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
-from test.kernels.modes import both
 from test.messages.examples import make_surfels
 
 CORNERS = 3 * (SEGMENTS - 2)
@@ -44,24 +43,14 @@ def circle(segments):
 AXES = np.vstack([np.eye(3), -np.eye(3), [[0.0, -0.0, -1.0]], [[1e-9, 0.0, -1.0]]])
 
 
-@both
 @pytest.mark.parametrize('segments', [3, 4, 8, 13])
-def test_triangles_tile_a_regular_polygon_that_faces_along_the_normal(segments, call):
+def test_triangles_tile_a_regular_polygon_that_faces_along_the_normal(segments):
     normal = np.vstack([AXES, make_surfels(30).normal])
     num = len(normal)
     rng = np.random.default_rng(2)
     position, radius = rng.uniform(-50.0, 50.0, (num, 3)), rng.uniform(0.1, 0.3, num)
-    rows = rng.permutation(num)
-    points = np.empty((num * (segments - 2) * 3, 3))
-    colors = np.empty((len(points), 4), np.float32)
-    given = rng.uniform(size=(num, 4)).astype(np.float32)
+    points = disc_triangles(position, normal, radius, circle(segments))
 
-    call(
-        draw_discs,
-        *((position, normal), rows, radius, given, circle(segments), points, colors),
-    )
-
-    position, normal = position[rows], normal[rows]
     a, b, c = points.reshape(num, segments - 2, 3, 3).transpose(2, 0, 1, 3)
     offset = points.reshape(num, -1, 3) - position[:, None]
     np.testing.assert_allclose(
@@ -72,7 +61,6 @@ def test_triangles_tile_a_regular_polygon_that_faces_along_the_normal(segments, 
     assert (twice_area > 0.0).all()  # counter-clockwise
     polygon = 0.5 * segments * radius**2 * np.sin(2.0 * np.pi / segments)
     np.testing.assert_allclose(0.5 * twice_area.sum(axis=1), polygon)
-    np.testing.assert_array_equal(colors, np.repeat(given, 3 * (segments - 2), axis=0))
 
 
 def test_the_discs_of_full_voxels_touch():
