@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.base import FiniteFilter, generator, parameter, select, with_points
-from surfel_mapper.filters.kernels.voxel_grid import average, group_points
+from surfel_mapper.filters.kernels.voxel_grid import group_points
 from surfel_mapper.filters.merging import MergedColumns, PointGroups
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.registry import register
@@ -100,8 +100,7 @@ class VoxelGrid(FiniteFilter):
         with_rows = bool(scan.columns) and self.average_columns
         keys, sums, groups = grid.group(scan.points, with_rows)
         if self.use_centroid:
-            means: npt.NDArray[Any] = np.empty((len(sums), 3), scan.points.dtype, order='F')
-            average(sums, means.T)
+            means = sums[:, :3] / sums[:, 3:]
         else:
             means = grid.centres(keys)
         unit = self.unit_normals

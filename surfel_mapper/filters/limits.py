@@ -30,7 +30,6 @@ from surfel_mapper.filters.kernels.limits import (
     in_wedge,
     NEVER,
     outside_box,
-    sum_squares,
 )
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
@@ -189,9 +188,9 @@ def measure(scan: Scan, axis: int, limit_m: float) -> tuple[npt.NDArray[Any], An
 
 def range_sq(points: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return the squared distances (N,) from the origin, in the type of the coordinates, m^2."""
-    squares = np.empty(len(points), points.dtype)
-    sum_squares(points.T, squares)
-    return squares
+    x, y, z = points.T
+    with np.errstate(over='ignore'):  # of far points, which are beyond any limit
+        return np.asarray((x * x + y * y) + z * z)
 
 
 @register(libpointmatcher='AngleLimitDataPointsFilter')

@@ -15,7 +15,7 @@ the scan. There is no dense grid.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import inlined, kernel, U
+from surfel_mapper.kernels.compiling import inlined, U
 from surfel_mapper.kernels.grouping import AHEAD, CHUNK, enlarged_table, find_runs, number_runs
 
 ROWS = 4096
@@ -126,18 +126,3 @@ def spread_rows(chunk_keys, run_rows, rows):
         run += U(chunk_keys[i] != previous)
         previous = chunk_keys[i]
         rows[i] = run_rows[run]
-
-
-@kernel(error_model='numpy')
-def average(sums, means):
-    """
-    Divide the sums by the counts.
-
-    sums   (K, 4) float64, sum of x, y, z and number of points
-    means  (3, K) float32 or float64, out
-    """
-    for i in range(U(len(sums))):
-        count = sums[i, 3]
-        means[0, i] = sums[i, 0] / count
-        means[1, i] = sums[i, 1] / count
-        means[2, i] = sums[i, 2] / count
