@@ -21,7 +21,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline.preparation import reduced
-from surfel_mapper.pipeline.prepared import FilteredScan
+from surfel_mapper.pipeline.prepared import Prepared
 from surfel_mapper.scan import Scan
 from surfel_mapper.threads import pool
 
@@ -32,7 +32,7 @@ class Begun(NamedTuple):
     scan: Scan
     T_map_sensor: Transform
     config: Config
-    result: Future[FilteredScan]
+    result: Future[Prepared]
 
     def is_of(self, scan: Scan, T_map_sensor: Transform, config: Config) -> bool:
         """Return whether a scan is this one, at the same pose and with the same settings."""
@@ -64,7 +64,7 @@ class LookAhead:
         scan: Scan,
         T_map_sensor: Transform,
         config: Config,
-        prepare: Callable[[Scan, Transform], Callable[[], FilteredScan]],
+        prepare: Callable[[Scan, Transform], Callable[[], Prepared]],
     ) -> None:
         """
         Begin to prepare and reduce a scan in the other thread, unless that was begun before.
@@ -81,7 +81,7 @@ class LookAhead:
 
     def take(
         self, scan: Scan, T_map_sensor: Transform, config: Config
-    ) -> Callable[[], FilteredScan] | None:
+    ) -> Callable[[], Prepared] | None:
         """Return the function that waits for a scan that was begun, and None for another scan."""
         begun, self._begun = self._begun, None
         if begun is None or not begun.is_of(scan, T_map_sensor, config):
@@ -90,11 +90,11 @@ class LookAhead:
 
 
 def run_ahead(
-    work: Callable[[], FilteredScan],
+    work: Callable[[], Prepared],
     T_map_sensor: Transform,
     surfel_map: SurfelMap,
     config: Config,
-) -> FilteredScan:
+) -> Prepared:
     """Prepare and reduce a scan; errors of reduction wait until its moments are asked for."""
     prepared = work()
     try:

@@ -30,7 +30,7 @@ from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.drops import Drops, GATED
 from surfel_mapper.pipeline.local_map import LocalMap
 from surfel_mapper.pipeline.mapping_stages import expected_type
-from surfel_mapper.pipeline.prepared import FilteredScan, Prepared
+from surfel_mapper.pipeline.prepared import Prepared
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses, viewpoint
@@ -99,7 +99,7 @@ class Preparation:
             and self._poses.registered is None
         )
 
-    def ahead(self, scan: Scan, pose: Transform) -> Callable[[], FilteredScan]:
+    def ahead(self, scan: Scan, pose: Transform) -> Callable[[], Prepared]:
         """
         Look up the poses that a scan needs; return the function that deskews and filters it.
 
@@ -109,7 +109,7 @@ class Preparation:
         chain = self.chain
         T_base_sensor = self._poses.of_base(scan) if chain.filters else None
 
-        def prepare() -> FilteredScan:
+        def prepare() -> Prepared:
             return filtered_scan(
                 scan if deskewing is None else deskewing(), pose, chain, T_base_sensor
             )
@@ -134,7 +134,7 @@ class Preparation:
         pose: Transform,
         config: Config,
         laps: Laps,
-        begun: Callable[[], FilteredScan] | None = None,
+        begun: Callable[[], Prepared] | None = None,
     ) -> list[Prepared]:
         """
         Deskew, filter and register a scan; return the scans that can be mapped now.
@@ -169,15 +169,14 @@ class Preparation:
         is_gated = bool(gate.gate_distance_m or gate.gate_angle_deg)
         if is_gated and registered is None:
             self._check_motion(scan, pose, gate)
-        outcome = self._filtered(scan, pose, laps) if begun is None else begun()
+        prepared = self._filtered(scan, pose, laps) if begun is None else begun()
         if self.chain.filters:
             laps.end('filter')
-            self._count_steps(outcome)
+            self._count_steps(prepared)
         elif begun is not None and times is not None:
             laps.end('deskew')
         if self._around.surfel_map.columns:
-            self._check_columns(outcome.filtered)
-        prepared = Prepared(outcome.scan, outcome.filtered, pose, windowed=outcome.windowed)
+            self._check_columns(prepared.filtered)
         if registered is None:
             return [prepared]
         confirmed = self._register(registered, prepared, times)
@@ -186,7 +185,7 @@ class Preparation:
             self._check_motion(confirmed[0].scan, confirmed[0].T_map_sensor, gate)
         return confirmed
 
-    def _filtered(self, scan: Scan, pose: Transform, laps: Laps) -> FilteredScan:
+    def _filtered(self, scan: Scan, pose: Transform, laps: Laps) -> Prepared:
         """Return a scan deskewed, joined with images, and filtered; raise FilterError."""
         if self._needs_free_rays and scan.free is None:  # first: deskewing makes nan of inf
             scan = replace(scan, free=free_directions(scan, self._deskewed))
@@ -198,19 +197,19 @@ class Preparation:
         if self._needs_free_rays or self._images is not None:
             laps.end('images')
         if not self.chain.filters:
-            return FilteredScan(scan, scan)
+            return Prepared(scan, scan, pose)
         return filtered_scan(scan, pose, self.chain, self._poses.of_base(scan))
 
     def _deskewed(self, scan: Scan) -> Scan:
         """Return a scan with all points in the sensor frame at its stamp."""
         return scan if scan.times is None else self._poses.deskewing(scan, scan.times)()
 
-    def _count_steps(self, outcome: FilteredScan) -> None:
+    def _count_steps(self, prepared: Prepared) -> None:
         """Count what the filters did; raise if they left no points."""
-        counters, num_points = self._drops.counters, len(outcome.filtered)
-        for s in outcome.steps:
+        counters, num_points = self._drops.counters, len(prepared.filtered)
+        for s in prepared.steps:
             counters.add_filter(s.name, s.points_in, s.points_out, s.milliseconds, s.not_finite)
-        counters.points_left_out['filtered'] += len(outcome.scan) - num_points
+        counters.points_left_out['filtered'] += len(prepared.scan) - num_points
         if not num_points:
             raise ScanRefusedError('filtered_out', 'the filters left none of its points')
 
@@ -280,7 +279,7 @@ class Preparation:
 
 def filtered_scan(
     scan: Scan, pose: Transform, chain: Chain, T_base_sensor: Transform | None
-) -> FilteredScan:
+) -> Prepared:
     """
     Return a deskewed scan filtered.
 
@@ -293,9 +292,9 @@ def filtered_scan(
 
     """
     if not chain.filters:
-        return FilteredScan(scan, scan)
+        return Prepared(scan, scan, pose)
     filtered, steps = chain.run(replace(scan, T_base_sensor=T_base_sensor, T_map_sensor=pose))
-    return FilteredScan(scan, filtered, steps)
+    return Prepared(scan, filtered, pose, steps)
 
 
 def stands_still(T_map_last: Transform, T_map_sensor: Transform, gate: WindowConfig) -> bool:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Prepared: a scan that is ready for the map; FilteredScan: one whose pose is not settled yet."""
+"""Prepared: a scan that is ready for the map, or for registration."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from surfel_mapper.scan import Scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FilteredScan:
+class Prepared:
     """
-    A scan before and after the filters.
+    A scan that is ready for the map, or for registration.
 
     Attributes
     ----------
@@ -24,32 +24,10 @@ class FilteredScan:
         Deskewed, before the filters.
     filtered : Scan
         After the filters; the same if there are none.
+    T_map_sensor : (4, 4) float64
+        Its pose; before registration the predicted one.
     steps : tuple of Step
         What each filter did.
-    windowed : WindowedScan or Exception, optional
-        Its moments, or the error of reducing it, if another thread has done so.
-
-    """
-
-    scan: Scan
-    filtered: Scan
-    steps: tuple[Step, ...] = ()
-    windowed: WindowedScan | Exception | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prepared:
-    """
-    A scan that is ready for the map.
-
-    Attributes
-    ----------
-    scan : Scan
-        Deskewed, before the filters.
-    filtered : Scan
-        After the filters.
-    T_map_sensor : (4, 4) float64
-        Its pose.
     registration : RegistrationResult, optional
         If poses come from registration to the map.
     T_fixed_body : (4, 4) float64, optional
@@ -62,6 +40,7 @@ class Prepared:
     scan: Scan
     filtered: Scan
     T_map_sensor: Transform
+    steps: tuple[Step, ...] = ()
     registration: RegistrationResult | None = None
     T_fixed_body: Transform | None = None
     windowed: WindowedScan | Exception | None = None
