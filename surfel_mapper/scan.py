@@ -10,7 +10,7 @@ when they are first read, most often by the thread that reduces the scan.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, cast, TYPE_CHECKING
@@ -87,6 +87,48 @@ class LazyPoints:
     def __len__(self) -> int:
         """Return the number of points."""
         return self.num_points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ComputedColumns(Mapping[str, npt.NDArray[Any]]):
+    """
+    Columns that are each computed when they are first read: most never are.
+
+    Attributes
+    ----------
+    names : collection of str
+        The columns that there are.
+    compute : callable
+        Returns the column of a name.
+    num_rows : int
+        Rows of each column.
+
+    """
+
+    names: Collection[str]
+    compute: Callable[[str], npt.NDArray[Any]]
+    num_rows: int
+    _computed: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        """Return a column, the same array every time."""
+        if name not in self._computed:
+            if name not in self.names:
+                raise KeyError(name)
+            self._computed[name] = self.compute(name)
+        return self._computed[name]
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether the column exists, without computing it."""
+        return name in self.names
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        """Return the number of columns."""
+        return len(self.names)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -34,7 +34,7 @@ from surfel_mapper.filters.base import (
 from surfel_mapper.filters.columns import DENSITIES
 from surfel_mapper.filters.descriptors import TIME_COLUMNS, times_of
 from surfel_mapper.filters.kernels.boxes import cut
-from surfel_mapper.filters.merging import MergedColumns, PointGroups
+from surfel_mapper.filters.merging import merged_columns, PointGroups
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.registry import register
 from surfel_mapper.filters.shapes import as_matrices, eigen, EIGEN_OF, Moments, ShapeFilter, shares
@@ -182,7 +182,7 @@ class BoxFilter(ShapeFilter):
         out_row[chosen] = np.arange(len(chosen))
         inside = select(scan, fit[boxes.rows])
         groups = PointGroups.of(out_row[boxes.rows[fit[boxes.rows]]], len(chosen))
-        columns = MergedColumns(inside.columns, groups, average=self.average_columns)
+        columns = merged_columns(inside.columns, groups, average=self.average_columns)
         means = with_points(inside, boxes.moments.mean[chosen], columns)
         return means, chosen
 

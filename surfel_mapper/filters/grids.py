@@ -29,7 +29,7 @@ import numpy.typing as npt
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.base import FiniteFilter, generator, parameter, select, with_points
 from surfel_mapper.filters.kernels.voxel_grid import group_points
-from surfel_mapper.filters.merging import MergedColumns, PointGroups
+from surfel_mapper.filters.merging import merged_columns, PointGroups
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
@@ -104,7 +104,7 @@ class VoxelGrid(FiniteFilter):
         else:
             means = grid.centres(keys)
         unit = self.unit_normals
-        columns = MergedColumns(scan.columns, groups, average=with_rows, unit=unit)
+        columns = merged_columns(scan.columns, groups, average=with_rows, unit=unit)
         reduced = with_points(scan, means, columns)
         return reduced if self.min_points == 1 else select(reduced, sums[:, 3] >= self.min_points)
 
@@ -229,7 +229,7 @@ class OctreeGrid(FiniteFilter):
         if self.sampling_method == MEDOID:
             apart_sq = ((points - means[rows]) ** 2).sum(axis=1)
             return select(scan, least_of_each(apart_sq, rows, number))
-        return with_points(scan, means, MergedColumns(scan.columns, groups))
+        return with_points(scan, means, merged_columns(scan.columns, groups))
 
 
 def leaves(points: Points, max_points: int, max_size_m: float) -> tuple[Ids, int]:

@@ -17,7 +17,7 @@ Sums run over the points in their order.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 import enum
 import math
@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.filters.columns import Array, EIGEN_VECTORS, MATCHED_IDS, NORMALS
+from surfel_mapper.scan import ComputedColumns
 
 
 class Kind(enum.Enum):
@@ -88,11 +89,15 @@ class PointGroups:
         return cls(rows, first, np.bincount(rows, minlength=number))
 
 
-class MergedColumns(Mapping[str, Array]):
+def merged_columns(
+    columns: Mapping[str, Array],
+    groups: PointGroups,
+    *,
+    average: bool = True,
+    unit: bool = True,
+) -> ComputedColumns:
     """
-    The columns of merged points, (K,) or (K, C) each.
-
-    Each is computed when first read: most never are.
+    Return the columns of merged points, (K,) or (K, C) each.
 
     Parameters
     ----------
@@ -107,46 +112,13 @@ class MergedColumns(Mapping[str, Array]):
 
     """
 
-    __slots__ = ('_average', '_columns', '_groups', '_made', '_unit', 'num_rows')
+    def compute(name: str) -> Array:
+        kind = kind_of(name, columns[name]) if average else Kind.FIRST
+        if kind is Kind.DIRECTION and not unit:
+            kind = Kind.NUMBER
+        return merged(kind, columns[name], groups)
 
-    def __init__(
-        self,
-        columns: Mapping[str, Array],
-        groups: PointGroups,
-        *,
-        average: bool = True,
-        unit: bool = True,
-    ) -> None:
-        self._columns = columns
-        self._groups = groups
-        self._average = average
-        self._unit = unit
-        self._made: dict[str, Array] = {}
-        self.num_rows = len(groups.first)
-
-    def __getitem__(self, name: str) -> Array:
-        """Return a column, the same array every time."""
-        if name not in self._made:
-            column = self._columns[name]
-            self._made[name] = merged(self._kind(name, column), column, self._groups)
-        return self._made[name]
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether the column exists, without computing it."""
-        return name in self._columns
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
-        return iter(self._columns)
-
-    def __len__(self) -> int:
-        """Return the number of columns."""
-        return len(self._columns)
-
-    def _kind(self, name: str, column: Array) -> Kind:
-        """Return the kind by which a column is merged."""
-        kind = kind_of(name, column) if self._average else Kind.FIRST
-        return Kind.NUMBER if kind is Kind.DIRECTION and not self._unit else kind
+    return ComputedColumns(columns, compute, len(groups.first))
 
 
 def merged(kind: Kind, column: Array, groups: PointGroups) -> Array:

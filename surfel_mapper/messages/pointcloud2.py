@@ -17,9 +17,8 @@ All arrays together are no larger than the message, because fields must not over
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from dataclasses import field as dataclass_field
 from functools import lru_cache, partial
 from itertools import pairwise
 import logging
@@ -41,7 +40,7 @@ from surfel_mapper.messages.cdr import (
     read_header,
     write_header,
 )
-from surfel_mapper.scan import LazyPoints, Scan
+from surfel_mapper.scan import ComputedColumns, LazyPoints, Scan
 
 UINT32, FLOAT32, FLOAT64 = 6, 7, 8
 
@@ -130,7 +129,7 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
         points=lazy,
         stamp_ns=stamp_ns,
         frame_id=frame_id,
-        columns=MessageColumns(points, fields, math.prod(points.shape)),
+        columns=ComputedColumns(fields, partial(column, points, fields), math.prod(points.shape)),
         topic=topic,
         msg=msg,
     )
@@ -277,36 +276,13 @@ class Points:
         return items
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MessageColumns(Mapping[str, npt.NDArray[Any]]):
+def column(points: Points, fields: Mapping[str, Field], name: str) -> npt.NDArray[Any]:
     """
-    The further fields of a cloud as columns, each decoded when it is first read.
+    Return one field of all points, (N,) or (N, count), read-only and in native byte order.
 
-    Most are views; those of other byte orders or padded rows are copies, made only if used.
+    It is a view, or a copy if the byte order is another or rows are padded.
     """
-
-    points: Points
-    fields: Mapping[str, Field]
-    num_rows: int
-    decoded: dict[str, npt.NDArray[Any]] = dataclass_field(default_factory=dict)
-
-    def __getitem__(self, name: str) -> npt.NDArray[Any]:
-        if name not in self.decoded:
-            self.decoded[name] = column(self.points, self.fields[name])
-        return self.decoded[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.fields)
-
-    def __len__(self) -> int:
-        return len(self.fields)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.fields
-
-
-def column(points: Points, field: Field) -> npt.NDArray[Any]:
-    """Return one field of all points, (N,) or (N, count), read-only and in native byte order."""
+    field = fields[name]
     values = points.view(field)
     values = values.astype(values.dtype.newbyteorder('='), copy=False)
     values = values.reshape(-1, field.count) if field.count > 1 else values.reshape(-1)

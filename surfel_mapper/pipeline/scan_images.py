@@ -12,7 +12,7 @@ already has stay.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,7 @@ import numpy.typing as npt
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.geometry import Transform
 from surfel_mapper.layers import Images
-from surfel_mapper.scan import DepthImage, Scan
+from surfel_mapper.scan import ComputedColumns, DepthImage, Scan
 from surfel_mapper.sensors.depth import LABEL, PinholeCamera, SceneImage
 
 MAX_IMAGES = 60
@@ -114,7 +114,7 @@ class ScanImages:
             if values is not None:
                 columns[COLUMNS[kind][0]] = values
         if depth is not None:
-            return replace(scan, depth=depth, columns=PixelColumns(scan, depth)), missing
+            return replace(scan, depth=depth, columns=pixel_columns(scan, depth)), missing
         return replace(scan, columns=columns), missing
 
     def _nearest(self, kind: str, stamp_ns: int) -> SceneImage | None:
@@ -179,58 +179,23 @@ def camera_of(scan: Scan) -> PinholeCamera:
     return PinholeCamera(int(scan.camera[0]), int(scan.camera[1]), *scan.camera[2:])
 
 
-class PixelColumns(Mapping[str, npt.NDArray[Any]]):
+def pixel_columns(scan: Scan, depth: DepthImage) -> ComputedColumns:
     """
-    Columns of the points of a depth image, taken from images of its pixels when first read.
+    Return the columns of a depth image, and those taken from images of its pixels when first read.
 
     The distance field reads the images themselves, and often nothing else needs the columns.
-
-    Parameters
-    ----------
-    scan : Scan
-        Points, camera, and columns that stay as they are.
-    depth : DepthImage
-        The images.
-
     """
+    kinds = {COLUMNS[kind][0]: kind for kind in COLUMNS if not has_column(scan, kind)}
+    kinds = {name: kind for name, kind in kinds.items() if getattr(depth, kind) is not None}
 
-    __slots__ = ('_base', '_camera', '_made', '_pixel', '_points', '_sources', 'num_rows')
+    def compute(name: str) -> npt.NDArray[Any]:
+        if name not in kinds:
+            return scan.columns[name]
+        camera = camera_of(scan)
+        pixel = pixels_of(camera, scan.points, (camera.height, camera.width))
+        return pixel_values(kinds[name], getattr(depth, kinds[name]), pixel)
 
-    def __init__(self, scan: Scan, depth: DepthImage) -> None:
-        self._base, self._camera, self._points = scan.columns, camera_of(scan), scan.points
-        images = {kind: getattr(depth, kind) for kind in COLUMNS}
-        self._sources = {
-            COLUMNS[kind][0]: (kind, pixels)
-            for kind, pixels in images.items()
-            if pixels is not None and not has_column(scan, kind)
-        }
-        self._made: dict[str, npt.NDArray[Any]] = {}
-        self._pixel: npt.NDArray[np.int32] | None = None
-        self.num_rows = len(scan)
-
-    def __getitem__(self, name: str) -> npt.NDArray[Any]:
-        """Return a column, the same array every time."""
-        if name not in self._sources:
-            return self._base[name]
-        if name not in self._made:
-            if self._pixel is None:
-                size = self._camera.height, self._camera.width
-                self._pixel = pixels_of(self._camera, self._points, size)
-            self._made[name] = pixel_values(*self._sources[name], self._pixel)
-        return self._made[name]
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether the column exists, without making it."""
-        return name in self._sources or name in self._base
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
-        yield from self._base
-        yield from self._sources
-
-    def __len__(self) -> int:
-        """Return the number of columns."""
-        return len(self._base) + len(self._sources)
+    return ComputedColumns([*scan.columns, *kinds], compute, len(scan))
 
 
 def packed(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:

@@ -12,7 +12,7 @@ import pytest
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.base import select, with_columns, with_points
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.filters.merging import MergedColumns, PointGroups
+from surfel_mapper.filters.merging import merged_columns, PointGroups
 from surfel_mapper.scan import PointTimes
 from test.filters.examples import random_scan, scan_of
 
@@ -77,7 +77,7 @@ GROUPS = PointGroups.of(np.array([1, 0, 1, 0, 1]), 2)
 
 def merged(column, **settings):
     scan = scan_of(np.zeros((5, 3)), **{settings.pop('name', 'value'): column})
-    (found,) = MergedColumns(scan.columns, GROUPS, **settings).values()
+    (found,) = merged_columns(scan.columns, GROUPS, **settings).values()
     assert found.dtype == np.asarray(column).dtype
     return found
 
@@ -115,7 +115,7 @@ def test_stamps_are_averaged_exactly_and_towards_zero():
 
 def test_seven_stamps_do_not_overflow():
     scan = scan_of(np.zeros((7, 3)), times=np.full(7, 2**62, np.int64))
-    found = MergedColumns(scan.columns, PointGroups.of(np.zeros(7, np.int64), 1))['times']
+    found = merged_columns(scan.columns, PointGroups.of(np.zeros(7, np.int64), 1))['times']
     assert found.tolist() == [2**62]
 
 
@@ -144,5 +144,5 @@ def test_unpacked_colours_are_averaged_and_rounded(dtype):
 
 def test_no_points_leave_no_rows():
     scan = scan_of(np.zeros((0, 3)), value=np.zeros((0, 4)), times=np.zeros(0, np.int64))
-    found = MergedColumns(scan.columns, PointGroups.of(np.zeros(0, np.int64), 0))
+    found = merged_columns(scan.columns, PointGroups.of(np.zeros(0, np.int64), 0))
     assert (found['value'].shape, found['times'].shape) == ((0, 4), (0,))
