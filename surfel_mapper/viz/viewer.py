@@ -30,12 +30,6 @@ if TYPE_CHECKING:
 NEW = 0.25
 """Share of the map that has to change before the whole map is logged again."""
 
-WHOLE_S = 20.0
-"""
-Longest time between two logs of the whole map of a running node, s: its server drops the oldest
-data, and a page that is opened later has to find the map.
-"""
-
 MAX_POINTS = 20_000
 """Limit of the points logged of a scan; larger scans are subsampled."""
 
