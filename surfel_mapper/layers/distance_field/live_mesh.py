@@ -39,45 +39,9 @@ CORNER_BYTES = 40
 Tile = tuple[int, int, int]
 
 
-class ChangedBlocks:
+class CopiedMesh:
     """
-    Copies of the blocks of a field that have changed, taken in steps.
-
-    Parameters
-    ----------
-    mesher : Mesher
-        Makes the mesh of the copied blocks.
-
-    """
-
-    def __init__(self, mesher: Mesher) -> None:
-        self._mesher = mesher
-        self._portions: Iterator[Changes] | None = None
-        self._copied: list[Changes] = []
-
-    def copy_next(self) -> bool:
-        """Copy the next blocks; return True if there are none left."""
-        if self._portions is None:
-            self._portions = self._mesher.portions(PORTION)
-        changes = next(self._portions, None)
-        if changes is not None:
-            self._copied.append(changes)
-        return changes is None
-
-    def take(self) -> list[Changes]:
-        """Copy the rest; return all since the last call."""
-        while not self.copy_next():
-            pass
-        copied, self._copied, self._portions = self._copied, [], None
-        return copied
-
-
-class LiveMesh:
-    """
-    Messages that keep a viewer's mesh up to date.
-
-    The results of ``changed`` and ``complete`` must be iterated in the order in which they were
-    made, by one thread at a time.
+    The mesh of copies of the blocks of a field, of which changed ones are copied in steps.
 
     Parameters
     ----------
@@ -88,10 +52,8 @@ class LiveMesh:
 
     def __init__(self, blocks: BlockMap) -> None:
         self._mesher = Mesher(blocks, visible_only=True)
-        self._changed = ChangedBlocks(self._mesher)
-        self._tiles: dict[Tile, dict[int, None]] = {}
-        self._numbers: dict[Tile, int] = {}
-        self._is_known = False
+        self._portions: Iterator[Changes] | None = None
+        self._copied: list[Changes] = []
 
     @property
     def nbytes(self) -> int:
@@ -100,15 +62,42 @@ class LiveMesh:
 
     def prepare(self) -> bool:
         """Copy some of the changed blocks; return True once all are; called by the map's owner."""
-        return self._changed.copy_next()
+        if self._portions is None:
+            self._portions = self._mesher.portions(PORTION)
+        changes = next(self._portions, None)
+        if changes is not None:
+            self._copied.append(changes)
+        return changes is None
+
+    def _take(self) -> list[Changes]:
+        """Copy the rest; return all since the last call."""
+        while not self.prepare():
+            pass
+        copied, self._copied, self._portions = self._copied, [], None
+        return copied
+
+
+class LiveMesh(CopiedMesh):
+    """
+    Messages that keep a viewer's mesh up to date.
+
+    The results of ``changed`` and ``complete`` must be iterated in the order in which they were
+    made, by one thread at a time.
+    """
+
+    def __init__(self, blocks: BlockMap) -> None:
+        super().__init__(blocks)
+        self._tiles: dict[Tile, dict[int, None]] = {}
+        self._numbers: dict[Tile, int] = {}
+        self._is_known = False
 
     def changed(self, moment: Moment) -> Iterable[bytes]:
         """Return MarkerArrays of the tiles that have changed; called by the owner of the map."""
-        return self._messages(self._changed.take(), moment, is_complete=False)
+        return self._messages(self._take(), moment, is_complete=False)
 
     def complete(self, moment: Moment) -> Iterable[bytes]:
         """Return MarkerArrays of all tiles, which replace any before."""
-        return self._messages(self._changed.take(), moment, is_complete=True)
+        return self._messages(self._take(), moment, is_complete=True)
 
     def _messages(
         self, changes: list[Changes], moment: Moment, *, is_complete: bool
@@ -145,35 +134,16 @@ class LiveMesh:
         return list(touched)
 
 
-class WholeMesh:
+class WholeMesh(CopiedMesh):
     """
     The mesh as one marker; its blocks are marched only if they have changed.
 
     The results of ``messages`` must be iterated as those of LiveMesh.
-
-    Parameters
-    ----------
-    blocks : BlockMap
-        The field.
-
     """
-
-    def __init__(self, blocks: BlockMap) -> None:
-        self._mesher = Mesher(blocks, visible_only=True)
-        self._changed = ChangedBlocks(self._mesher)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes used by the triangles."""
-        return self._mesher.nbytes
-
-    def prepare(self) -> bool:
-        """Copy some of the changed blocks; return True once all are; called by the map's owner."""
-        return self._changed.copy_next()
 
     def messages(self, moment: Moment) -> Iterable[bytes]:
         """Return one Marker; called by the owner of the map."""
-        return self._marker(self._changed.take(), moment)
+        return self._marker(self._take(), moment)
 
     def _marker(self, changes: list[Changes], moment: Moment) -> Iterator[bytes]:
         for change in changes:
