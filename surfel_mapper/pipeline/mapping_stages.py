@@ -12,6 +12,7 @@ import numpy.typing as npt
 from surfel_mapper.compilation import CompileStage
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.channels import CHANNELS
+from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SETTINGS
 
@@ -27,12 +28,12 @@ def warm_up_stages(config: Config) -> list[CompileStage]:
     return stages
 
 
-def compile_adding(config: Config) -> SurfelMap:
-    """Compile reducing and adding points; return the map of one."""
+def compile_adding(config: Config) -> tuple[SurfelMap, ScanMoments]:
+    """Compile reducing and adding points; return the map of one, and its moments."""
     surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
     columns = {name: np.zeros(1) for name in CHANNELS}
-    surfel_map.insert(surfel_map.reduce(np.zeros((1, 3), expected_type(config)), columns=columns))
-    return surfel_map
+    points = np.zeros((1, 3), expected_type(config))
+    return surfel_map, surfel_map.add(points, columns=columns)
 
 
 def expected_type(config: Config) -> npt.DTypeLike:
@@ -42,7 +43,7 @@ def expected_type(config: Config) -> npt.DTypeLike:
 
 def compile_deriving(config: Config) -> None:
     """Compile deriving surfels, of coarser maps too if they are published."""
-    surfel_map = compile_adding(config)
+    surfel_map, _ = compile_adding(config)
     surfel_map.surfels_changed(since=0)
     surfel_map.surfels()
     if config.publish.adaptive:
@@ -53,8 +54,6 @@ def compile_deriving(config: Config) -> None:
 
 def compile_removing(config: Config) -> None:
     """Compile removing points, and the digest."""
-    surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
-    columns = {name: np.zeros(1) for name in CHANNELS}
-    moments = surfel_map.add(np.zeros((1, 3), expected_type(config)), columns=columns)
+    surfel_map, moments = compile_adding(config)
     surfel_map.digest()
     surfel_map.remove(moments)
