@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import colorsys
-from dataclasses import replace
 from functools import partial
 from typing import Any, TYPE_CHECKING
 
@@ -33,6 +32,7 @@ from surfel_mapper.messages.markers import (
     TEXT_VIEW_FACING,
     TRIANGLE_LIST,
 )
+from surfel_mapper.messages.model_packets import rows_of
 from surfel_mapper.messages.surfel_markers import shade
 from surfel_mapper.models.outlines import next_corners
 from surfel_mapper.models.shapes import ellipsoid_corners, ellipsoid_frames, FACES
@@ -167,13 +167,7 @@ def most_points(gaussians: Gaussians, most: int) -> Gaussians:
     if len(gaussians) <= most:
         return gaussians
     rows = np.sort(np.argsort(-gaussians.num_points, kind='stable')[:most])
-    return replace(
-        gaussians,
-        id=gaussians.id[rows],
-        num_points=gaussians.num_points[rows],
-        mean=gaussians.mean[rows],
-        covariance=gaussians.covariance[rows],
-    )
+    return rows_of(gaussians, rows)
 
 
 PLANE, SURFACE, GAUSSIAN, NONE = 0, 1, 2, 255
