@@ -297,12 +297,12 @@ def test_a_static_child_takes_no_dynamic_transform_and_the_reverse():
 @pytest.mark.parametrize(
     ('pose', 'named'),
     [
-        (np.full((4, 4), np.nan), 'not finite'),
-        (np.eye(3), r'shape \(3, 3\)'),
-        (np.zeros((4, 4)), 'not a rotation'),
-        (np.diag([1.0, 1.0, -1.0, 1.0]), 'not a rotation'),
-        (np.diag([1.0, 1.0, 1.00001, 1.0]), 'not a rotation'),
-        (np.diag([1.0, 1.0, 1.0, 2.0]), 'not a rotation'),
+        (np.full((4, 4), np.nan), 'expected a rigid transform'),
+        (np.eye(3), r'float64 \(3, 3\), expected float'),
+        (np.zeros((4, 4)), 'expected a rigid transform'),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), 'expected a rigid transform'),
+        (np.diag([1.0, 1.0, 1.0001, 1.0]), 'expected a rigid transform'),
+        (np.diag([1.0, 1.0, 1.0, 2.0]), 'expected a rigid transform'),
     ],
 )
 def test_a_transform_that_is_not_rigid_is_refused_and_changes_nothing(add, pose, named):

@@ -32,12 +32,9 @@ from operator import attrgetter
 import numpy as np
 
 from surfel_mapper.errors import PoseError, PoseNotYetError, PosesLateError
-from surfel_mapper.geometry import compose, interpolate, inverse, Transform
+from surfel_mapper.geometry import check_rigid, compose, interpolate, inverse, Transform
 
 NS_PER_S = 1_000_000_000
-
-MAX_SKEW = 1e-6
-"""Largest entry of R R^T - I that a transform may have; rounding to float32 gives 1e-7."""
 
 MAX_EDGES = 10_000
 """Largest number of edges; a robot has some hundred, and new names must not fill the memory."""
@@ -529,36 +526,11 @@ def _chained(edges: list[PoseTrack], stamp_ns: int) -> Transform | None:
 def rigid(parent: str, child: str, T_parent_child: Transform) -> Transform:
     """Return a copy of a transform, or raise PoseError if it is not rigid."""
     transform = np.array(T_parent_child, dtype=np.float64)
-    if transform.shape != (4, 4):
-        raise not_rigid(parent, child, f'shape {transform.shape}, expected (4, 4)')
-    rows = transform.tolist()
-    if not all(map(math.isfinite, [*rows[0], *rows[1], *rows[2]])):
-        raise not_rigid(parent, child, f'not finite, {rows[:3]}')
-    if rows[3] != [0.0, 0.0, 0.0, 1.0] or not is_rotation(*(row[:3] for row in rows[:3])):
-        raise not_rigid(parent, child, f'not a rotation and a translation, {rows}')
+    try:
+        check_rigid(f'transform {parent!r} -> {child!r}', transform)
+    except ValueError as error:
+        raise PoseError(str(error)) from None
     return transform
-
-
-def not_rigid(parent: str, child: str, why: str) -> PoseError:
-    """Return the error for a transform that is refused."""
-    return PoseError(f'transform {parent!r} -> {child!r}: {why}')
-
-
-def is_rotation(a: list[float], b: list[float], c: list[float]) -> bool:
-    """Return whether three finite rows are orthonormal but for rounding, and no mirror."""
-    (a0, a1, a2), (b0, b1, b2), (c0, c1, c2) = a, b, c
-    if max(*map(abs, a), *map(abs, b), *map(abs, c)) > 2.0:
-        return False  # and its square may overflow
-    skew = max(
-        abs(a0 * a0 + a1 * a1 + a2 * a2 - 1.0),
-        abs(b0 * b0 + b1 * b1 + b2 * b2 - 1.0),
-        abs(c0 * c0 + c1 * c1 + c2 * c2 - 1.0),
-        abs(a0 * b0 + a1 * b1 + a2 * b2),
-        abs(a0 * c0 + a1 * c1 + a2 * c2),
-        abs(b0 * c0 + b1 * c1 + b2 * c2),
-    )
-    volume = a0 * (b1 * c2 - b2 * c1) + a1 * (b2 * c0 - b0 * c2) + a2 * (b0 * c1 - b1 * c0)
-    return skew <= MAX_SKEW and volume > 0.0
 
 
 def seconds(stamp_ns: int) -> str:
