@@ -66,23 +66,16 @@ class QueuedCloud(NamedTuple):
             return ''
 
 
-class LostCloud(NamedTuple):
-    """How a dropped cloud is counted; see Mapper.refuse_clouds."""
+class Lost(NamedTuple):
+    """How a dropped cloud of a topic is counted, or else a dropped pose or image; see Mapper."""
 
     cause: str
-    topic: str
     reason: str
+    topic: str = ''
     frame_id: str = ''
 
 
-class LostPose(NamedTuple):
-    """How a dropped pose, or image of colours or labels, is counted; see Mapper.ignore_message."""
-
-    cause: str
-    reason: str
-
-
-TOO_MANY_POSES = LostPose('overload', 'poses dropped: too many are waiting')
+TOO_MANY_POSES = Lost('overload', 'poses dropped: too many are waiting')
 
 
 class Call(NamedTuple):
@@ -128,7 +121,7 @@ class MappingThread:
         self._num_bytes = 0
         self._max_bytes = machine_bytes() // SHARE_OF_MEMORY
         self._is_behind = False  # because of kernels that were compiled
-        self._lost: Counter[LostCloud | LostPose] = Counter()
+        self._lost: Counter[Lost] = Counter()
         self._stopping = False
         self._thread = threading.Thread()
 
@@ -164,19 +157,19 @@ class MappingThread:
 
     def refuse_pose(self, reason: str) -> None:
         """Count a pose message that cannot be decoded."""
-        self._lose(LostPose('bad_pose', reason))
+        self._lose(Lost('bad_pose', reason))
 
     def refuse_image(self, reason: str) -> None:
         """Count an image of colours or labels, or its calibration, that cannot be decoded."""
-        self._lose(LostPose('bad_image', f'image ignored: {reason}'))
+        self._lose(Lost('bad_image', f'image ignored: {reason}'))
 
     def refuse_cloud(self, topic: str, reason: str) -> None:
         """Count a cloud that cannot be decoded."""
-        self._lose(LostCloud('bad_cloud', topic, reason))
+        self._lose(Lost('bad_cloud', reason, topic))
 
     def report_failure(self, task: str, error: Exception) -> None:
         """Count an error that nothing expects, of a callback in another thread."""
-        self._lose(LostPose(INTERNAL, f'{task} failed: {described(error)}'))
+        self._lose(Lost(INTERNAL, f'{task} failed: {described(error)}'))
 
     def put_image(self, image: SceneImage) -> None:
         """
@@ -190,7 +183,7 @@ class MappingThread:
             if len(images) > MAX_IMAGES:
                 images.popleft()
                 reason = f'{image.kind} images dropped: too many are waiting'
-                self._lost[LostPose('overload', reason)] += 1
+                self._lost[Lost('overload', reason)] += 1
             self._changed.notify()
 
     def put_cloud(
@@ -206,7 +199,7 @@ class MappingThread:
                 self._work.remove(oldest)
                 self._count_cloud(oldest.msg, -1)
                 reason = f'in frame {oldest.frame_id!r}, {TOO_FAST}'
-                self._lost[LostCloud('overload', oldest.topic, reason, oldest.frame_id)] += 1
+                self._lost[Lost('overload', reason, oldest.topic, oldest.frame_id)] += 1
             self._changed.notify()
 
     def _is_full(self) -> bool:
@@ -302,15 +295,15 @@ class MappingThread:
         """Return whether any input waits; called with the lock held."""
         return any((self._static, self._poses, self._images, self._work, self._lost))
 
-    def _lose(self, lost: LostCloud | LostPose) -> None:
+    def _lose(self, lost: Lost) -> None:
         with self._changed:
             self._lost[lost] += 1
             self._changed.notify()
 
-    def _count(self, lost: Counter[LostCloud | LostPose]) -> None:
+    def _count(self, lost: Counter[Lost]) -> None:
         """Report dropped messages to the mapper, which counts and logs them."""
         for message, number in lost.items():
-            if isinstance(message, LostPose):
+            if not message.topic:
                 self._mapper.ignore_message(message.cause, message.reason, number)
             else:
                 self._mapper.refuse_clouds(
