@@ -53,8 +53,6 @@ class Budget:
         Bytes of the input.
     error : callable of str to Exception
         Class of the errors of the reader.
-    floor : int
-        Memory that is always allowed, bytes.
 
     Attributes
     ----------
@@ -65,16 +63,10 @@ class Budget:
 
     """
 
-    def __init__(
-        self,
-        name: str | Path,
-        size: int,
-        error: Callable[[str], Exception],
-        *,
-        floor: int = FLOOR_BYTES,
-    ) -> None:
+    def __init__(self, name: str | Path, size: int, error: Callable[[str], Exception]) -> None:
         self.name = name
-        self.max_bytes = limit_for(size, floor)
+        usual = min(max(FLOOR_BYTES, BYTES_PER_BYTE * size), machine_bytes() * 3 // 4)
+        self.max_bytes = stated_limit() or usual
         self.used_bytes = 0
         self._error = error
 
@@ -96,11 +88,6 @@ class Budget:
                 f'{VARIABLE}'
             )
         self.used_bytes = needed
-
-
-def limit_for(size: int, floor: int) -> int:
-    """Return the limit of memory for an input of a size, bytes."""
-    return stated_limit() or min(max(floor, BYTES_PER_BYTE * size), machine_bytes() * 3 // 4)
 
 
 def stated_limit() -> int:

@@ -24,8 +24,9 @@ def test_small_inputs_may_use_the_floor_and_large_ones_a_multiple_of_their_size(
     assert Budget('a', FLOOR_BYTES, BagError).max_bytes == BYTES_PER_BYTE * FLOOR_BYTES
 
 
-def test_the_error_of_the_reader_names_input_need_and_limit():
-    budget = Budget('/points', 10, CloudFormatError, floor=1000)
+def test_the_error_of_the_reader_names_input_need_and_limit(monkeypatch):
+    monkeypatch.setenv(VARIABLE, '1000')
+    budget = Budget('/points', 10, CloudFormatError)
     budget.take(600, 'fields')
     with pytest.raises(
         CloudFormatError, match=r'/points: data: needs 1100 bytes, .* limit of 1000 .*MAX'
