@@ -107,6 +107,11 @@ class Moment:
     frame_id: str = ''
     T_map_sensor: npt.NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
 
+    @property
+    def header(self) -> dict[str, Any]:
+        """Stamp and frame, as keyword arguments of functions that write messages."""
+        return {'stamp_ns': self.stamp_ns, 'frame_id': self.frame_id}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Publication:

@@ -47,5 +47,4 @@ class CostsLayer(Layer):
         surfels = surfel_map.surfels(config.map.min_points)
         center = moment.T_map_sensor[:2, 3]
         grid = traversability(surfels, surfel_map.voxel_size_m, center, config.grid)
-        content = (grid.resolution_m, grid.origin, grid.cost)
-        return [occupancy_grid(*content, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)]
+        return [occupancy_grid(grid.resolution_m, grid.origin, grid.cost, **moment.header)]

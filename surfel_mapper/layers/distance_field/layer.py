@@ -324,8 +324,7 @@ class TsdfLayer(Layer):
 
     def _slice_messages(self, moment: Moment) -> list[bytes]:
         grid = slice_at(self.blocks, self.config.tsdf.slice_height_m)
-        content = (grid.resolution_m, grid.origin, grid.cost)
-        return [occupancy_grid(*content, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)]
+        return [occupancy_grid(grid.resolution_m, grid.origin, grid.cost, **moment.header)]
 
     def _esdf_messages(self, moment: Moment) -> Iterable[bytes]:
         """Return the cloud of the distances below esdf.max_m; serialised while iterated."""
@@ -333,17 +332,13 @@ class TsdfLayer(Layer):
         near = distances.distance < self.config.esdf.max_m
         points = distances.points[near].astype(np.float32)
         columns = dict(zip('xyz', points.T, strict=True)) | {'distance': distances.distance[near]}
-        return (
-            cloud_bytes(from_columns(table), stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)
-            for table in [columns]
-        )
+        return (cloud_bytes(from_columns(table), **moment.header) for table in [columns])
 
     def _clearance_messages(self, moment: Moment) -> list[bytes]:
         config = self.config.esdf
         heights_m, area = (config.slice_min_m, config.slice_max_m), self._position[:2]
         grid = clearance_slice(self.blocks, heights_m, config.max_m, area, config.radius_m)
-        content = (grid.resolution_m, grid.origin, grid.cost)
-        return [occupancy_grid(*content, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)]
+        return [occupancy_grid(grid.resolution_m, grid.origin, grid.cost, **moment.header)]
 
     def _settle(self, scans: Iterable[WindowedScan]) -> list[Integrated]:
         """

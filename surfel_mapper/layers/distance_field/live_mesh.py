@@ -111,8 +111,7 @@ class LiveMesh(CopiedMesh):
         for tile in tiles:
             mesh = self._mesher.parts(self._tiles[tile])
             number = self._numbers.setdefault(tile, len(self._numbers))
-            stamp_ns, frame_id = moment.stamp_ns, moment.frame_id
-            markers.append(mesh_marker(mesh, number=number, stamp_ns=stamp_ns, frame_id=frame_id))
+            markers.append(mesh_marker(mesh, number=number, **moment.header))
             size += 3 * len(mesh) * CORNER_BYTES
             if size > MAX_BYTES:
                 yield marker_array(markers)
@@ -149,9 +148,7 @@ class WholeMesh(CopiedMesh):
         for change in changes:
             self._mesher.apply(change)
         mesh = self._mesher.parts()
-        yield marker_bytes(
-            mesh_marker(mesh, number=0, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)
-        )
+        yield marker_bytes(mesh_marker(mesh, number=0, **moment.header))
 
 
 def tiles_of(keys: list[int]) -> list[Tile]:
@@ -163,11 +160,4 @@ def tiles_of(keys: list[int]) -> list[Tile]:
 
 def clearing(moment: Moment) -> Marker:
     """Return the marker that deletes all others."""
-    return Marker(
-        ns='mesh',
-        id=0,
-        type=TRIANGLE_LIST,
-        action=DELETE_ALL,
-        frame_id=moment.frame_id,
-        stamp_ns=moment.stamp_ns,
-    )
+    return Marker(ns='mesh', id=0, type=TRIANGLE_LIST, action=DELETE_ALL, **moment.header)

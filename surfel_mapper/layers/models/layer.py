@@ -172,36 +172,29 @@ class ModelsLayer(Layer):
         return self._shapes.of(self.models.model, self.models.versions)
 
     def _changed_models(self, moment: Moment) -> list[bytes]:
-        facts = {'stamp_ns': moment.stamp_ns, 'frame_id': moment.frame_id}
-        message = self._stream.changes(self.models.model, self.models.versions, **facts)
+        message = self._stream.changes(self.models.model, self.models.versions, **moment.header)
         return [] if message is None else [message]
 
     def _all_models(self, moment: Moment) -> list[bytes]:
-        facts = {'stamp_ns': moment.stamp_ns, 'frame_id': moment.frame_id}
-        return [self._stream.complete(self.models.model, self.models.versions, **facts)]
+        return [self._stream.complete(self.models.model, self.models.versions, **moment.header)]
 
     def _marker_messages(self, moment: Moment) -> list[bytes]:
         markers = model_markers(
             self._current_shapes(),
             self.models.model.gaussians,
             self.around.surfel_map.voxel_size_m,
-            stamp_ns=moment.stamp_ns,
-            frame_id=moment.frame_id,
+            **moment.header,
         )
         return [marker_array(markers)]
 
     def _primitive_messages(self, moment: Moment) -> list[bytes]:
         gaussians, versions = self.models.model.gaussians, self.models.versions
         columns = primitive_columns(self._current_shapes(), gaussians, versions)
-        return [
-            cloud_bytes(from_columns(columns), stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)
-        ]
+        return [cloud_bytes(from_columns(columns), **moment.header)]
 
     def _surfel_messages(self, moment: Moment) -> list[bytes]:
         columns = surfel_primitive_columns(self.models.surfels, self.models.model)
-        return [
-            cloud_bytes(from_columns(columns), stamp_ns=moment.stamp_ns, frame_id=moment.frame_id)
-        ]
+        return [cloud_bytes(from_columns(columns), **moment.header)]
 
     def _all_outlines(self, moment: Moment) -> Iterable[bytes]:
         self._published = dict.fromkeys(self._published, 0)  # and removed ones, empty
@@ -220,6 +213,4 @@ class ModelsLayer(Layer):
             if previous.get(number) != version
         }
         for number, ring in rings.items():
-            yield polygon_instance(
-                ring, number, stamp_ns=moment.stamp_ns, frame_id=moment.frame_id
-            )
+            yield polygon_instance(ring, number, **moment.header)
