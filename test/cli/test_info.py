@@ -76,11 +76,6 @@ def test_json_holds_the_same(tmp_path, capsys):
     ]
 
 
-def test_no_bag_is_refused(tmp_path, capsys):
-    assert main(['info', str(tmp_path / 'none')]) == 1
-    assert 'none: no such file or directory' in capsys.readouterr().err
-
-
 def test_a_bag_that_is_cut_off_is_shown_as_far_as_it_goes(tmp_path, capsys):
     path = write_mcap(tmp_path / 'a.mcap', drive())
     cut(path, 0.5)

@@ -13,7 +13,7 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.models import read
 from surfel_mapper.models.evaluation import nearest
-from test.models.scenes import room, sheet, VIEW
+from test.models.scenes import room, VIEW
 
 
 @pytest.fixture(scope='module')
@@ -57,25 +57,6 @@ def test_the_cloud_has_the_printed_precision_and_completeness(extracted, figures
     assert rms(complete) == pytest.approx(figures['completeness_rms_m'], rel=1e-3)
     assert figures['bytes'] == models.stat().st_size
     assert figures['planes'] == len(read(models).planes) >= 5
-
-
-def test_a_smaller_spacing_gives_more_points_on_the_same_planes(tmp_path, capsys):
-    points = sheet(2.0, 2.0, 0.01, centre=(0.0, 0.0, 0.5))
-    ply.write_points(tmp_path / 'flat.ply', dict(zip('xyz', points.T, strict=True)))
-    out = str(tmp_path / 'out')
-    words = ['extract', str(tmp_path / 'flat.ply'), '-o', out, '--set', 'models.noise_m=0.002']
-    assert main(words) == 0
-    capsys.readouterr()
-    cloud = tmp_path / 'cloud.ply'
-    arguments = ['resample', f'{out}/models.smm', '--spacing', '0.02', '-o', str(cloud), '--json']
-    assert main(arguments) == 0
-    said = json.loads(capsys.readouterr().out)
-    table = ply.read_points(cloud)
-    assert said == {'planes': 1, 'surfaces': 0, 'gaussians': 0, 'points': len(table['x'])}
-    assert len(table['x']) == pytest.approx(100 * 100, rel=0.1)
-    assert np.abs(table['z'] - 0.5).max() < 0.001
-    assert main(arguments) == 1
-    assert 'exists; expected a new name, or --overwrite' in capsys.readouterr().err
 
 
 def test_far_models_are_written_as_doubles(extracted, figures, tmp_path):

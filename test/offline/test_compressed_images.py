@@ -3,9 +3,7 @@
 """A bag whose images are packed is mapped as one whose are not; damaged ones are counted."""
 
 import numpy as np
-import pytest
 
-from surfel_mapper.errors import BagError
 from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
 from test.messages.test_compressed_image import packed, packed_depth
 from test.offline.test_depth import camera_info, image, replayed
@@ -74,9 +72,3 @@ def test_packed_images_are_taken_where_there_are_no_others(tmp_path):
     settings = {'input.kind': 'depth', 'pose.source': 'identity'}
     mapper, recording = replayed(write_rosbag2(tmp_path / 'bag', entries), settings)
     assert (recording.topics, mapper.counters.mapped) == ([DEPTH_TOPIC], 1)
-
-
-def test_a_topic_of_another_name_is_refused_with_those_there_are(tmp_path):
-    settings = {**SETTINGS, 'input.topics': ['nothing']}
-    with pytest.raises(BagError, match=f'no topic /nothing; Image topics: .*{DEPTH_TOPIC}'):
-        replayed(recorded(tmp_path / 'bag'), settings)

@@ -5,7 +5,6 @@
 import numpy as np
 import pytest
 
-from surfel_mapper.errors import BagError
 from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
 from test.offline.test_depth import camera_info, IMAGE, image, replayed, SETTINGS
 
@@ -61,12 +60,6 @@ def test_images_that_cannot_be_read_are_counted_and_the_depth_is_mapped(tmp_path
     assert mapper.counters.mapped == 3
     assert mapper.counters.messages_ignored == {'bad_image': 3}
     assert not mapper.tsdf.mesh().colors.any()
-
-
-def test_a_topic_that_is_not_in_the_bag_is_refused(tmp_path):
-    settings = {**COLORED, 'layers.tsdf.color_topic': 'nothing'}
-    with pytest.raises(BagError, match='no topic /nothing; Image topics: /camera/'):
-        replayed(recorded(tmp_path), settings)
 
 
 @pytest.mark.parametrize('number', [3, 80])

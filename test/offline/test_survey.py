@@ -16,7 +16,6 @@ from surfel_mapper.offline.survey import offers, survey
 from test.bags.recorded import (
     CLOUD,
     drive,
-    MOUNT_M,
     NUM_SCANS,
     ODOMETRY,
     PERIOD_NS,
@@ -58,13 +57,6 @@ def test_every_source_is_offered_and_its_settings_map_every_scan(tmp_path):
         with BagReader(path) as reader:
             poses = pose_topics(reader.topics, mapper.config, offer.poses)
             assert sum(1 for _ in feed(reader, mapper, offer.clouds, poses)) == NUM_SCANS
-
-
-def test_the_mounting_is_taken_from_the_static_transforms(tmp_path):
-    _, made = surveyed(write_rosbag2(tmp_path / 'a', drive()))
-
-    mounts = [offer.settings.get('frames.base_to_sensor') for offer in made]
-    assert mounts == [None, [*MOUNT_M, 0.0, 0.0, 0.0, 1.0], [*MOUNT_M, 0.0, 0.0, 0.0, 1.0]]
 
 
 def test_a_mounting_over_two_transforms_is_their_product(tmp_path):

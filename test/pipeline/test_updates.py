@@ -100,17 +100,6 @@ def test_the_limits_of_the_configuration_hold(limits, left):
     assert set(mapper.counters.evicted) <= {name.split('__')[1] for name in limits}
 
 
-def test_points_are_kept_if_configured():
-    for keep in (False, True):
-        mapper = mapper_with(pose__source='identity', window__keep_points=keep)
-        scan = scan_at(1.0)
-        insert(mapper, scan)
-        (windowed,) = mapper.window
-        assert (windowed.points is not None) == keep
-        if keep:
-            assert (windowed.points == scan.points).all()
-
-
 def drive_gated(**gate):
     """Return which of 13 scans are mapped: x rises by 0.25 m to 1.5 m, then a turn by 10 deg."""
     mapper = mapper_with(**gate)
