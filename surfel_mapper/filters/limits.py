@@ -26,7 +26,6 @@ from surfel_mapper.filters.kernels.limits import (
     ALWAYS,
     BOTH,
     EITHER,
-    in_field_of_view,
     in_wedge,
     NEVER,
     outside_box,
@@ -252,61 +251,6 @@ def theta_kind(limit_deg: float, *, below: bool) -> int:
     if not 0.0 <= limit_deg <= 180.0:
         return ALWAYS if (limit_deg > 180.0) == below else NEVER
     return BOTH
-
-
-@register
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FieldOfView(Filter):
-    """Keep the points within a field of view, edges included."""
-
-    azimuth_min_deg: float = parameter(
-        -180.0, 'Start of the azimuth about z, from x towards y, deg.', low=-360.0, high=360.0
-    )
-    azimuth_max_deg: float = parameter(
-        180.0, 'End of the azimuth, up to 360 deg after its start, deg.', low=-360.0, high=360.0
-    )
-    elevation_min_deg: float = parameter(
-        -90.0, 'Lowest angle above the plane of x and y, deg.', low=-90.0, high=90.0
-    )
-    elevation_max_deg: float = parameter(
-        90.0, 'Highest angle above the plane of x and y, deg.', low=-90.0, high=90.0
-    )
-    sensor: str = parameter('', 'Only scans in this frame are filtered; empty: all.')
-
-    def check(self) -> None:
-        """Refuse a field of view that is empty or wider than a turn."""
-        if not 0.0 < self.azimuth_max_deg - self.azimuth_min_deg <= 360.0:
-            raise ConfigError(
-                f'{self.name}: azimuth_max_deg: {self.azimuth_max_deg:g}, expected '
-                f'more than azimuth_min_deg ({self.azimuth_min_deg:g}) by up to 360'
-            )
-        if not self.elevation_min_deg <= self.elevation_max_deg:
-            raise ConfigError(
-                f'{self.name}: elevation_max_deg: {self.elevation_max_deg:g}, expected at least '
-                f'elevation_min_deg ({self.elevation_min_deg:g})'
-            )
-
-    def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; those at the origin or not finite do not."""
-        if self.sensor and self.sensor != scan.frame_id:
-            return np.ones(len(scan), np.bool_)
-        azimuth = (self.azimuth_min_deg, self.azimuth_max_deg)
-        elevation = (self.elevation_min_deg, self.elevation_max_deg)
-        has_low, has_high = (abs(limit) < 90.0 for limit in elevation)
-        edges = [f(limit) for limit in azimuth for f in (cosine, sine)]
-        edges += [sine(limit) / cosine(limit) if abs(limit) < 90.0 else 0.0 for limit in elevation]
-        extent = azimuth[1] - azimuth[0]
-        in_view = np.empty(len(scan), np.bool_)
-        in_field_of_view(
-            scan.points.T,
-            np.array(edges, scan.points.dtype),
-            extent < 360.0,
-            extent > 180.0,
-            has_low,
-            has_high,
-            in_view,
-        )
-        return in_view
 
 
 def sine(angle_deg: float) -> float:

@@ -40,18 +40,12 @@ COMPANIONS = {
     ('add_descriptor', 'num_components'): lambda value: {'values': (0.0,) * min(value, 9)},
     ('range_limit', 'min_m'): lambda value: {'max_m': math.inf},
     ('range_limit', 'max_m'): lambda value: {'min_m': 0.0},
-    ('field_of_view', 'azimuth_min_deg'): lambda value: {'azimuth_max_deg': value + 1.0},
-    ('field_of_view', 'azimuth_max_deg'): lambda value: {'azimuth_min_deg': value - 1.0},
-    ('field_of_view', 'elevation_min_deg'): lambda value: {'elevation_max_deg': 90.0},
-    ('field_of_view', 'elevation_max_deg'): lambda value: {'elevation_min_deg': -90.0},
 }
 """Parameters that a parameter at its bounds needs beside it."""
 
 JOINT = {
     ('add_descriptor', 'num_components'),
     ('range_limit', 'min_m'),
-    ('field_of_view', 'azimuth_min_deg'),
-    ('field_of_view', 'azimuth_max_deg'),
 }
 """Parameters of which one bound cannot be reached, because another parameter forbids it."""
 

@@ -131,66 +131,6 @@ def test_on_an_axis_there_is_no_angle():
     assert kept('angle_limit', points, phi_min_deg=-90.0, phi_max_deg=90.0) == []
 
 
-@pytest.mark.parametrize(
-    ('azimuth', 'elevation'),
-    [
-        ((-45.0, 45.0), (-90.0, 90.0)),
-        ((100.0, 260.0), (-20.0, 30.0)),
-        ((-180.0, 180.0), (-25.0, 3.0)),
-        ((-10.0, 300.0), (-90.0, 0.0)),
-        ((-270.0, -200.0), (0.0, 90.0)),
-        ((0.0, 180.0), (10.0, 40.0)),
-    ],
-)
-@pytest.mark.parametrize('dtype', [np.float32, np.float64])
-def test_field_of_view_keeps_what_a_sensor_would_see(azimuth, elevation, dtype):
-    points = BALL.astype(dtype)
-    x, y, z = points.T.astype(np.float64)
-    turn = (np.degrees(np.arctan2(y, x)) - azimuth[0]) % 360.0
-    height = np.degrees(np.arctan2(z, np.hypot(x, y)))
-    seen = (turn <= azimuth[1] - azimuth[0]) & (elevation[0] <= height) & (height <= elevation[1])
-    found = kept(
-        'field_of_view',
-        points,
-        azimuth_min_deg=azimuth[0],
-        azimuth_max_deg=azimuth[1],
-        elevation_min_deg=elevation[0],
-        elevation_max_deg=elevation[1],
-    )
-    assert found == np.flatnonzero(seen).tolist()
-
-
-def test_the_edges_of_a_field_of_view_are_in_it():
-    points = [[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]
-    assert kept('field_of_view', points, azimuth_min_deg=-90, azimuth_max_deg=45) == [0, 1, 3]
-    assert kept('field_of_view', points, elevation_min_deg=0, elevation_max_deg=0) == [0, 1, 2, 3]
-
-
-def test_points_at_the_sensor_or_not_finite_are_not_seen():
-    points = [[0.0, 0.0, 0.0], [np.nan, 1.0, 0.0], [INF, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    assert kept('field_of_view', points) == [3]
-
-
-def test_a_field_of_view_may_be_that_of_one_sensor():
-    narrow = {'azimuth_min_deg': -1.0, 'azimuth_max_deg': 1.0}
-    points = [[-1.0, 0.0, 0.0]]
-    assert kept('field_of_view', points, **narrow, sensor='another') == [0]
-    assert kept('field_of_view', points, **narrow, sensor='sensor') == []
-
-
-@pytest.mark.parametrize(
-    ('settings', 'expected'),
-    [
-        ({'azimuth_min_deg': 10, 'azimuth_max_deg': 10}, 'azimuth_max_deg: 10, expected more'),
-        ({'azimuth_min_deg': -200}, 'by up to 360'),
-        ({'elevation_min_deg': 5, 'elevation_max_deg': 4}, 'elevation_max_deg: 4, expected at l'),
-    ],
-)
-def test_a_field_that_holds_nothing_or_comes_round_is_refused(settings, expected):
-    with pytest.raises(ConfigError, match=expected):
-        filter_of('field_of_view', **settings)
-
-
 def kept_rows(name, scan, /, **parameters):
     scan = replace(scan, columns={**scan.columns, 'row': np.arange(len(scan))})
     return filter_of(name, **parameters).apply(scan).columns['row'].tolist()

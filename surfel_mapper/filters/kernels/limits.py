@@ -43,33 +43,6 @@ NEVER, ALWAYS, BOTH, EITHER = range(4)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def in_field_of_view(xyz, edges, has_azimuth, is_wide, has_low, has_high, within):
-    """
-    Find which points are within an azimuth and an elevation.
-
-    xyz      (3, N) float32 or float64, m
-    edges    (6,) of the type of xyz: cosine and sine of the start of the azimuth, of its end;
-             tangents of the lowest and of the highest elevation
-    has_azimuth, has_low, has_high  whether these bounds apply
-    is_wide  whether the azimuth is more than half a turn
-    within   (N,) bool, out; false at the origin and for coordinates that are not finite
-    """
-    start_cos, start_sin, end_cos, end_sin = edges[0], edges[1], edges[2], edges[3]
-    low, high = edges[4], edges[5]
-    all_x, all_y, all_z = xyz[0], xyz[1], xyz[2]
-    for i in range(len(all_x)):
-        x, y, z = all_x[i], all_y[i], all_z[i]
-        planar = np.sqrt(x * x + y * y)
-        somewhere = ((planar > 0.0) | (z != 0.0)) & (abs(planar + z) < np.inf)
-        past = y * start_cos >= x * start_sin
-        short = y * end_cos <= x * end_sin
-        turned = (past & short) | (is_wide & (past | short)) | (not has_azimuth)
-        above = (z >= planar * low) | (not has_low)
-        below = (z <= planar * high) | (not has_high)
-        within[i] = somewhere & turned & above & below
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
 def in_wedge(xyz, cosines, kinds, want_all, is_beyond):
     """
     Find the points whose phi and theta are beyond limits.
