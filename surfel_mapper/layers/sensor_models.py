@@ -1,89 +1,37 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The camera or lidar of each scan, and its measurements: points and free rays.
-
-The model of a lidar is fitted to the first scan of its frame and checked on every scan. If a scan
-does not fit, the model is fitted again, at growing intervals while no model fits. In between the
-frame has no model, and layers work without one.
-"""
+"""The place of the sensor of each scan, its camera, and its measurements: points, free rays."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-import logging
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config, TsdfConfig
-from surfel_mapper.errors import CloudFormatError, PoseError
+from surfel_mapper.errors import PoseError
 from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.channels import quantised
 from surfel_mapper.poses.buffer import TransformBuffer
 from surfel_mapper.scan import Scan
-from surfel_mapper.tsdf.fitting import best_fit, fit_share, LEAST_FIT
 from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
-from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
-
-logger = logging.getLogger(__name__)
-
-MISFIT = 0.8 * LEAST_FIT
-"""Share of fitting points of a scan below which the model is fitted again."""
-
-FIRST_RETRY, LAST_RETRY = 2, 256
-"""Scans until the next fit of a frame without a model; doubled after every failure."""
-
-NUM_CHECKED = 4096
-"""Points of a scan that a check looks at."""
-
-
-MAX_LIDARS = 64
-"""Frames whose lidars are kept; frame names may change without end."""
+from surfel_mapper.tsdf.sensors import CameraModel
 
 MAX_CAMERAS = 8
 """Cameras whose tables of rays are kept, 5 MB each at 640 x 480."""
-
-
-@dataclass(slots=True)
-class FrameModel:
-    """
-    The model of one frame.
-
-    Attributes
-    ----------
-    model : LidarModel or None
-        None while no model fits.
-    share : float
-        Share of fitting points of the last scan.
-    retry : int
-        Scans between two fits.
-    due : int
-        Scans until the next fit.
-
-    """
-
-    model: LidarModel | None = None
-    share: float = 0.0
-    retry: int = FIRST_RETRY
-    due: int = 0
 
 
 class SensorModels:
     """
     The sensors of the scans so far.
 
-    Attributes
-    ----------
-    frames : dict of str to FrameModel
-        The state of each frame with a lidar.
-
     Parameters
     ----------
     config : TsdfConfig
-        Ranges of the sensors, and the frame of the lidar.
+        Ranges of cameras, and the frame of the lidar.
     transforms : TransformBuffer, optional
         Tree of frames, in which ``sensor_frame`` is looked up.
 
@@ -92,9 +40,7 @@ class SensorModels:
     def __init__(self, config: TsdfConfig, transforms: TransformBuffer | None = None) -> None:
         self._config = config
         self._transforms = transforms
-        self.frames: dict[str, FrameModel] = {}
         self._cameras: dict[tuple[float, ...], CameraModel] = {}
-        self._checked: tuple[Scan | None, LidarModel | None] = (None, None)
         self._centered: tuple[Scan, Scan, Transform | None] | None = None
 
     @classmethod
@@ -139,26 +85,6 @@ class SensorModels:
         """Return the camera of a scan; None for a cloud of another sensor."""
         return self._camera(scan.camera) if scan.camera else None
 
-    def of(self, scan: Scan) -> CameraModel | LidarModel | None:
-        """
-        Return the sensor of a scan: its camera, else the lidar of its frame; None if none fits.
-
-        Parameters
-        ----------
-        scan : Scan
-            In the frame of its sensor, see centered.
-
-        """
-        if scan.camera:
-            return self._camera(scan.camera)
-        if self._checked[0] is not scan:  # several layers ask for the same scan
-            if scan.frame_id not in self.frames and len(self.frames) >= MAX_LIDARS:
-                del self.frames[next(iter(self.frames))]
-            frame = self.frames.setdefault(scan.frame_id, FrameModel())
-            self._check_fitted(frame, scan)
-            self._checked = scan, frame.model
-        return self._checked[1]
-
     def pose_in(self, scan: Scan) -> Transform | None:
         """
         Return the pose of the sensor in the frame of a scan, T_scan_sensor; None: its origin.
@@ -197,45 +123,6 @@ class SensorModels:
     def _ranges(self) -> dict[str, Any]:
         return {'min_range_m': self._config.min_range_m, 'max_range_m': self._config.max_range_m}
 
-    def _check_fitted(self, frame: FrameModel, scan: Scan) -> None:
-        """Check the model of a frame on a scan; fit it again if the scan does not fit."""
-        if frame.model is not None:
-            frame.share = self._share(frame.model, scan)
-            if frame.share >= MISFIT:
-                return
-            logger.warning(
-                'dynamic.clear: only %.0f %% of the points in %s fit the sensor of %d x %d rays; '
-                'it is fitted again',
-                *(100.0 * frame.share, scan.frame_id, frame.model.rows, frame.model.columns),
-            )
-            frame.model, frame.due, frame.retry = None, 0, FIRST_RETRY
-        if frame.due > 0:
-            frame.due -= 1
-            return
-        try:
-            frame.model, frame.share = best_fit(
-                scan.points,
-                scan.columns.get('ring'),
-                self._config.voxel_size_m,
-                **self._ranges,
-            )
-        except CloudFormatError:  # fewer than two beams: nothing to fit
-            frame.model, frame.share = None, 0.0
-        if frame.model is None:
-            if frame.retry == FIRST_RETRY:
-                logger.warning(
-                    'dynamic.clear: no model of a lidar fits the points in %s (%.0f %% of them, '
-                    'expected %.0f %%): nothing is cleared by them. For a single lidar set '
-                    'layers.tsdf.sensor_frame',
-                    *(scan.frame_id, 100.0 * frame.share, 100.0 * LEAST_FIT),
-                )
-            frame.due, frame.retry = frame.retry, min(2 * frame.retry, LAST_RETRY)
-        else:
-            frame.retry = FIRST_RETRY
-
-    def _share(self, model: LidarModel, scan: Scan) -> float:
-        return fit_share(model, scan.points, self._config.voxel_size_m, num_checked=NUM_CHECKED)
-
 
 def seen_from(T_scan_sensor: Transform, scan: Scan) -> Scan:
     """Return a scan with points and free rays in the frame of its sensor."""
@@ -244,13 +131,8 @@ def seen_from(T_scan_sensor: Transform, scan: Scan) -> Scan:
     return replace(scan, points=points, free=None if scan.free is None else scan.free @ R)
 
 
-def without_sensor(config: TsdfConfig) -> TsdfConfig:
-    """Return settings by which the sensor is at the origin of its points."""
-    return replace(config, sensor_frame='')
-
-
 def range_image(
-    scan: Scan, sensor: CameraModel | LidarModel, *, has_color: bool, has_label: bool
+    scan: Scan, sensor: CameraModel, *, has_color: bool, has_label: bool
 ) -> RangeImage:
     """
     Return the range image of a scan: of its depth image if it has one, else of points and rays.
@@ -259,7 +141,7 @@ def range_image(
     ----------
     scan : Scan
         In the frame of its sensor.
-    sensor : CameraModel or LidarModel
+    sensor : CameraModel
         The model of it.
     has_color, has_label : bool
         Whether colours and labels are taken, if the scan has any.
@@ -273,7 +155,6 @@ def range_image(
     depth, columns = scan.depth, scan.columns
     if (
         depth is None
-        or not isinstance(sensor, CameraModel)
         or (has_color and depth.color is None and ('rgb' in columns or 'rgba' in columns))
         or (has_label and depth.label is None and 'label' in columns)
     ):
@@ -311,8 +192,9 @@ def measured(scan: Scan, max_range_m: float) -> npt.NDArray[Any]:
 
 def two_beams(dtype: Any) -> npt.NDArray[Any]:
     """Return simulated points of a lidar of two beams in a round room, to compile kernels with."""
-    lidar = LidarModel(rows=2, columns=64, vertical_fov_deg=10.0)
-    return np.asarray(3.0 * lidar.directions.reshape(-1, 3), dtype)
+    azimuth, z = np.meshgrid(np.linspace(-3.0, 3.0, 64), [-0.3, 0.3])
+    xyz = np.stack([3.0 * np.cos(azimuth), 3.0 * np.sin(azimuth), z], axis=-1)
+    return np.asarray(xyz.reshape(-1, 3), dtype)
 
 
 def colors_of(scan: Scan) -> npt.NDArray[np.uint8] | None:

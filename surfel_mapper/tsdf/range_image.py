@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-RangeImage: the measurements of one scan or depth image in the pixels of its sensor.
+RangeImage: the measurements of a depth image, or of the points of a depth camera, by pixel.
 
-Images of a full-circle lidar repeat the first column after the last, so that readers need no
-special case for the seam. See tsdf/kernels/range_image.py for the values of a pixel.
+See tsdf/kernels/range_image.py for the values of a pixel.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy.typing as npt
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.tsdf.kernels import range_image as kernels
 from surfel_mapper.tsdf.measurements import checked_labels
-from surfel_mapper.tsdf.sensors import CameraModel, Sensor
+from surfel_mapper.tsdf.sensors import CameraModel
 
 Float32 = npt.NDArray[np.float32]
 
@@ -37,24 +36,24 @@ class RangeImage:
 
     Attributes
     ----------
-    sensor : CameraModel or LidarModel
+    sensor : CameraModel
         The sensor model that defines the pixels.
-    range_m : (rows, columns or one more) float32
+    range_m : (rows, columns) float32
         Length of each ray, m; 0 means unknown, more than max_range_m free up to there.
     largest_m : float
         The largest range, at most max_range_m; 0 for an image without ranges.
     num_used : int
         Number of pixels or points used.
-    color : (rows, columns or one more, 3 or 4) uint8, optional
+    color : (rows, columns, 3 or 4) uint8, optional
         Red, green, blue; a fourth channel of 0 means unknown.
-    label : (rows, columns or one more) int32, optional
+    label : (rows, columns) int32, optional
         -1 means unknown.
-    mask : (rows, columns or one more) uint8, optional
+    mask : (rows, columns) uint8, optional
         1 for pixels that only free space, for example of moving objects.
 
     """
 
-    sensor: Sensor
+    sensor: CameraModel
     range_m: Float32
     largest_m: float
     num_used: int
@@ -161,7 +160,7 @@ def from_depth(
 
 
 def from_points(
-    sensor: Sensor,
+    sensor: CameraModel,
     points: npt.NDArray[Any],
     *,
     colors: npt.NDArray[np.uint8] | None = None,
@@ -172,7 +171,7 @@ def from_points(
 
     Parameters
     ----------
-    sensor : CameraModel or LidarModel
+    sensor : CameraModel
         Model of the sensor.
     points : (N, 3) float32 or float64
         In the frame of the sensor, m; points not finite or out of view are left out.
@@ -189,7 +188,7 @@ def from_points(
     """
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype not in (np.float32, np.float64):
         raise CloudFormatError(f'points: {points.dtype} {points.shape}, expected (N, 3) float')
-    image = np.zeros((sensor.rows, sensor.columns + sensor.wraps), np.float32)
+    image = np.zeros((sensor.rows, sensor.columns), np.float32)
     source = np.full((sensor.rows, sensor.columns), -1, np.int32)
     largest, used = kernels.from_points(
         np.ascontiguousarray(points), sensor.projection, limits(sensor), image, source
@@ -204,7 +203,7 @@ def from_points(
     return range_image.with_images(**more) if more else range_image
 
 
-def limits(sensor: Sensor) -> Float32:
+def limits(sensor: CameraModel) -> Float32:
     """Return the smallest and largest range, and the value of a clearing pixel, m, (3,)."""
     farthest = sensor.max_range_m
     return np.array([sensor.min_range_m, farthest, farthest + CLEARING_M], np.float32)

@@ -16,12 +16,13 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.queries import labels_of
-from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
+from surfel_mapper.tsdf.sensors import CameraModel
 from test.fields import config_of
+from test.tsdf.scenes import lidar_rays
 
 S = 10**9
 RADIUS_M = 5.0
-LIDAR = LidarModel(rows=64, columns=360, vertical_fov_deg=60.0)
+RAYS = lidar_rays(64, 360, 60.0)
 SETTINGS = {
     'pose.source': 'odometry',
     'frames.base': 'lidar',
@@ -34,11 +35,11 @@ SETTINGS = {
 
 
 def sphere(**columns):
-    points = (RADIUS_M * LIDAR.directions).reshape(-1, 3)
+    points = (RADIUS_M * RAYS).reshape(-1, 3)
     return Scan(points=points, stamp_ns=0, frame_id='lidar', columns=columns)
 
 
-RING = np.repeat(np.arange(LIDAR.rows), LIDAR.columns)
+RING = np.repeat(np.arange(64), 360)
 
 
 def mapper_with(**settings):

@@ -9,11 +9,11 @@ from surfel_mapper import DistanceField
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.tsdf.queries import FREE, OCCUPIED, UNKNOWN
-from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
+from surfel_mapper.tsdf.sensors import CameraModel
+from test.tsdf.scenes import lidar_rays
 
 CONFIG = TsdfConfig(voxel_size_m=0.1, truncation_m=0.3, color=True, semantics='single')
-LIDAR = LidarModel(rows=64, columns=360, vertical_fov_deg=60.0)
-SPHERE = 2.0 * LIDAR.directions.reshape(-1, 3)
+SPHERE = 2.0 * lidar_rays(64, 360, 60.0).reshape(-1, 3)
 
 
 def test_field_of_a_sphere_has_its_distances_gradients_colours_and_labels():
@@ -50,9 +50,9 @@ def test_depth_image_is_fused_with_its_colours():
     assert (mesh.colors == 77).all()
 
 
-def test_the_model_of_a_lidar_is_refused_because_points_need_none():
-    with pytest.raises(TypeError, match='sensor: a LidarModel, expected a CameraModel'):
-        DistanceField(CONFIG).add(SPHERE, np.eye(4), sensor=LIDAR)
+def test_a_sensor_that_is_no_camera_is_refused():
+    with pytest.raises(TypeError, match='sensor: a str, expected a CameraModel'):
+        DistanceField(CONFIG).add(SPHERE, np.eye(4), sensor='VLP-16')
 
 
 CAMERA = CameraModel(columns=80, rows=60, fx=70.0, fy=70.0, cx=40.0, cy=30.0)

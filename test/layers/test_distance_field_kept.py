@@ -15,7 +15,7 @@ from surfel_mapper.pipeline.regions import Box
 from surfel_mapper.pipeline.saved_state import load_mapper, save_mapper
 from surfel_mapper.ros.map_files import load_map, save_map
 from test import extras
-from test.layers.test_distance_field import insert, LIDAR, mapper_with
+from test.layers.test_distance_field import insert, mapper_with, RAYS
 
 
 def field_of(mapper):
@@ -124,7 +124,7 @@ def test_labels_of_points_colour_the_mesh_and_are_in_the_file(tmp_path):
             'layers.tsdf.dynamic_labels': [3.0],
         }
     )
-    y = LIDAR.directions.reshape(-1, 3)[:, 1]
+    y = RAYS.reshape(-1, 3)[:, 1]
     labels = np.select([y > 0.5, y > 0.0, y > -0.5], [1, 2, -1], 3).astype(np.int32)
     insert(mapper, 1, label=labels)
     mesh = mapper.tsdf.mesh()

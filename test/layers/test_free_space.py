@@ -1,87 +1,84 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts on places from a range image, against a twin that knows the pixel of each place."""
+"""Verdicts on places from the points around their directions, against a twin in plain Python."""
+
+import math
 
 import numpy as np
 import pytest
 
-from surfel_mapper.layers.dynamic_objects.kernels.free_space import (
-    LEAST_PIXELS,
+from surfel_mapper.layers.dynamic_objects.free_space import (
+    FINEST_DEG,
+    LEAST_CELLS,
     look_through,
+    NUM_GRIDS,
     SEEN,
     THROUGH,
     UNKNOWN,
 )
-from surfel_mapper.tsdf.sensors import LidarModel
-from test.kernels.modes import both
+from test.tsdf.scenes import lidar_rays
 
 MARGIN_M = 0.4
-AROUND = LidarModel(rows=8, columns=40, vertical_fov_deg=40.0)
-NARROW = LidarModel(rows=6, columns=20, vertical_fov_deg=20.0)
-UNEVEN = LidarModel(rows=5, columns=24, beam_elevations_deg=(15.0, 6.0, 2.0, -1.0, -14.0))
 
 
-def verdicts_of(call, sensor, image, places):
-    x, y, z = np.asarray(places, np.float32).T.copy()
-    verdict = np.full(len(x), 99, np.int8)
-    call(
-        look_through,
-        *(x, y, z, sensor.projection, image, sensor.columns, np.float32(MARGIN_M), verdict),
-    )
-    return verdict
+def cell_of(point, step_deg):
+    """Return row and column of a direction."""
+    x, y, z = map(float, point)
+    up, around = math.degrees(math.atan2(z, math.hypot(x, y))), math.degrees(math.atan2(y, x))
+    return int((90.0 - up) // step_deg), int((180.0 - around) // step_deg)
 
 
-def image_of(sensor, ranges, around):
-    """Return an image for the kernel; one all around repeats its first column."""
-    return np.concatenate([ranges, ranges[:, :1]], axis=1) if around else ranges.copy()
+def twin(points, place):
+    """Return the verdict on a place, from the cells of each grid in a dictionary."""
+    distance, seen = math.dist(place, (0.0, 0.0, 0.0)), False
+    for grid in range(NUM_GRIDS):
+        step_deg, ranges = FINEST_DEG * 2**grid, {}
+        for point in points:
+            ranges.setdefault(cell_of(point, step_deg), []).append(math.dist(point, (0, 0, 0)))
+        row, column = cell_of(place, step_deg)
+        around = [
+            (r, (column + c) % round(360 / step_deg)) for r in range(-2, 3) for c in (-1, 0, 1)
+        ]
+        nearest = {(r, c): min(ranges[row + r, c]) for r, c in around if (row + r, c) in ranges}
+        known = sum(abs(r) <= 1 for r, _ in nearest)
+        if known >= LEAST_CELLS and min(nearest.values()) > distance + MARGIN_M:
+            return THROUGH
+        here = min(ranges.get((row, column), [math.inf]))
+        seen = seen or abs(here - distance) <= MARGIN_M
+    return SEEN if seen else UNKNOWN
 
 
-def twin(ranges, row, column, distance, around):
-    """Return the verdict on a place at a distance along the ray of a pixel."""
-    window = []
-    for r in range(max(row - 1, 0), min(row + 2, ranges.shape[0])):
-        for c in (column - 1, column, column + 1):
-            if around or 0 <= c < ranges.shape[1]:
-                window.append(float(ranges[r, c % ranges.shape[1]]))
-    known = [value for value in window if value > 0.0]
-    if len(known) >= LEAST_PIXELS and min(known) > distance + MARGIN_M:
-        return THROUGH
-    here = float(ranges[row, column])
-    return SEEN if here > 0.0 and abs(here - distance) <= MARGIN_M else UNKNOWN
-
-
-@both
-@pytest.mark.parametrize(('sensor', 'around'), [(AROUND, True), (UNEVEN, True)], ids=str)
-def test_verdicts_equal_those_of_the_twin(call, sensor, around):
+def test_verdicts_equal_those_of_the_twin():
     rng = np.random.default_rng(3)
-    shape = sensor.rows, sensor.columns
-    ranges = rng.uniform(3.0, 9.0, shape).astype(np.float32)
-    ranges[:, : shape[1] // 2] = 6.0  # walls, so that all three verdicts occur
-    ranges[rng.random(shape) < 0.3] = 0.0
-    row, column = rng.integers(0, shape, (600, 2)).T
-    distance = rng.uniform(1.0, 10.0, 600)
-    places = sensor.directions[row, column] * distance[:, None]
-
-    found = verdicts_of(call, sensor, image_of(sensor, ranges, around), places)
-
-    expected = [twin(ranges, *place, around) for place in zip(row, column, distance, strict=True)]
-    assert found.tolist() == expected
+    rays = lidar_rays(16, 90, 30.0).reshape(-1, 3)
+    points = rays * np.where(rays[:, :1] > 0.0, 6.0, rng.uniform(3.0, 9.0, (len(rays), 1)))
+    points = points[rng.random(len(points)) < 0.8]
+    places = rays[::7] * rng.uniform(1.0, 9.0, (len(rays[::7]), 1))
+    expected = [twin(points, place) for place in places]
+    found = look_through(points, places, MARGIN_M)
     assert {SEEN, UNKNOWN, THROUGH} == set(expected)
+    assert np.mean(found == expected) > 0.99  # others are on the border of two directions
 
 
-@both
-def test_places_outside_the_view_are_unknown(call):
-    ranges = np.full((NARROW.rows, NARROW.columns), 9.0, np.float32)
-    places = [[0.0, 0.0, 3.0], [1.0, 0.0, 2.0], [np.nan] * 3, [np.inf, 0.0, 0.0]]
-    assert (verdicts_of(call, NARROW, ranges, places) == UNKNOWN).all()
-    assert verdicts_of(call, NARROW, ranges, [[3.0, 0.0, 0.0]]).tolist() == [THROUGH]
+@pytest.mark.parametrize(('rows', 'columns'), [(128, 1024), (64, 2048), (16, 900)])
+def test_a_place_before_a_wall_is_seen_through_by_any_lidar(rows, columns):
+    wall = 8.0 * lidar_rays(rows, columns, 30.0).reshape(-1, 3)
+    places = lidar_rays(7, 11, 24.0).reshape(-1, 3)
+    for range_m, verdict in ((4.0, THROUGH), (7.9, SEEN), (9.0, UNKNOWN)):
+        assert set(look_through(wall, range_m * places, MARGIN_M).tolist()) == {verdict}
 
 
-@both
-def test_four_known_pixels_of_nine_are_not_enough(call):
-    ranges = np.zeros((AROUND.rows, AROUND.columns), np.float32)
-    ranges[3, 9:12] = ranges[4, 9] = 8.0
-    place = [3.0 * AROUND.directions[4, 10]]
-    assert verdicts_of(call, AROUND, image_of(AROUND, ranges, True), place) == UNKNOWN
-    ranges[4, 11] = 8.0
-    assert verdicts_of(call, AROUND, image_of(AROUND, ranges, True), place) == THROUGH
+def test_nothing_is_known_beside_the_rays_or_without_points():
+    wall = 8.0 * lidar_rays(64, 1024, 30.0).reshape(-1, 3)
+    beside = np.array([[1.0, 0.0, 3.0], [0.0, 0.0, -2.0]])
+    assert look_through(wall, beside, MARGIN_M).tolist() == [UNKNOWN, UNKNOWN]
+    assert look_through(np.empty((0, 3)), beside, MARGIN_M).tolist() == [UNKNOWN, UNKNOWN]
+
+
+def test_a_place_over_ground_at_a_grazing_angle_is_not_seen_through():
+    rays = lidar_rays(64, 1024, 30.0).reshape(-1, 3)
+    rays = rays[rays[:, 2] < -0.02]
+    ground = rays * (-1.5 / rays[:, 2:])
+    steps = np.linspace(5.5, 30.0, 200)
+    places = np.column_stack([steps, np.zeros(200), np.full(200, -1.4)])
+    assert THROUGH not in look_through(ground, places, MARGIN_M)

@@ -12,7 +12,7 @@ from surfel_mapper.tsdf.blocks import BlockMap, VISIBLE_VOXELS
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.mesh import Mesher
 from surfel_mapper.tsdf.queries import sample
-from test.tsdf.scenes import image_of, sphere, VLP16
+from test.tsdf.scenes import image_of, sphere, WIDE
 
 VOXEL_M = 0.2
 SETTINGS = dict(voxel_size_m=VOXEL_M, truncation_m=0.6, carve_m=20.0)
@@ -22,9 +22,9 @@ def scans(number):
     """Yield images of a room with noise and a ball that moves, and stamps, ns."""
     rng = np.random.default_rng(3)
     for n in range(number):
-        walls = 6.0 + rng.normal(0.0, 0.01, VLP16.directions.shape[:2])
-        ball = sphere(VLP16, (3.0, -2.0 + 0.3 * n, 0.0), 1.0)
-        yield image_of(VLP16, np.fmin(walls, ball)), n * 10**8
+        walls = 6.0 + rng.normal(0.0, 0.01, WIDE.directions.shape[:2])
+        ball = sphere(WIDE, (-2.0 + 0.3 * n, 0.0, 3.0), 1.0)
+        yield image_of(WIDE, np.fmin(walls, ball)), n * 10**8
 
 
 def vertices_by_edge(mesher):

@@ -17,12 +17,12 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
 from surfel_mapper.sensors.depth import PinholeCamera
-from surfel_mapper.tsdf.sensors import LidarModel
 from test.messages.test_compressed_image import packed, packed_depth
 from test.ros.live import cloud, LATCHED, odometry, stamp, START_NS
 from test.ros.test_inputs import arguments, camera_info, OPTICAL
 from test.ros.test_node import PERIOD_NS
 from test.ros.test_outputs import BASE, start_node
+from test.tsdf.scenes import lidar_rays
 
 RADIUS_M = 5.0
 SETTINGS = {
@@ -63,7 +63,7 @@ def test_the_sphere_around_a_lidar_comes_as_mesh_slice_and_distances(start, peer
     esdf_slices = peer.collect(OccupancyGrid, f'{BASE}/esdf_slice', LATCHED)
     meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
     slices = peer.collect(OccupancyGrid, f'{BASE}/tsdf_slice', LATCHED)
-    directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
+    directions = lidar_rays(32, 360, 60.0).reshape(-1, 3)
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
     peer.publish('/points', cloud(START_NS, RADIUS_M * directions))
 
@@ -162,7 +162,7 @@ def test_a_late_reader_gets_the_whole_mesh_and_then_changes_only(start, peer):
     start_node(start, peer, **{**SETTINGS, **coarse, 'layers.tsdf.max_range_m': 100.0})
     meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
     peer.spin_until(lambda: num_complete(meshes) == 1)  # before the first scan, without triangles
-    directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
+    directions = lidar_rays(32, 360, 60.0).reshape(-1, 3)
     half = directions[:, 0] > 0.0
     level = np.abs(directions[:, 2]) < 0.1
     ranges = np.where(half, np.where(level, 30.0, np.nan), RADIUS_M)[:, None]

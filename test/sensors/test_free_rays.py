@@ -18,16 +18,16 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.free_rays import free_directions
 from surfel_mapper.tsdf.queries import FREE, states, UNKNOWN
-from surfel_mapper.tsdf.sensors import LidarModel
+from test.tsdf.scenes import lidar_rays
 
-LIDAR = LidarModel(rows=32, columns=360, vertical_fov_deg=40.0)
+RAYS = lidar_rays(32, 360, 40.0)
 S = 10**9
 
 
 def organised(nothing, where, staggered_deg=0.0, order=slice(None), transpose=False):
     """Return a scan of a sphere, the content of some pixels, and their true directions."""
-    turn = np.radians(staggered_deg) * np.arange(LIDAR.rows)[:, None]
-    d = LIDAR.directions.astype(float)
+    turn = np.radians(staggered_deg) * np.arange(len(RAYS))[:, None]
+    d = RAYS.astype(float)
     rays = np.stack(
         [
             np.cos(turn) * d[..., 0] - np.sin(turn) * d[..., 1],

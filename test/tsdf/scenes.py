@@ -10,11 +10,20 @@ from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.kernels import range_image as kernels
 from surfel_mapper.tsdf.measurements import LEAST_WEIGHT
 from surfel_mapper.tsdf.range_image import limits, RangeImage
-from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
+from surfel_mapper.tsdf.sensors import CameraModel
 
 VGA = CameraModel(columns=640, rows=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
 SMALL = CameraModel(columns=80, rows=60, fx=65.0, fy=65.0, cx=40.0, cy=30.0)
-VLP16 = LidarModel(rows=16, columns=360, vertical_fov_deg=30.0, max_range_m=30.0)
+WIDE = CameraModel(columns=160, rows=120, fx=60.0, fy=60.0, cx=80.0, cy=60.0, max_range_m=30.0)
+
+
+def lidar_rays(rows, columns, fov_deg):
+    """Return unit vectors of a spinning lidar, (rows, columns, 3), from 180 deg on clockwise."""
+    up = np.deg2rad(np.linspace(fov_deg / 2.0, -fov_deg / 2.0, rows))[:, None]
+    around = np.pi - 2.0 * np.pi * np.arange(columns) / columns
+    level = np.cos(up)
+    z = np.broadcast_to(np.sin(up), (rows, columns))
+    return np.stack([level * np.cos(around), level * np.sin(around), z], -1).astype(np.float32)
 
 
 def plane(sensor, angle_deg, depth_m=2.0):
@@ -96,10 +105,8 @@ def zero_crossings(blocks):
 
 def image_of(sensor, range_m):
     """Return the range image of ranges in the pixels of a sensor; nan: unknown, inf: free."""
-    image = np.empty((sensor.rows, sensor.columns + sensor.wraps), np.float32)
+    image = np.empty((sensor.rows, sensor.columns), np.float32)
     ranges = np.ascontiguousarray(range_m, np.float32)
     one = np.float32(1.0), np.nan, np.ones_like(ranges), limits(sensor)
     largest, used = kernels.from_depth(ranges, *one, image)
-    if sensor.wraps:
-        image[:, -1] = image[:, 0]
     return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)

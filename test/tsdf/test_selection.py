@@ -3,7 +3,6 @@
 """T11: the selected blocks, against all blocks and all rays."""
 
 import numpy as np
-import pytest
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.geometry import pose_matrix
@@ -11,15 +10,10 @@ from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.kernels.integration import OBSERVED
 from surfel_mapper.tsdf.selection import BlockSelection
-from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
+from surfel_mapper.tsdf.sensors import CameraModel
 from test.tsdf.scenes import image_of
 
-SENSORS = {
-    'camera': CameraModel(
-        columns=48, rows=36, fx=40.0, fy=40.0, cx=24.0, cy=18.0, max_range_m=5.0
-    ),
-    'lidar': LidarModel(rows=16, columns=90, vertical_fov_deg=50.0, max_range_m=5.0),
-}
+CAMERA = CameraModel(columns=48, rows=36, fx=40.0, fy=40.0, cx=24.0, cy=18.0, max_range_m=5.0)
 SIZES = dict(voxel_size_m=0.125, truncation_m=0.3, voxels_per_side=4)
 
 
@@ -41,7 +35,7 @@ def everywhere(T, reach_m, size_m):
 
 
 def test_a_new_block_beside_the_chosen_ones_has_no_voxel_near_a_surface():
-    rng, sensor = np.random.default_rng(5), SENSORS['camera']
+    rng, sensor = np.random.default_rng(5), CAMERA
     config = TsdfConfig(**SIZES)
     for _ in range(5):
         T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)
@@ -58,15 +52,14 @@ def test_a_new_block_beside_the_chosen_ones_has_no_voxel_near_a_surface():
         assert len(missed) <= 0.02 * share
 
 
-@pytest.mark.parametrize('sensor', SENSORS)
-def test_rays_touch_every_block_of_their_band(sensor):
-    rng, sensor = np.random.default_rng(7), SENSORS[sensor]
+def test_rays_touch_every_block_of_their_band():
+    rng, sensor = np.random.default_rng(7), CAMERA
     config = TsdfConfig(**SIZES, carve_m=0.0)
     for _ in range(5):
         # So far away pixels are more than half a voxel apart, and none is passed over.
         T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)
         chosen = {*map(tuple, BlockSelection(config).blocks(image, T).index)}
-        range_m = image.range_m[:, : sensor.columns]
+        range_m = image.range_m
         rays = sensor.directions.astype(float) @ T[:3, :3].T
         sampled = set()
         for along in np.linspace(-0.3, 0.3, 40):
@@ -77,9 +70,11 @@ def test_rays_touch_every_block_of_their_band(sensor):
 
 
 def test_carving_reaches_all_but_corners_of_blocks_along_the_rays():
-    sensor = LidarModel(rows=64, columns=1024, vertical_fov_deg=45.0, max_range_m=20.0)
+    sensor = CameraModel(
+        columns=512, rows=256, fx=250.0, fy=250.0, cx=256.0, cy=128.0, max_range_m=20.0
+    )
     rng = np.random.default_rng(8)
-    range_m = np.repeat(np.repeat(rng.uniform(2.0, 19.0, (8, 32)), 8, 0), 32, 1)
+    range_m = np.repeat(np.repeat(rng.uniform(2.0, 19.0, (8, 16)), 32, 0), 32, 1)
     image, T = image_of(sensor, range_m), random_pose(rng)
     config = TsdfConfig(voxel_size_m=0.1, truncation_m=0.3)
     chosen = BlockSelection(config).blocks(image, T).index
@@ -94,26 +89,25 @@ def test_carving_reaches_all_but_corners_of_blocks_along_the_rays():
         found = {*map(tuple, block[inside].astype(int))}
         deep += len(found)
         missed += len(found - keys)
-    assert deep > 10_000
+    assert deep > 5_000
     assert missed == 0
 
 
 def test_without_a_measurement_there_is_no_block():
-    image = image_of(SENSORS['lidar'], np.full((16, 90), np.nan))
+    image = image_of(CAMERA, np.full((36, 48), np.nan))
     found = BlockSelection(TsdfConfig(**SIZES)).blocks(image, np.eye(4))
     assert (found.index.shape, found.near.shape) == ((0, 3), (0,))
 
 
-@pytest.mark.parametrize('sensor', SENSORS)
-def test_blocks_near_the_surface_are_those_of_the_band(sensor):
-    rng, sensor = np.random.default_rng(9), SENSORS[sensor]
+def test_blocks_near_the_surface_are_those_of_the_band():
+    rng, sensor = np.random.default_rng(9), CAMERA
     config = TsdfConfig(**SIZES, carve_m=20.0)
     selection = BlockSelection(config)  # its marks are used again
     for _ in range(5):
         T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)
         selected = selection.blocks(image, T)
         index, near = selected.index, selected.near
-        range_m = image.range_m[:, : sensor.columns]
+        range_m = image.range_m
         rays = sensor.directions.astype(float) @ T[:3, :3].T
         sampled = set()
         for along in np.linspace(-0.3, 0.3, 40):
@@ -126,7 +120,7 @@ def test_blocks_near_the_surface_are_those_of_the_band(sensor):
 
 
 def test_clearing_pixels_have_no_blocks_near_a_surface():
-    image = image_of(SENSORS['camera'], np.full((36, 48), np.inf))
+    image = image_of(CAMERA, np.full((36, 48), np.inf))
     found = BlockSelection(TsdfConfig(**SIZES, carve_m=20.0)).blocks(image, np.eye(4))
     assert len(found.index) > 100
     assert not found.near.any()

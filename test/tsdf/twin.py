@@ -23,29 +23,10 @@ def voxel_centres(config, block):
 def place_in_image(sensor, p):
     """Return column and row of (N, 3) points, nan for points out of view."""
     with np.errstate(all='ignore'):
-        if hasattr(sensor, 'fx'):
-            u = sensor.fx * p[:, 0] / p[:, 2] + sensor.cx
-            v = sensor.fy * p[:, 1] / p[:, 2] + sensor.cy
-            seen = (p[:, 2] > 0) & (u >= 0) & (u <= sensor.columns)
-            seen &= (v >= 0) & (v <= sensor.rows)
-            return np.where(seen, u, np.nan), np.where(seen, v, np.nan)
-        azimuth = np.arctan2(p[:, 1], p[:, 0])
-        elevation = np.arcsin(p[:, 2] / np.linalg.norm(p, axis=1))
-    first = np.deg2rad(sensor.first_azimuth_deg)
-    u = (first - azimuth) / (2 * np.pi) % 1.0 * sensor.columns
-    beams = np.deg2rad(
-        sensor.beam_elevations_deg
-        or np.linspace(
-            sensor.vertical_fov_top_deg,
-            sensor.vertical_fov_top_deg - sensor.vertical_fov_deg,
-            sensor.rows,
-        )
-    )
-    # Beyond the first and the last beam rows go on at the pitch between the outermost two.
-    low = beams[0] + (beams[0] - beams[1]), beams[-1] - (beams[-2] - beams[-1])
-    known = np.concatenate([[low[0]], beams, [low[1]]])
-    v = np.interp(-elevation, -known, np.arange(-1, sensor.rows + 1), np.nan, np.nan)
-    seen = (v >= -0.5) & (v <= sensor.rows - 0.5) & ~np.isnan(u)
+        u = sensor.fx * p[:, 0] / p[:, 2] + sensor.cx
+        v = sensor.fy * p[:, 1] / p[:, 2] + sensor.cy
+        seen = (p[:, 2] > 0) & (u >= 0) & (u <= sensor.columns)
+        seen &= (v >= 0) & (v <= sensor.rows)
     return np.where(seen, u, np.nan), np.where(seen, v, np.nan)
 
 

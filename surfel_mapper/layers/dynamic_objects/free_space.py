@@ -44,10 +44,10 @@ def look_through(
     Returns
     -------
     (K,) int8
-        THROUGH if the points of the nine directions around a place end behind it by more than the
-        margin. They all must: at a grazing angle neighbouring ones differ by more than any margin,
-        and the place is between them. SEEN if the one of its own direction ends within the margin.
-        Else UNKNOWN.
+        THROUGH if the points of the directions around a place, five rows of three, end behind it
+        by more than the margin. They all must: at a grazing angle neighbouring rows differ by more
+        than any margin, and the place is between them. SEEN if the one of its own direction ends
+        within the margin. Else UNKNOWN.
 
     """
     (range_m, *cells), (distance_m, row, column) = direction_cells(points), direction_cells(places)
@@ -55,9 +55,9 @@ def look_through(
     np.minimum.at(nearest, tuple(cells), range_m)
     through, seen = np.zeros((2, len(places)), bool)
     for _ in range(NUM_GRIDS):
-        modes = {'size': 3, 'mode': ('constant', 'wrap')}
-        lowest = minimum_filter(nearest, cval=np.inf, **modes)
-        share = uniform_filter((nearest < np.inf).astype(np.float32), **modes)
+        modes = ('constant', 'wrap')
+        lowest = minimum_filter(nearest, (5, 3), mode=modes, cval=np.inf)
+        share = uniform_filter((nearest < np.inf).astype(np.float32), 3, mode=modes)
         enough = share[row, column] > (LEAST_CELLS - 0.5) / 9.0
         through |= enough & (lowest[row, column] > distance_m + margin_m)
         seen |= np.abs(nearest[row, column] - distance_m) <= margin_m

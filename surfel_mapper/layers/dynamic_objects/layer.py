@@ -3,7 +3,7 @@
 """
 Dynamic objects as a layer: voxels that later scans see through are cleared.
 
-Every scan becomes a range image, and the voxels of the map are looked up in it. A voxel gains a
+The voxels of the map are compared with the points of every scan. A voxel gains a
 count if the rays around it end behind it or met nothing, and loses all counts when it is seen or
 hit again. A short window forgets dynamic objects anyway; this is for windows longer than objects
 stand still.
@@ -11,7 +11,6 @@ stand still.
 
 from __future__ import annotations
 
-from dataclasses import replace
 import math
 
 import numpy as np
@@ -19,14 +18,9 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import inverse
-from surfel_mapper.layers.dynamic_objects.kernels.free_space import look_through, SEEN, THROUGH
+from surfel_mapper.layers.dynamic_objects.free_space import look_through, SEEN, THROUGH
 from surfel_mapper.layers.layer import InsertedScan, Layer, Surroundings
-from surfel_mapper.layers.sensor_models import (
-    range_image,
-    SensorModels,
-    two_beams,
-    without_sensor,
-)
+from surfel_mapper.layers.sensor_models import measured
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.scan import Scan
 
@@ -54,22 +48,12 @@ class DynamicObjectsLayer(Layer):
 
         Raises
         ------
-        CloudFormatError
-            If the sensor cannot be recognised from the points.
         PoseError
             If ``layers.tsdf.sensor_frame`` is not connected with the frame of the scan.
 
         """
         keys = self.around.surfel_map.keys()
         return self.count(inserted.scan, inserted.T_map_sensor, keys, inserted.keys)
-
-    def warm_up(self) -> None:
-        """Compile the kernels, for points of either type."""
-        for dtype in (np.float32, np.float64):
-            scan = Scan(points=two_beams(dtype), stamp_ns=0, frame_id='')
-            around = replace(self.around, sensors=SensorModels(without_sensor(self.config.tsdf)))
-            fresh = DynamicObjectsLayer(self.config, around)
-            fresh.count(scan, np.eye(4), np.zeros(1, np.int64), np.zeros(1, np.int64))
 
     def count(
         self, scan: Scan, T_map_sensor: npt.NDArray[np.float64], keys: Keys, hit: Keys
@@ -90,8 +74,6 @@ class DynamicObjectsLayer(Layer):
 
         Raises
         ------
-        CloudFormatError
-            If the sensor cannot be recognised from the points.
         PoseError
             If ``layers.tsdf.sensor_frame`` is not connected with the frame of the scan.
 
@@ -112,17 +94,17 @@ class DynamicObjectsLayer(Layer):
     ) -> npt.NDArray[np.int8]:
         """Return the verdict of a scan on each voxel, (K,) int8: SEEN, THROUGH or unknown."""
         scan, T_map_sensor = self.around.sensors.centered(scan, T_map_sensor)
-        sensor, voxel_size_m = self.around.sensors.of(scan), self.around.surfel_map.voxel_size_m
-        if sensor is None:  # no model fits: nothing is known about any voxel
-            return np.zeros(len(keys), np.int8)
-        image = range_image(scan, sensor, has_color=False, has_label=False).range_m
-        image = np.minimum(image, np.float32(sensor.max_range_m))  # unknown beyond
+        tsdf, voxel_size_m = self.config.tsdf, self.around.surfel_map.voxel_size_m
+        axes = [2, 0, 1] if scan.camera else [0, 1, 2]  # x ahead
+        points = measured(scan, tsdf.max_range_m)[:, axes].astype(np.float32)
+        ranges = np.linalg.norm(points, axis=1)
+        kept = (ranges >= tsdf.min_range_m) & (ranges < np.inf)
+        scales = np.minimum(tsdf.max_range_m / ranges[kept], 1.0)  # unknown beyond
         T = inverse(T_map_sensor)
         centers = (unpack_keys(keys).astype(np.float64) + 0.5) * voxel_size_m
-        x, y, z = (centers @ T[:3, :3].T + T[:3, 3]).astype(np.float32).T.copy()
+        places = (centers @ T[:3, :3].T + T[:3, 3])[:, axes].astype(np.float32)
+        near = np.linalg.norm(places, axis=1) <= tsdf.max_range_m
         margin_m = self.config.dynamic.margin_m or math.sqrt(3.0) * voxel_size_m
-        verdict = np.empty(len(keys), np.int8)
-        look_through(
-            *(x, y, z, sensor.projection, image, sensor.columns, np.float32(margin_m), verdict)
-        )
+        verdict = np.zeros(len(keys), np.int8)
+        verdict[near] = look_through(points[kept] * scales[:, None], places[near], margin_m)
         return verdict

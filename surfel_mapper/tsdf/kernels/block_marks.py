@@ -67,7 +67,7 @@ def mark_rays(image, directions, pose, reach, side, marks, near):
     """
     Mark the blocks that rays touch, and those in the band about a surface.
 
-    image       (rows, columns or more) float32 m
+    image       (rows, columns) float32 m
     directions  (rows, columns, 3) float32, unit vectors in the frame of the sensor
     pose        (3, 4) float64, from m in the sensor frame to blocks from the cube's corner
     reach       (NUM_REACH,) float64

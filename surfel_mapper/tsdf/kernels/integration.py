@@ -21,7 +21,6 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.prefetch import prefetch
-from surfel_mapper.kernels.projection import project
 from surfel_mapper.tsdf.kernels.channels import (
     apply_mask,
     fuse_color,
@@ -41,6 +40,7 @@ from surfel_mapper.tsdf.kernels.lookup import (
     mix,
     TAU,
 )
+from surfel_mapper.tsdf.kernels.projection import project
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -78,7 +78,7 @@ def integrate_blocks(blocks, offsets, field, sensor, images, settings, channels,
               contradicting measurements, in [0, 1)
     offsets   (3, N) float32 m, from the first voxel to every voxel, x fastest
     field     (R, 2, N) float32, distance and weight of all blocks
-    sensor    (kind, parameters, elevations), see kernels/projection.py
+    sensor    (6,) float32, see tsdf/kernels/projection.py
     images    (pairs, color, label, mask): pairs, as gather takes them, with their BORDER; see
               fuse_color, vote_labels, apply_mask; missing images have
               no rows
@@ -94,7 +94,6 @@ def integrate_blocks(blocks, offsets, field, sensor, images, settings, channels,
     upper, lower = np.empty(num_voxels, np.int64), np.empty(num_voxels, np.int64)
     pixel = np.empty(num_voxels, np.int32)
     mixed, label = np.empty(num_voxels, np.uint8), np.empty(num_voxels, np.int32)
-    kind, parameters, elevations = sensor
     pairs, color_image, label_image, mask = images
     stride = pairs.shape[1]
     color, votes = channels
@@ -107,7 +106,7 @@ def integrate_blocks(blocks, offsets, field, sensor, images, settings, channels,
         shift(offsets[0], corners[b, 0], x)
         shift(offsets[1], corners[b, 1], y)
         shift(offsets[2], corners[b, 2], z)
-        project(x, y, z, kind, parameters, elevations, distance, u, v)
+        project(x, y, z, sensor, distance, u, v)
         locate(distance, u, v, stride, settings, pixel)
         gather(pairs.ravel(), stride, pixel, upper, lower)
         mix(upper.view(np.float32), lower.view(np.float32), u, v, settings, value)

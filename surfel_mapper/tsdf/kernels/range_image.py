@@ -11,7 +11,7 @@ max_range, which avoids differences of infinities.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.projection import project
+from surfel_mapper.tsdf.kernels.projection import project
 
 CHUNK = 1024
 """Points projected at once: the scratch arrays fit the L1 cache."""
@@ -37,7 +37,7 @@ def from_depth(depth, scale, unknown, ray_length, limits, image):
     depth       (rows, columns) float32, float64 or uint16; scale float32, metres of one unit
     unknown     float64, a depth that means unknown; nan if there is none
     ray_length  (rows, columns) float32, range at depth 1
-    image       (rows, columns or more) float32 m, out
+    image       (rows, columns) float32 m, out
 
     largest is the largest range, max_range if a pixel clears; used counts the pixels that are not
     unknown.
@@ -62,16 +62,13 @@ def from_points(points, sensor, limits, image, index):
     Project points to their nearest pixels, which keep the closest; return (largest, used).
 
     points  (N, 3) float32 or float64 m, in the frame of the sensor; non-finite points are skipped
-    sensor  (kind, parameters, elevations), see kernels/projection.py
-    image   (rows, columns or one more) float32 m, in: 0; out: ranges, with the first column
-            repeated at the end if there is one more
+    sensor  (6,) float32, see tsdf/kernels/projection.py
+    image   (rows, columns) float32 m, in: 0; out: ranges
     index   (rows, columns) int32, out: number of the point of each filled pixel
 
     largest is the largest range, max_range if a pixel clears; used counts the points in view.
     """
     rows, columns = np.int64(index.shape[0]), np.int64(index.shape[1])
-    kind, parameters, elevations = sensor
-    all_around = image.shape[1] > columns
     scratch = np.empty((6, CHUNK), np.float32)
     x, y, z = scratch[0], scratch[1], scratch[2]
     distance, u, v = scratch[3], scratch[4], scratch[5]
@@ -82,16 +79,14 @@ def from_points(points, sensor, limits, image, index):
             x[n] = points[start + n, 0]
             y[n] = points[start + n, 1]
             z[n] = points[start + n, 2]
-        project(x, y, z, kind, parameters, elevations, distance, u, v)
+        project(x, y, z, sensor, distance, u, v)
         for n in range(count):
             value = range_value(distance[n], limits)
             # False for nan and inf, whose column is arbitrary.
-            if value == 0.0 or not (u[n] >= np.float32(-0.5) and distance[n] < np.inf):
+            if value == 0.0 or not (u[n] >= np.float32(0.0) and distance[n] < np.inf):
                 continue
             row = np.int64(np.floor(v[n] + np.float32(0.5)))
             column = np.int64(np.floor(u[n] + np.float32(0.5)))
-            if column == columns and all_around:
-                column = 0
             if row < 0 or row >= rows or column < 0 or column >= columns:
                 continue
             used += 1
@@ -99,7 +94,4 @@ def from_points(points, sensor, limits, image, index):
             if image[row, column] == 0.0 or value < image[row, column]:
                 image[row, column] = value
                 index[row, column] = start + n
-    if all_around:
-        for row in range(rows):
-            image[row, columns] = image[row, 0]
     return min(largest, limits[1]), used
