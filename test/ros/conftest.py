@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 import fcntl
+import os
 import sys
 
 import pytest
@@ -26,7 +27,8 @@ def domain(tmp_path_factory):
 @pytest.fixture(scope='session')
 def prefork(domain, tmp_path_factory):
     """Compile all kernels, then return the process of which verbs are forked, if it can."""
-    with compiling_alone(tmp_path_factory.getbasetemp().parent):
+    own = tmp_path_factory.getbasetemp()  # of pytest-xdist one in a folder for each process
+    with compiling_alone(own.parent if 'PYTEST_XDIST_WORKER' in os.environ else own):
         forking = Prefork() if sys.platform == 'linux' else load()
     yield forking
     if forking is not None:
