@@ -247,7 +247,7 @@ def drive_of_two(offsets_s, *, rear_hz=20, pose_hz=50, start_s=1.7e9):
     return mapper
 
 
-@pytest.mark.parametrize('offset_s', [-1.7e9 + 614.0, -3600.0, -37.0, 37.0, 3600.0, 3e8])
+@pytest.mark.parametrize('offset_s', [-1.7e9 + 614.0, -37.0, 3600.0])
 @pytest.mark.parametrize('rear_hz', [5, 20])
 def test_a_sensor_with_another_clock_leaves_the_map_of_the_first(offset_s, rear_hz, caplog):
     mapper = drive_of_two([offset_s], rear_hz=rear_hz)
