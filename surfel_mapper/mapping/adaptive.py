@@ -32,7 +32,6 @@ from surfel_mapper.errors import MapError
 from surfel_mapper.kernels import layout
 from surfel_mapper.kernels.layout import KEY, STAMP
 from surfel_mapper.mapping.channels import channel_names, means
-from surfel_mapper.mapping.coarsening import coarse_keys
 from surfel_mapper.mapping.kernels import adaptive as kernels
 from surfel_mapper.mapping.kernels.adaptive import DIRTY, EMPTY, LINK, LINK_BITS, LINKED, SHOWN
 from surfel_mapper.mapping.kernels.rows import read_rows
@@ -122,40 +121,12 @@ class CellTable(VoxelTable):
 
     def find_or_add(self, key: npt.NDArray[np.int64]) -> Rows:
         """Return the rows of cells (K,), which are added if they are missing."""
-        keys, numbers = coarse_keys(key, 0)
+        keys, numbers = np.unique(key, return_inverse=True)
         rows = self.add(no_points(keys, self.channel_sums.shape[1]), 0).astype(np.intp)
         for slab in (self._links, self._children):
             if len(slab.array) < len(self.rows.array):
                 slab.grow(len(self.rows.array))
-        return rows[numbers.astype(np.intp)]
-
-    def mark(self, links: npt.NDArray[np.int64]) -> Rows:
-        """Mark the parents of nodes as dirty; return those that were clean, each once."""
-        is_parent = np.zeros(self.rows_used + 1, np.bool_)
-        is_parent[links >> LINK_BITS] = True
-        parents = np.flatnonzero(is_parent[1:])
-        cells: Rows = parents[self._links.array[parents, LINK] & DIRTY == 0]
-        self._links.array[cells, LINK] |= DIRTY
-        return cells
-
-    def detach(self, links: npt.NDArray[np.int64], key: npt.NDArray[np.int64], level: int) -> None:
-        """Remove nodes of a level from the children of their parents."""
-        parents = links >> LINK_BITS
-        linked = parents > 0
-        self.children[parents[linked] - 1, octants(key[linked], level)] = 0
-
-    def clean(self, dirty: Rows, level: int) -> None:
-        """Mark dirty cells of a level as clean, and free the empty ones."""
-        links = self._links.array
-        kernels.clean(dirty, links)
-        empty = dirty[self.stamps.array[dirty, STAMP] == EMPTY]
-        if len(empty):
-            key = self.keys(empty)
-            self.detach(links[empty, LINK], key, level)
-            links[empty] = 0
-            moments = no_points(key, self.channel_sums.shape[1])
-            object.__setattr__(moments, 'rows', empty)  # hints save compiling the look-up
-            self.remove(moments, 0)
+        return rows[numbers]
 
 
 class AdaptiveCut:
@@ -274,14 +245,14 @@ class AdaptiveCut:
         self._version, self._num_rows = self._map.version, self._map.rows_used
         if len(self._links.array) < self._num_rows:
             self._links.grow(2 * self._num_rows)
-        dirty, detached = self._judge(changed)
+        dirty, unlinked = self._judge(changed)
         voxels, cells, left_voxels, left_cells = self._compare(dirty[-1])
         surfels = self._surfels(voxels, cells, covariance)
         shown = self._keys(voxels, cells)
         for level, dirty_cells in enumerate(dirty, 1):
-            self._cells.clean(dirty_cells, level)
+            self._clean(dirty_cells, level)
         kernels.clean(changed, self._links.array)
-        gone = joined(self._lost, (np.concatenate([detached, left_voxels]), left_cells))
+        gone = joined(self._lost, (np.concatenate([unlinked, left_voxels]), left_cells))
         self._removed = np.setdiff1d(gone[0], shown[0]), np.setdiff1d(gone[1], shown[1])
         index, levels = indices(*self._removed)
         size = np.asarray(self._map.voxel_size_m * 2.0**levels)
@@ -328,48 +299,51 @@ class AdaptiveCut:
         return state.hexdigest()
 
     def _judge(self, changed: Rows) -> tuple[list[Rows], npt.NDArray[np.int64]]:
-        """Link and judge the cells above changed voxels: dirty ones by level, detached keys."""
-        new, emptied, detached = self._detach(changed)
-        dirty = [np.concatenate([emptied, self._attach(new, 0)])]
-        space = workspace()
+        """Link and judge the cells above changed voxels: dirty ones by level, unlinked keys."""
+        cells, gone = self._link(changed, 0)
+        dirty, space = [cells], workspace()
         for level in range(1, self._levels + 1):
             for start in range(0, len(dirty[-1]), BLOCK):
                 self._judge_cells(dirty[-1][start : start + BLOCK], level, space)
             if level < self._levels:
-                dirty.append(self._attach(dirty[-1], level))
-        return dirty, detached
+                dirty.append(self._link(dirty[-1], level)[0])
+        return dirty, gone
 
-    def _detach(self, changed: Rows) -> tuple[Rows, Rows, npt.NDArray[np.int64]]:
+    def _link(self, chosen: Rows, level: int) -> tuple[Rows, npt.NDArray[np.int64]]:
         """
-        Unlink the changed rows that hold their voxel no longer.
+        Link changed nodes of a level to their parents.
 
-        Returns rows without a link, dirty cells, and the keys of unlinked voxels of the cut.
+        Returns the rows of the parents that become dirty, and the keys of voxels of the cut that
+        the chosen rows hold no longer.
         """
-        links = self._links.array
-        key, link = links[changed].T
-        is_linked = link != 0
-        rows, key, link = changed[is_linked], key[is_linked], link[is_linked]
-        stays = key == self._map.slabs[0][rows, KEY]
-        links[rows, LINK] = np.where(stays, link | DIRTY, 0)
-        dirty, gone = self._cells.mark(link), ~stays
-        new = np.concatenate([changed[~is_linked], rows[gone]])
-        link, key = link[gone], key[gone]
-        self._cells.detach(link, key, 0)
-        return new, dirty, key[link & SHOWN > 0]
-
-    def _attach(self, chosen: Rows, level: int) -> Rows:
-        """Link changed nodes of a level to their parents; return the ones that become dirty."""
-        rows, _, links = self._nodes(level)
-        new = chosen[links[chosen, LINK] >> LINK_BITS == 0]
-        key = rows[new, KEY]
-        del rows, links  # views would pin the memory
+        new, dirty, gone = self._mark(chosen, level)
+        key = self._nodes(level)[0][new, KEY]
         if key.min(initial=0) < 0:  # emptied voxels
             new, key = new[key >= 0], key[key >= 0]
         parents = self._cells.find_or_add(parent_keys(key, level))
         self._cells.children.reshape(-1)[parents * 8 + octants(key, level)] = new + 1
         links = self._nodes(level)[2]
         links[new] = np.column_stack([key, ((parents + 1) << LINK_BITS) | DIRTY])
-        return self._cells.mark(links[chosen, LINK])
+        return np.sort(np.concatenate([dirty, self._mark(new, level)[1]])), gone
+
+    def _mark(self, chosen: Rows, level: int) -> list[npt.NDArray[np.int64]]:
+        """Return the outputs of the kernel ``mark`` for nodes of a level."""
+        outputs = [np.empty(len(chosen), np.int64) for _ in range(3)]
+        links, children = self._cells.nodes[2], self._cells.children
+        numbers = kernels.mark(chosen, self._nodes(level), links, children, *outputs)
+        return [array[:num] for array, num in zip(outputs, numbers, strict=True)]
+
+    def _clean(self, dirty: Rows, level: int) -> None:
+        """Mark dirty cells of a level as clean, and free the empty ones."""
+        rows, stamps, links = self._cells.nodes
+        kernels.clean(dirty, links)
+        empty = dirty[stamps[dirty, STAMP] == EMPTY]
+        if len(empty):
+            moments = no_points(rows[empty, KEY], self._cells.channel_sums.shape[1])
+            object.__setattr__(moments, 'rows', empty)  # hints save compiling the look-up
+            self._cells.remove(moments, 0)
+            self._mark(empty, level)
+            links[empty] = 0
 
     def _judge_cells(self, dirty: Rows, level: int, space: Space) -> None:
         """Sum and judge cells of a level."""

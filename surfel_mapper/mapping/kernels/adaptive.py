@@ -23,7 +23,7 @@ import math
 import numpy as np
 
 from surfel_mapper.kernels.compiling import inlined, kernel, U
-from surfel_mapper.kernels.layout import BITS, KEY, MAX_MAP_COUNT, PRODUCT, SCANS, STAMP
+from surfel_mapper.kernels.layout import BITS, KEY, MAX_MAP_COUNT, PRODUCT, ROW, SCANS, STAMP
 from surfel_mapper.kernels.prefetch import prefetch
 from surfel_mapper.mapping.kernels.rows import (
     add_to_row,
@@ -223,9 +223,11 @@ def judge(summed, means, ends, cells, children, thickness, size, stamps):
                     if means[j, ERROR] >= 0.0:
                         dx, dy = means[j, 0] - means[i, 0], means[j, 1] - means[i, 1]
                         dz = means[j, 2] - means[i, 2]
-                        error_sq = ((dx * dx + dy * dy) + dz * dz) * means[i, ERROR]
-                        error_sq += variance / means[i, COUNT] + variance / means[j, COUNT]
-                        mixed |= is_beyond((dx * nx + dy * ny) + dz * nz, error_sq, offset)
+                        across = (dx * nx + dy * ny) + dz * nz
+                        if abs(across) > offset:
+                            error_sq = ((dx * dx + dy * dy) + dz * dz) * means[i, ERROR]
+                            error_sq += variance / means[i, COUNT] + variance / means[j, COUNT]
+                            mixed |= is_beyond(across, error_sq, offset)
             shape += U(means[i, COUNT] >= CHILD_POINTS)
         is_plane = n >= MIN_POINTS and values[index, 1] >= MIN_SPREAD * size * size
         is_plane &= stop - start > U(1)
@@ -237,6 +239,48 @@ def is_beyond(value, error_sq, tolerance):
     """Return whether a value, of a squared standard error, is beyond a tolerance about 0."""
     excess = abs(value) - tolerance
     return excess > 0.0 and excess * excess > SIGMAS * SIGMAS * error_sq
+
+
+@kernel()
+def mark(chosen, nodes, cell_links, children, new, dirty, gone):
+    """
+    Mark changed nodes and their parents as dirty, and unlink rows that hold another node now.
+
+    chosen  (K,) int64, rows
+    new     (K,) int64, out: rows without a link
+    dirty   (K,) int64, out: rows of the parents that were clean
+    gone    (K,) int64, out: keys of the unlinked nodes that were in the cut
+
+    Returns the numbers of outputs.
+    """
+    flat, links, parent_links = nodes[0].ravel(), nodes[2].ravel(), cell_links.ravel()
+    num_new, num_dirty, num_gone, last = 0, 0, 0, len(chosen) - 1
+    for index in range(len(chosen)):
+        later = chosen[min(index + 4 * AHEAD, last)]
+        prefetch(flat, later * ROW)
+        prefetch(links, later * 2)
+        later = links[U(chosen[min(index + 2 * AHEAD, last)]) * U(2) + U(LINK)] >> LINK_BITS
+        prefetch(parent_links, max(later - 1, 0) * 2)
+        row = chosen[index]
+        at = U(row) * U(2)
+        key, link = links[at + U(LINKED)], links[at + U(LINK)]
+        parent = (link >> LINK_BITS) - 1
+        is_linked = parent >= 0
+        if is_linked:
+            dirty[num_dirty] = parent
+            num_dirty += cell_links[parent, LINK] & DIRTY == 0
+            cell_links[parent, LINK] |= DIRTY
+            links[at + U(LINK)] = link | DIRTY
+            if flat[first_word(row) + U(KEY)] != key:
+                gone[num_gone] = key
+                num_gone += link & SHOWN
+                links[at + U(LINK)] = 0
+                for octant in range(8):
+                    children[parent, octant] *= children[parent, octant] != row + 1
+                is_linked = False
+        new[num_new] = row
+        num_new += not is_linked
+    return num_new, num_dirty, num_gone
 
 
 @kernel()
