@@ -8,6 +8,7 @@ A snapshot: it does not follow later changes of the map, and any thread may quer
 
 from __future__ import annotations
 
+from functools import cached_property
 import math
 from typing import Any
 
@@ -15,10 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_numbers
-from surfel_mapper.kernels.grouping import build_table
 from surfel_mapper.kernels.layout import BITS
-from surfel_mapper.mapping.kernels.queries import best_around, rows_at
-from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.mapping.moments import pack_keys, within_reach
 from surfel_mapper.mapping.surfels import Surfels
 
 
@@ -41,10 +40,15 @@ class SurfelIndex:
         self.surfels = surfels
         self.voxel_size_m = voxel_size_m
         self._bits = BITS + level
-        self._keys = pack_keys(surfels.voxel_index)
-        size = 1 << max(2 * len(surfels) - 1, 1).bit_length()
-        self._table = np.empty(size, np.int32)
-        build_table(self._keys, self._table)
+        keys = pack_keys(surfels.voxel_index)
+        self._order = np.argsort(keys)
+        self._keys = keys[self._order]
+
+    @cached_property
+    def _tree(self) -> Any:
+        from scipy.spatial import cKDTree  # which takes long to load
+
+        return cKDTree(self.surfels.position)
 
     def at(self, points: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """
@@ -62,9 +66,16 @@ class SurfelIndex:
 
         """
         xyz = _as_xyz(points)
-        rows = np.empty(len(xyz), np.int64)
+        rows = np.full(len(xyz), -1)
         scale = (1 << self._bits) / self.voxel_size_m
-        rows_at(xyz, scale, self._bits, self._keys, self._table, rows)
+        voxels = np.floor(np.floor(xyz * scale) / float(1 << self._bits))
+        inside = np.flatnonzero(within_reach(voxels))
+        keys = pack_keys(voxels[inside])
+        ranks = np.searchsorted(self._keys, keys)
+        ranks[ranks == len(self._keys)] = 0
+        if len(self._keys):
+            is_there = self._keys[ranks] == keys
+            rows[inside[is_there]] = self._order[ranks[is_there]]
         return rows
 
     def nearest(
@@ -78,7 +89,7 @@ class SurfelIndex:
         points : (N, 3) float, m
             In the frame of the map.
         max_distance_m : float
-            Maximum distance of a surfel; the cost grows with its cube.
+            Maximum distance of a surfel.
 
         Returns
         -------
@@ -88,11 +99,15 @@ class SurfelIndex:
             Distance to the position of the surfel; inf if none is near.
 
         """
-        xyz = _as_xyz(points)
-        rows = self._best(xyz, max_distance_m, 1, np.empty(0))[:, 0]
-        step = self._of(self.surfels.position, rows) - xyz
-        distance = np.sqrt((step * step).sum(axis=1))
-        return rows, np.where(rows >= 0, distance, math.inf)
+        xyz, radius_m = _as_xyz(points), _as_radius('max_distance_m', max_distance_m)
+        rows, distance = np.full(len(xyz), -1), np.full(len(xyz), math.inf)
+        is_finite = np.isfinite(xyz).all(axis=1)
+        beyond_m = np.nextafter(radius_m, math.inf)
+        distance[is_finite], number = self._tree.query(
+            xyz[is_finite], distance_upper_bound=beyond_m
+        )
+        rows[is_finite] = np.where(number < len(self.surfels), number, -1)
+        return rows, distance
 
     def best_planar(
         self, points: npt.ArrayLike, k: int, max_distance_m: float
@@ -107,7 +122,7 @@ class SurfelIndex:
         k : int
             Number of surfels for each point.
         max_distance_m : float
-            Maximum distance from point to surfel position; the cost grows with its cube.
+            Maximum distance from point to surfel position.
 
         Returns
         -------
@@ -123,7 +138,15 @@ class SurfelIndex:
         """
         if k < 1:
             raise ValueError(f'k: {k}, expected 1 or more')
-        return self._best(_as_xyz(points), max_distance_m, k, -self.surfels.planarity)
+        xyz, radius_m = _as_xyz(points), _as_radius('max_distance_m', max_distance_m)
+        rows, planarity = np.full((len(xyz), k), -1), self.surfels.planarity
+        is_finite = np.isfinite(xyz).all(axis=1)
+        for number in np.flatnonzero(is_finite):
+            around = np.array(self._tree.query_ball_point(xyz[number], radius_m), np.int64)
+            around = around[~np.isnan(planarity[around])]
+            best = around[np.lexsort((around, -planarity[around]))][:k]
+            rows[number, : len(best)] = best
+        return rows
 
     def in_box(self, low: npt.ArrayLike, high: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """Return the rows of the surfels in a box, m, including its faces, ascending."""
@@ -135,8 +158,7 @@ class SurfelIndex:
 
     def in_radius(self, center: npt.ArrayLike, radius_m: float) -> npt.NDArray[np.int64]:
         """Return the rows of the surfels within a distance of a point, ascending."""
-        if not radius_m >= 0.0:
-            raise ValueError(f'radius_m: {radius_m}, expected zero or more')
+        _as_radius('radius_m', radius_m)
         step = self.surfels.position - _as_xyz(np.reshape(np.asarray(center), (1, 3)))
         return np.flatnonzero((step * step).sum(axis=1) <= radius_m * radius_m)
 
@@ -166,24 +188,6 @@ class SurfelIndex:
         step = xyz - self._of(self.surfels.position, rows)
         return np.asarray((step * self._of(self.surfels.normal, rows)).sum(axis=1))
 
-    def _best(
-        self, xyz: npt.NDArray[np.float64], radius_m: float, k: int, ranks: Any
-    ) -> npt.NDArray[np.int64]:
-        if not 0.0 <= radius_m < math.inf:
-            raise ValueError(f'max_distance_m: {radius_m}, expected zero or more, finite')
-        rows = np.empty((len(xyz), k), np.int64)
-        best_around(
-            xyz,
-            radius_m,
-            self.voxel_size_m,
-            self.surfels.position,
-            ranks,
-            self._keys,
-            self._table,
-            rows,
-        )
-        return rows
-
     def _of(
         self, values: npt.NDArray[np.float64], rows: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.float64]:
@@ -199,3 +203,10 @@ def _as_xyz(points: npt.ArrayLike) -> npt.NDArray[np.float64]:
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise ValueError(f'points: shape {xyz.shape}, expected (N, 3)')
     return xyz
+
+
+def _as_radius(name: str, radius_m: float) -> float:
+    """Return a radius; raise ValueError if it is negative or not finite."""
+    if not 0.0 <= radius_m < math.inf:
+        raise ValueError(f'{name}: {radius_m}, expected zero or more, finite')
+    return radius_m

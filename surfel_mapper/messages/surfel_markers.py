@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.geometry import face_normals
-from surfel_mapper.mapping.ages import Ages
+from surfel_mapper.mapping.ages import last_seen_ns
 from surfel_mapper.messages.markers import ADD, DELETE, LINE_LIST, Marker, TRIANGLE_LIST
 
 if TYPE_CHECKING:
@@ -174,10 +174,7 @@ def shades(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
 
 
 def disc_colors(
-    kind: str,
-    surfels: Surfels,
-    scans: Iterable[WindowedScan] = (),
-    ages: Ages | None = None,
+    kind: str, surfels: Surfels, scans: Iterable[WindowedScan] = ()
 ) -> npt.NDArray[np.float32]:
     """
     Return the colours of surfels, (K, 4).
@@ -191,8 +188,6 @@ def disc_colors(
         K of them.
     scans : iterable of WindowedScan
         The scans of the window.
-    ages : Ages, optional
-        Cache of the last drawing, which makes the next faster.
 
     """
     if kind == 'normal':
@@ -202,7 +197,7 @@ def disc_colors(
     window = list(scans)
     stamps = [scan.stamp_ns for scan in window] or [0]
     span_ns = max(max(stamps) - min(stamps), 1)
-    last_ns = (ages or Ages()).last_seen_ns(surfels.voxel_index, window)
+    last_ns = last_seen_ns(surfels.voxel_index, window)
     return shades((last_ns - min(stamps)) / span_ns)
 
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.mapping.ages import Ages, ages_s
+from surfel_mapper.mapping.ages import ages_s, last_seen_ns
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.contents import Cloud, Content, ExactMap, ShownMesh, Way
@@ -159,7 +159,7 @@ def with_age(surfels: Surfels, shown: ExactMap, level: int) -> DrawnDiscs:
     if not shown.scans or level:
         return DrawnDiscs.of(surfels)
     newest_ns = max(scan.stamp_ns for scan in shown.scans)
-    seen_ns = Ages().last_seen_ns(surfels.voxel_index, shown.scans)
+    seen_ns = last_seen_ns(surfels.voxel_index, shown.scans)
     return DrawnDiscs.of(surfels, {'age': ages_s(seen_ns, newest_ns)})
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing, RingsDrawing
-from surfel_mapper.mapping.ages import Ages, ages_s
+from surfel_mapper.mapping.ages import ages_s, last_seen_ns
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.messages.model_messages import quaternions
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
@@ -99,7 +99,6 @@ class Viewer:
         self._shown_voxels = self._removed = 0
         self._last: Update | None = None
         self._is_placed = False
-        self._ages = Ages()
         self._cut = mapper.map.adaptive_cut(mapper.config.map.min_points)
         if scene is None:
             scene = Scene.to_window()
@@ -211,7 +210,7 @@ class Viewer:
         values = {}
         if self._colouring == 'age':
             scans = list(self._mapper.window)
-            stamps = self._ages.last_seen_ns(surfels.voxel_index, scans)
+            stamps = last_seen_ns(surfels.voxel_index, scans)
             newest_ns = max((scan.stamp_ns for scan in scans), default=0)
             values['age'] = ages_s(stamps, newest_ns)
         return DrawnDiscs.of(surfels, values)

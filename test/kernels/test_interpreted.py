@@ -8,7 +8,7 @@ SHORT_MAPPING = """
 import hashlib
 import numpy as np
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.mapping.ages import Ages
+from surfel_mapper.mapping.ages import last_seen_ns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 
@@ -40,7 +40,7 @@ print(len(surfel_map.surfels_changed(since=surfel_map.version - 3)))
 window = [WindowedScan(moments=each, stamp_ns=n, T_map_sensor=pose) for n, each in enumerate(live)]
 few = surfel_map.surfels(1, at_most=100).voxel_index
 for scans in (window, window[1:]):
-    print(np.bincount(Ages().last_seen_ns(few, scans) + 1))
+    print(np.bincount(last_seen_ns(few, scans) + 1))
 try:
     surfel_map.remove(live[0])
     surfel_map.remove(live[0])

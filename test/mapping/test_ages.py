@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps at which voxels were last seen, while scans enter and leave the window."""
+"""Stamps at which the scans of a window last observed voxels."""
+
+import math
 
 import numpy as np
 import pytest
 
-from surfel_mapper.mapping.ages import Ages
+from surfel_mapper.mapping.ages import ages_s, last_seen_ns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 
@@ -30,32 +32,13 @@ def slow_last_seen_ns(voxel_index, held):
 
 
 @pytest.mark.parametrize('num_drawn', [0, 1, 300, 10_000])
-def test_the_newest_scan_of_each_voxel_is_found_while_the_window_slides(num_drawn):
+def test_the_newest_scan_of_each_voxel_decides_in_any_order(num_drawn):
     made, surfel_map = scans(num=12, num_points=400, seed=1)
-    ages = Ages()
-    for first in range(0, 8, 2):
-        held = made[first : first + 5]
-        drawn = surfel_map.surfels(1, num_drawn + first).voxel_index  # the budget moves too
-        found = ages.last_seen_ns(drawn, held)
-        assert found.tolist() == slow_last_seen_ns(drawn, held)
-    assert num_drawn == 0 or (found == -1).any()  # voxels of evicted scans
-
-
-def test_a_scan_that_loses_voxels_has_not_seen_them():
-    made, surfel_map = scans(num=2, num_points=500, seed=2)
-    drawn, ages = surfel_map.surfels(1, 200).voxel_index, Ages()
-    ages.last_seen_ns(drawn, made)
-
-    half = made[0].moments.select(np.arange(len(made[0].moments)) % 2 == 0)
-    made[0] = WindowedScan(moments=half, stamp_ns=made[0].stamp_ns, T_map_sensor=np.eye(4))
-
-    assert ages.last_seen_ns(drawn, made).tolist() == slow_last_seen_ns(drawn, made)
-
-
-def test_scans_may_come_and_leave_in_any_order():
-    made, surfel_map = scans(num=10, num_points=400, seed=3)
-    rng, ages = np.random.default_rng(4), Ages()
-    for _ in range(30):
-        held = [made[k] for k in np.flatnonzero(rng.uniform(size=len(made)) < 0.7)]
-        drawn = surfel_map.surfels(1, int(rng.integers(100, 400))).voxel_index
-        assert ages.last_seen_ns(drawn, held).tolist() == slow_last_seen_ns(drawn, held)
+    drawn = surfel_map.surfels(1, num_drawn).voxel_index
+    for window in (made, made[4:9], []):
+        seen_ns = last_seen_ns(drawn, window)
+        assert seen_ns.tolist() == slow_last_seen_ns(drawn, window)
+    assert (ages_s(seen_ns, 1).tolist(), seen_ns.tolist()) == (
+        pytest.approx([math.nan] * len(drawn), nan_ok=True),
+        [-1] * len(drawn),
+    )
