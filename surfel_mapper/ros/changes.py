@@ -152,6 +152,7 @@ class AdaptiveTracker:
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
         self._cut = mapper.map.adaptive_cut(self.min_points)
+        mapper.derives = False  # surfels of voxels are not published
 
     @property
     def min_points(self) -> int:

@@ -27,7 +27,6 @@ from visualization_msgs.msg import MarkerArray
 
 from surfel_mapper.config import Config
 from surfel_mapper.filters.columns import as_fields
-from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import surfel_columns, Surfels
 from surfel_mapper.messages.map_cloud import adaptive_cloud, moment_cloud, voxel_columns
@@ -77,7 +76,6 @@ class Outputs:
         self._changes = self._adaptive or ChangeTracker(mapper)
         # of ~/removed while publish.changed is false
         self._removals = self._adaptive or ChangeTracker(mapper)
-        self._ages = Ages()
         self._origin = OriginOutput(node, mapper)
         self._alignment = AlignmentOutputs(node, mapper)
         self._layers = LayerOutputs(node, mapper, thread)
@@ -109,9 +107,8 @@ class Outputs:
         with guarded('publishing of the alignment'):
             self._alignment.publish(update)
         self._layers.publish_update(update)
-        if self._mapper.derives:
-            with guarded('publishing of surfels'):
-                self._publish_surfels(update)
+        with guarded('publishing of surfels'):
+            self._publish_surfels(update)
         if self._filtered.get_subscription_count():
             with guarded('publishing of the filtered scan'):
                 self._publish_filtered(update.filtered)
@@ -131,8 +128,7 @@ class Outputs:
         with self._mapper.guarded('publishing of the origin'):
             self._origin.publish(self._stamp_ns)
         self._layers.expire()
-        if self._mapper.derives:
-            self._publish_changes(lambda tracker: tracker.collect())
+        self._publish_changes(lambda tracker: tracker.collect())
         if not self._timers:
             self.publish_latest()
 
@@ -143,8 +139,6 @@ class Outputs:
         Needed while no timer runs. Markers and coarser maps that were never published are left
         out, as nothing obsolete is kept of them.
         """
-        if not self._mapper.derives:
-            return
         for _, publisher, publish in self._periodic(self._mapper.config):
             was_published = publisher in self._published
             if self._is_due(publisher) or (was_published and self._is_new(publisher)):
@@ -301,7 +295,7 @@ class Outputs:
         markers = surfel_markers(
             surfels,
             surfel_map.voxel_size_m,
-            disc_colors(config.publish.marker_color, surfels, self._mapper.window, self._ages),
+            disc_colors(config.publish.marker_color, surfels, self._mapper.window),
             stamp_ns=self._stamp_ns,
             frame_id=self._mapper.map_frame,
         )

@@ -248,7 +248,8 @@ def test_adaptive_changes_add_up_to_the_adaptive_surfels():
         shown.update(zip(keys, change.surfels.num_points.tolist(), strict=True))
 
     for number in range(8):
-        node.map_scan(number * SECOND)
+        change_of_voxels, _ = node.map_scan(number * SECOND)
+        assert not len(change_of_voxels.surfels)  # none are derived
         follow(tracker.after_scan(None))
         check_shown(node, shown)
     node.mapper.clear()
