@@ -10,7 +10,7 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import depth_points, PinholeCamera, SceneImage
-from test.layers.test_distance_field import LIDAR, RING
+from test.layers.test_distance_field import RAYS, RING
 
 MS = 10**6
 CAMERA = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
@@ -116,7 +116,7 @@ def test_points_of_a_lidar_are_coloured_where_a_camera_sees_them_and_only_there(
     mapper.add_pose('base', 'camera', 0, (0.1, 0.0, 1.0), optical, static=True)
     mapper.add_pose('odom', 'base', 1000 * MS, (7.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     mapper.add_image(image(1000 * MS))
-    points = (5.0 * LIDAR.directions).reshape(-1, 3)
+    points = (5.0 * RAYS).reshape(-1, 3)
     mapper.add_scan(
         Scan(points=points, stamp_ns=1000 * MS, frame_id='lidar', columns={'ring': RING})
     )
