@@ -63,6 +63,14 @@ Share and number of opposed voxels of a scan from which it warns.
 A hall with pose errors of 20 mm has 1 to 6 %, a wall of half a voxel 13 %.
 """
 
+PLANE_M, PLANE_VOXELS = 0.5, (3, 5)
+"""
+Edge of the cells whose points give normals, m, and its least and largest number of voxels.
+
+With 5 voxels instead of 3 at 0.1 m the angles between faces in a hall are 12.4 deg instead of
+13.5; at 0.2 m the median error would rise by 0.3 mm.
+"""
+
 FIRST_BLOCKS = 16384
 """Blocks for which there is room at first."""
 
@@ -210,6 +218,12 @@ class PointIntegrator:
         return self._fuse(scan, cells, (origin, corner), stamp_ns, (places, *images))
 
     @property
+    def _plane_voxels(self) -> int:
+        """Edge of the cells whose points give normals, voxels."""
+        wanted = round(PLANE_M / self.blocks.config.voxel_size_m)
+        return min(max(wanted, PLANE_VOXELS[0]), PLANE_VOXELS[1])
+
+    @property
     def _carve_m(self) -> float:
         """Range up to which rays free space, m."""
         return min(self.blocks.config.carve_m, self.blocks.config.max_range_m)
@@ -255,10 +269,11 @@ class PointIntegrator:
         keys, sums = all_keys[:number], all_sums[:number]
         planes, plane_keys, plane_sums = (np.empty_like(a) for a in (keys, keys, sums))
         table = new_table(number)
-        number = point_cells.merge_cells(keys, sums, table, planes, plane_keys, plane_sums)
+        edge, content = self._plane_voxels, (table, planes, plane_keys, plane_sums)
+        number = point_cells.merge_cells(keys, sums, edge, *content)
         order = np.argsort(plane_keys[:number])
         fitted, normals = np.empty((number, 3)), np.empty((number, 3))
-        point_cells.fit_planes(plane_keys[order], plane_sums[order], fitted)
+        point_cells.fit_planes(plane_keys[order], plane_sums[order], edge, fitted)
         normals[order] = fitted
         cells = np.empty((len(keys), CELL))
         size_m = self.blocks.config.voxel_size_m

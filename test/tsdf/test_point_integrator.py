@@ -14,6 +14,7 @@ from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.mesh import Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
 from surfel_mapper.tsdf.queries import labels_at, sample
+from test.tsdf.scenes import lidar_rays
 
 VOXEL_M = 0.2
 POSE = pose_matrix([0.33, -0.71, 0.52], [0.1, -0.2, 0.3, np.sqrt(0.86)])
@@ -146,6 +147,27 @@ def test_noise_of_a_plane_is_averaged():
     error = (vertices - [4.0, 0.0, 0.0]) @ normal
     # a cell merges at least ten points: 0.02 / 10^(1/2) is 6.3 mm
     assert np.sqrt(np.mean(error**2)) < 0.0065
+
+
+def test_ground_between_the_rings_of_a_lidar_is_smooth():
+    one, rng = integrator(voxel_size_m=0.1, carve_m=0.0), np.random.default_rng(1)
+    rays = lidar_rays(64, 1024, 60.0).reshape(-1, 3).astype(float)
+    rays = rays[rays[:, 2] < -0.15]
+    for number in range(4):
+        T = np.eye(4)
+        T[0, 3] = 0.37 * number
+        ranges = -1.55 / rays[:, 2] + 0.02 * rng.standard_normal(len(rays))
+        one.integrate(rays * ranges[:, None], T, number * 10**8)
+    mesh = mesh_of(one.blocks)
+    corners = mesh.vertices[mesh.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas, apart = np.linalg.norm(normals, axis=1), np.hypot(*corners[:, :, :2].mean(axis=1).T)
+    ring = (areas > 1e-9) & (apart > 4.0) & (apart < 8.0)
+    tilts_deg = np.degrees(np.arccos(np.clip(normals[ring, 2] / areas[ring], -1.0, 1.0)))
+    assert ring.sum() > 20_000
+    # with planes of 9 voxels, for larger voxels, these are 3.0 deg and 3.2 mm
+    assert np.average(tilts_deg, weights=areas[ring]) < 2.7
+    assert np.sqrt(np.mean((corners[ring, :, 2] + 1.55) ** 2)) < 0.0027
 
 
 def wall_of(thickness_m, tilt=0.0, num_scans=6):

@@ -5,7 +5,7 @@ Merge the points of a scan by voxel, and fit planes to their surroundings.
 
 A cell is the set of points in one voxel. All rays of a cell are fused as one ray to the mean of
 its points, as in the merged integrator of voxblox. Normals are those of larger cells, of
-PLANE voxels a side, with the 26 cells around: the mean of a few points in a voxel is as good as a
+some voxels a side, with the 26 cells around: the mean of a few points in a voxel is as good as a
 range reading, but their plane is not.
 
 Tables are open addressed: (T, 2) int64 of key and number, T a power of two, EMPTY keys are free.
@@ -25,9 +25,6 @@ EMPTY = -1
 
 MOMENTS = 10
 """Columns of sums: count, sums of x y z, and of xx xy xz yy yz zz, about the centre of a cell."""
-
-PLANE = 3
-"""Edge of the larger cells whose planes give normals, voxels."""
 
 LEAST_SPREAD = 0.3
 """Least variance along the second axis of a plane, voxels^2: two rows of a lidar, not one."""
@@ -147,11 +144,12 @@ def merge_points(points, pose, limits, table, keys, sums):
 
 
 @njit(cache=True, nogil=True)
-def merge_cells(keys, sums, table, planes, plane_keys, plane_sums):
+def merge_cells(keys, sums, edge, table, planes, plane_keys, plane_sums):
     """
     Sum the moments of cells by the larger cell that they lie in.
 
     keys, sums              of K cells of a voxel
+    edge                    of a larger cell, voxels
     table                   (T, 2) int64, in and out; T more than K
     planes                  (K,) int64, out: number of the larger cell of each
     plane_keys, plane_sums  (K,) and (K, MOMENTS), out
@@ -161,24 +159,25 @@ def merge_cells(keys, sums, table, planes, plane_keys, plane_sums):
     number = 0
     for cell in range(len(keys)):
         i, j, k = unpacked(keys[cell])
-        a, b, c = i // PLANE, j // PLANE, k // PLANE
+        a, b, c = i // edge, j // edge, k // edge
         last = number
         into, number = number_of(packed(a, b, c), table, plane_keys, last)
         planes[cell] = into
         if number > last:
             plane_sums[into] = 0.0
-        middle = 0.5 * (PLANE - 1)
-        x, y, z = i - a * PLANE - middle, j - b * PLANE - middle, k - c * PLANE - middle
+        middle = 0.5 * (edge - 1)
+        x, y, z = i - a * edge - middle, j - b * edge - middle, k - c * edge - middle
         add_moments(sums[cell], x, y, z, plane_sums[into])
     return number
 
 
 @njit(cache=True, nogil=True)
-def fit_planes(keys, sums, normals):
+def fit_planes(keys, sums, edge, normals):
     """
     Fit a plane to each cell and its neighbours.
 
-    keys, sums  of M cells of PLANE voxels, ascending
+    keys, sums  of M cells, ascending
+    edge        of a cell, voxels
     normals     (M, 3) float64, out: either sign; 0 if the points are no plane
     """
     near, first = np.empty(MOMENTS), np.zeros(9, np.int64)
@@ -191,7 +190,7 @@ def fit_planes(keys, sums, normals):
                 first[column] += 1
             n = first[column]
             while n < len(keys) and keys[n] <= middle + 1:
-                add_moments(sums[n], a * PLANE, b * PLANE, (keys[n] - middle) * PLANE, near)
+                add_moments(sums[n], a * edge, b * edge, (keys[n] - middle) * edge, near)
                 n += 1
         normals[cell] = 0.0
         count = near[0]
