@@ -384,7 +384,7 @@ def write_files(
     target = trajectory.positions[-1] if trajectory.stamps_ns else (0.0, 0.0, 0.0)
     min_points, most = mapper.config.map.min_points, most_shown(meshes)
     in_view = drawn_surfels(drawn, mapper.map, min_points, target, most)
-    write_report(page, title, summary, surfels, history, picture, meshes, sections, in_view)
+    write_report(page, title, summary, surfels, history, meshes, sections, in_view)
     write_outcomes(output / SCANS, mapper.outcomes or [])
     write_json(figures, summary)
     files = known_formats()

@@ -111,25 +111,14 @@ def lines(x: Array, series: Mapping[str, Array], x_label: str, y_label: str) -> 
 
 def histogram(values: Array, low: float, high: float, x_label: str, y_label: str) -> str:
     """Return a histogram of NUM_BINS bars from low to high; non-finite values are left out."""
-    from matplotlib.collections import PolyCollection
-
     finite = values[np.isfinite(values)]
     if not len(finite):
         return NO_DATA
-    clipped = np.clip(finite, low, high)
-    counts, edges = np.histogram(clipped, bins=NUM_BINS, range=(low, high))
-    starts, ends, bottom, top = edges[:-1], edges[1:], np.zeros(NUM_BINS), counts
-    corners = [(starts, bottom), (starts, top), (ends, top), (ends, bottom)]
-    bars = list(np.transpose(corners, (2, 0, 1)))
+    counts, edges = np.histogram(np.clip(finite, low, high), NUM_BINS, (low, high))
     with _axes() as (figure, axes):
-        # two thirds of the time of as many single bars
-        axes.add_collection(PolyCollection(bars, color=BAR, linewidth=0.0))
-        axes.set(
-            xlim=(low, high),
-            ylim=(0.0, 1.05 * counts.max()),
-            xlabel=x_label,
-            ylabel=y_label,
-        )
+        axes.stairs(counts, edges, fill=True, color=BAR, linewidth=0.0)
+        axes.set(xlim=(low, high), ylim=(0.0, 1.05 * counts.max()))
+        axes.set(xlabel=x_label, ylabel=y_label)
         return _svg(figure, f'{y_label} by {x_label}')
 
 

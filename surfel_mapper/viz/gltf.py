@@ -21,7 +21,7 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.triangles import import_trimesh, write_scene, Y_UP
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.discs import Colouring, CORNERS, DrawnDiscs
-from surfel_mapper.viz.mesh import GREY, vertex_normals
+from surfel_mapper.viz.mesh import GREY
 
 Array = npt.NDArray[np.float64]
 
@@ -65,8 +65,7 @@ class GltfScene:
             return
         corners, triangles = discs.triangles()
         colours = np.repeat(self.colouring.of(discs), CORNERS, axis=0)
-        normals = np.repeat(discs.normal, CORNERS, axis=0)
-        self._add(path, corners, triangles, normals, colours)
+        self._add(path, corners, triangles, colours)
 
     def mesh(self, path: str, mesh: Mesh, *, static: bool = True) -> None:
         """Add a mesh, in its colours if it has any."""
@@ -74,7 +73,7 @@ class GltfScene:
             return
         grey = np.broadcast_to(GREY, mesh.vertices.shape)
         colours = mesh.colors if len(mesh.colors) else grey
-        self._add(path, mesh.vertices, mesh.triangles, vertex_normals(mesh), colours)
+        self._add(path, mesh.vertices, mesh.triangles, colours)
 
     def points(
         self,
@@ -100,16 +99,9 @@ class GltfScene:
         static: bool = True,
     ) -> None:
         """Add lines, (M, 3) m each."""
-        path_of = self._trimesh.path
-        ends = np.cumsum([len(line) for line in lines])
-        strips = [
-            path_of.entities.Line(np.arange(end - len(line), end))
-            for end, line in zip(ends, lines, strict=True)
-            if len(line) > 1
-        ]
-        if strips:
-            vertices = np.concatenate([np.asarray(line, np.float64) for line in lines])
-            self._add_geometry(path, path_of.Path3D(strips, vertices, process=False))
+        for line in lines:
+            if len(line) > 1:
+                self._add_geometry(path, self._trimesh.load_path(line))
 
     def poses(self, path: str, stamp_ns: npt.NDArray[np.int64], xyz: Array, turns: Array) -> None:
         """Leave out poses over time."""
@@ -126,21 +118,11 @@ class GltfScene:
         """
         write_scene(self.path, self._scene)
 
-    def _add(
-        self,
-        path: str,
-        vertices: Any,
-        triangles: Any,
-        normals: Any,
-        colours: npt.NDArray[np.uint8],
-    ) -> None:
+    def _add(self, path: str, vertices: Any, triangles: Any, colours: Any) -> None:
         mesh = self._trimesh.Trimesh(
-            vertices=vertices,
-            faces=triangles,
-            vertex_normals=normals,
-            vertex_colors=linear(colours),
-            process=False,
+            vertices, triangles, vertex_colors=linear(colours), process=False
         )
+        mesh.vertex_normals  # noqa: B018, glTF has only normals that were computed
         self._add_geometry(path, mesh)
 
     def _add_geometry(self, path: str, geometry: Any) -> None:

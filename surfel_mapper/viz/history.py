@@ -3,8 +3,7 @@
 """
 History: the figures of each scan of a replay, for the plots of the report.
 
-The figures are flat arrays, about 100 bytes a scan: 4 MB an hour at 10 Hz. Counting surfels visits
-every voxel of the map, so a run of any length has between 32 and 64 counts, evenly spread.
+The figures are flat arrays, about 100 bytes a scan: 4 MB an hour at 10 Hz.
 """
 
 from __future__ import annotations
@@ -18,13 +17,10 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
 
-MAX_COUNTS = 64
-"""Number of surfel counts at which every second one is dropped."""
-
 
 class History:
     """
-    Figures of every scan that was mapped, and counts of surfels.
+    Figures of every scan that was mapped.
 
     Attributes
     ----------
@@ -39,8 +35,6 @@ class History:
         self._voxels: array[int] = array('q')
         self._dropped: array[int] = array('q')
         self._positions: array[float] = array('d')
-        self._counts: list[tuple[int, int]] = []
-        self._every = 1
 
     def __len__(self) -> int:
         """Return the number of scans."""
@@ -58,14 +52,6 @@ class History:
         self._voxels.append(mapper.map.num_voxels)
         self._dropped.append(mapper.counters.dropped.total())
         self._positions.extend(update.T_map_sensor[:3, 3])
-        if (len(self) - 1) % self._every == 0:
-            self._count(mapper)
-
-    def _count(self, mapper: Mapper) -> None:
-        self._counts.append((len(self) - 1, mapper.map.num_surfels(mapper.config.map.min_points)))
-        if len(self._counts) == MAX_COUNTS:
-            del self._counts[1::2]
-            self._every *= 2
 
     @property
     def seconds(self) -> npt.NDArray[np.float64]:
@@ -87,9 +73,3 @@ class History:
     def trajectory(self) -> npt.NDArray[np.float64]:
         """Position of the sensor at each scan, map frame, (S, 3) m."""
         return np.array(self._positions, np.float64).reshape(-1, 3)
-
-    @property
-    def surfels(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Number of the scan of each surfel count, and the counts, (C,) each."""
-        scan, count = np.array(self._counts, np.int64).reshape(-1, 2).T
-        return scan, count

@@ -97,5 +97,5 @@ def show(
         surfels = drawn = shown
     summary['surfels'] = len(surfels)
     valid = drawn.select(np.isfinite(drawn.planarity))
-    body = turning_view(valid, np.empty((0, 3)), np.empty(0), summary, None, {})
+    body = turning_view(valid, np.empty((0, 3)), np.empty(0), summary, {})
     return InlineView(page('map', body), f'{len(surfels)} surfels')

@@ -57,7 +57,6 @@ def write_report(
     summary: Mapping[str, Any],
     surfels: Surfels,
     history: History | None = None,
-    picture: str | Path | None = None,
     layers: Mapping[str, Mesh] | None = None,
     sections: Sequence[str] = (),
     drawn: Surfels | None = None,
@@ -78,8 +77,6 @@ def write_report(
         The map, or a part of it.
     history : History, optional
         Figures of each scan; without it there are no plots over time.
-    picture : str or Path, optional
-        A PNG file, for browsers without WebGL 2.
     layers : mapping of str to Mesh, optional
         Meshes that can be shown in place of the surfels, by name.
     sections : sequence of str
@@ -98,7 +95,7 @@ def write_report(
     shown = valid if drawn is None else drawn.select(np.isfinite(drawn.planarity))
     blocks = [
         f'<h1>{as_html(title)}</h1><p class="about">{as_html(about(summary))}</p>',
-        turning_view(shown, history.trajectory, history.seconds, summary, picture, layers or {}),
+        turning_view(shown, history.trajectory, history.seconds, summary, layers or {}),
         figures(summary, history, valid),
         *sections,
         plots(valid, summary, history),
@@ -203,16 +200,15 @@ def tracking_table(registration: Mapping[str, Any]) -> str:
 def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str:
     """Return the section with all plots."""
     seconds = history.seconds
-    at, counts = history.surfels
     times = {
         stage: np.array(history.milliseconds[stage])
         for stage in sorted(history.milliseconds, key=stage_order)
     }
     slope = np.degrees(np.arccos(np.clip(np.abs(surfels.normal[:, 2]), 0.0, 1.0)))
-    growth = {'surfels': counts.astype(np.float64)}
+    growth = {'voxels': history.voxels.astype(np.float64)}
     dropped = {'dropped': history.dropped.astype(np.float64)}
     charts = {
-        'Surfels over time': lines(seconds[at], growth, 'time (s)', 'surfels'),
+        'Voxels over time': lines(seconds, growth, 'time (s)', 'voxels'),
         'Time by stage': lines(seconds, times, 'time (s)', 'ms a scan'),
         'Planarity of the surfels': histogram(
             surfels.planarity, 0.0, 1.0, 'planarity: 0 a line or a ball, 1 a plane', 'surfels'

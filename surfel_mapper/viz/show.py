@@ -11,13 +11,13 @@ place near the first content that lies far from zero: float32, in which rerun dr
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.mapping.ages import ages_s, last_seen_ns
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.contents import Cloud, Content, ExactMap, ShownMesh, Way
 from surfel_mapper.viz.detail import DetailedMap
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
@@ -106,7 +106,8 @@ def show_contents(
     for content in contents:
         if isinstance(content, ShownMesh):
             path = f'map/{content.name}'
-            scene.mesh(path, shifted_mesh(content.mesh, origin_m), static=True)
+            mesh = replace(content.mesh, vertices=content.mesh.vertices - origin_m)
+            scene.mesh(path, mesh, static=True)
             about[content.name] = f'{len(content.mesh):,} triangles'
             if path in hidden:  # it would flicker through the discs on the same surfaces
                 about[content.name] += ', hidden: its eye in the panel of the viewer shows them'
@@ -144,9 +145,8 @@ def map_tiles(
         discs = with_age(surfels, shown, int(level[tile]))
         values = {**discs.values, 'level': np.full(len(discs), level[tile])}
         name = f'tile_{i}_{j}'.replace('-', 'm')
-        tiles[f'map/{shown.name}/{name}'] = DrawnDiscs(
-            discs.position + shift_m, discs.normal, discs.radius_m, values
-        )
+        moved = replace(discs, position=discs.position + shift_m, values=values)
+        tiles[f'map/{shown.name}/{name}'] = moved
     about = f'{whole.counts[0].sum():,} surfels in voxels of {shown.moments.voxel_size_m:g} m'
     if level.any():
         drawn = whole.counts[level, np.arange(len(whole))].sum()
@@ -232,16 +232,5 @@ def shifted_cloud(cloud: Cloud, origin_m: Array) -> Cloud:
     """Return a cloud about an origin."""
     discs = cloud.discs
     if discs is not None:
-        position = discs.position - origin_m
-        discs = DrawnDiscs(position, discs.normal, discs.radius_m, discs.values)
+        discs = replace(discs, position=discs.position - origin_m)
     return Cloud(cloud.name, cloud.position - origin_m, discs)
-
-
-def shifted_mesh(mesh: Mesh, origin_m: Array) -> Mesh:
-    """Return a mesh about an origin."""
-    return Mesh(
-        vertices=mesh.vertices - origin_m,
-        triangles=mesh.triangles,
-        colors=mesh.colors,
-        labels=mesh.labels,
-    )

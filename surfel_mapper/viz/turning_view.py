@@ -13,9 +13,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
-import io
 import json
-from pathlib import Path
 from string import Template
 from typing import Any
 
@@ -49,7 +47,6 @@ def turning_view(
     trajectory: Array,
     seconds: Array,
     summary: Mapping[str, Any],
-    picture: str | Path | None,
     layers: Mapping[str, Mesh],
 ) -> str:
     """
@@ -80,14 +77,8 @@ def turning_view(
     data = json.dumps(view_data(shown, trajectory, seconds, layers, origin_m)).replace(
         '<', '\\u003c'
     )
-    fallback = '<p class="none">This browser has no WebGL 2.</p>'
-    if picture is not None:
-        png = base64.b64encode(small_png(picture)).decode()
-        fallback = f'<img alt="the map, drawn" src="data:image/png;base64,{png}">'
     template = (files('surfel_mapper.viz') / 'page' / 'view.html').read_text(encoding='utf-8')
-    return Template(template.strip()).substitute(
-        choice=choice, fallback=fallback, note=note, data=data
-    )
+    return Template(template.strip()).substitute(choice=choice, note=note, data=data)
 
 
 def labelled(text: str, name: str, options: Sequence[str]) -> str:
@@ -99,16 +90,6 @@ def labelled(text: str, name: str, options: Sequence[str]) -> str:
 def most_shown(layers: Mapping[str, Mesh]) -> int:
     """Return the limit of the surfels beside these layers."""
     return BESIDE_MESHES if any(map(len, layers.values())) else MAX_SHOWN
-
-
-def small_png(picture: str | Path) -> bytes:
-    """Return a PNG file at half of its size, for browsers that show nothing else."""
-    from PIL import Image
-
-    content = io.BytesIO()
-    with Image.open(picture) as image:
-        image.convert('RGB').reduce(2).quantize(64, dither=Image.Dither.NONE).save(content, 'PNG')
-    return content.getvalue()
 
 
 def within_sight(surfels: Surfels) -> Surfels:

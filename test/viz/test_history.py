@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A history has a row for every scan, and a bounded number of counts of surfels."""
+"""A history has a row for every scan."""
 
 from types import SimpleNamespace
 
@@ -9,7 +9,7 @@ import numpy as np
 from surfel_mapper.config import Config
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
-from surfel_mapper.viz.history import History, MAX_COUNTS
+from surfel_mapper.viz.history import History
 
 IDENTITY = Config().replace({'pose.source': 'identity', 'map.min_points': 2})
 
@@ -34,9 +34,6 @@ def test_a_history_ends_where_the_map_does():
     assert history.voxels[-1] == mapper.map.num_voxels
     assert history.dropped.tolist() == [1, 2, 3, 4, 5]  # each scan is followed by an empty one
     np.testing.assert_array_equal(history.trajectory, np.zeros((5, 3)))
-    scans, counts = history.surfels
-    assert scans.tolist() == [0, 1, 2, 3, 4]
-    assert counts[-1] == len(mapper.map.surfels(2)) == mapper.map.num_surfels(2) > 0
     assert {'reduce', 'insert', 'normals', 'total'} <= set(history.milliseconds)
     assert all(len(times) == 5 for times in history.milliseconds.values())
 
@@ -51,19 +48,7 @@ def test_a_stage_that_comes_and_goes_leaves_gaps():
     np.testing.assert_array_equal(history.milliseconds['filter'], [np.nan, 5.0, 6.0])
 
 
-def test_surfels_are_counted_a_bounded_number_of_times_evenly_spread():
-    mapper, history = Mapper(IDENTITY), History()
-    update = SimpleNamespace(stamp_ns=0, milliseconds={}, T_map_sensor=np.eye(4))
-    for _ in range(5000):
-        history.add(mapper, update)
-
-    scans, _ = history.surfels
-    assert MAX_COUNTS / 2 <= len(scans) <= MAX_COUNTS
-    assert len(set(np.diff(scans))) == 1
-    assert scans[-1] > 4900
-
-
 def test_no_scan_at_all_is_an_empty_history():
     history = History()
-    assert len(history) == len(history.seconds) == len(history.surfels[0]) == 0
+    assert len(history) == len(history.seconds) == len(history.voxels) == 0
     assert history.trajectory.shape == (0, 3)
