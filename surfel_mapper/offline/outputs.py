@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from surfel_mapper.layers.drawings import Drawing
     from surfel_mapper.pipeline import Mapper, ScanOutcome, Update
     from surfel_mapper.pipeline.map_part import ApartMap
+    from surfel_mapper.tsdf.mesh import Mesh
     from surfel_mapper.viz.history import History
 
 SCANS = 'scans.csv'
@@ -334,6 +335,27 @@ def write_apart(path: Path, apart: ApartMap) -> None:
     write_tum(path.with_suffix('.tum'), list(apart.stamps_ns), np.array(apart.poses))
 
 
+def write_layers(
+    output: Path, formats: Sequence[str], mapper: Mapper
+) -> tuple[dict[str, Mesh], list[str]]:
+    """Write the files and pictures of layers; return their meshes and sections for the report."""
+    from surfel_mapper.viz.drawings import draw_points, page_meshes, section_html
+
+    drawings: list[Drawing] = []
+    sections: list[str] = []
+    for layer in mapper.layers.values():
+        layer.write(output, formats)
+        drawings += layer.drawings()
+        section = layer.section()
+        if section is not None:
+            picture_path = None
+            if section.picture is not None:
+                picture_path = output / section.picture.file_name
+                draw_points(picture_path, section.picture)
+            sections.append(section_html(section, picture_path))
+    return page_meshes(drawings), sections
+
+
 def write_files(
     output: Path,
     formats: Sequence[str],
@@ -354,24 +376,11 @@ def write_files(
     from surfel_mapper.files.atomic import write_json
     from surfel_mapper.files.trajectory import TRAJECTORY
     from surfel_mapper.viz.detail import drawn_surfels
-    from surfel_mapper.viz.drawings import draw_points, page_meshes, section_html
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
     from surfel_mapper.viz.turning_view import most_shown
 
-    drawings: list[Drawing] = []
-    sections = []
-    for layer in mapper.layers.values():
-        layer.write(output, formats)
-        drawings += layer.drawings()
-        section = layer.section()
-        if section is not None:
-            picture_path = None
-            if section.picture is not None:
-                picture_path = output / section.picture.file_name
-                draw_points(picture_path, section.picture)
-            sections.append(section_html(section, picture_path))
-    meshes = page_meshes(drawings)
+    meshes, sections = write_layers(output, formats, mapper) if mapper.layers else ({}, [])
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     title = (

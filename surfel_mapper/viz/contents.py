@@ -71,11 +71,10 @@ class ExactMap:
     origin_m: Array
     scans: list[WindowedScan] = field(default_factory=list)
 
-    def middle(self) -> Array:
-        """Return the median of the voxels in the fixed frame, (3,) m."""
+    def middles(self) -> Array:
+        """Return the middles of up to some 100,000 voxels in the fixed frame, (N, 3) m."""
         index = unpack_keys(self.moments.key[:: max(len(self.moments) // 100_000, 1)])
-        middle = (np.median(index, axis=0) + 0.5) * self.moments.voxel_size_m
-        return np.asarray(middle + self.origin_m, np.float64)
+        return np.asarray((index + 0.5) * self.moments.voxel_size_m + self.origin_m, np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

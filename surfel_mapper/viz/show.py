@@ -95,7 +95,9 @@ def show_contents(
     if any(map(len, drawn)):
         scene.colouring = Colouring.over(colouring, drawn)
     positions = [discs.position for discs in drawn] + [cloud.position for cloud in clouds]
-    box = box_of(positions if any(map(len, positions)) else vertices(contents, origin_m))
+    if not any(map(len, positions)):
+        positions = [positions_of(content) - origin_m for content in contents]
+    box = box_of(positions)
     meshes = [f'map/{content.name}' for content in contents if isinstance(content, ShownMesh)]
     hidden = meshes if any(map(len, drawn)) and isinstance(scene, Scene) else []
     scene.look(*box, looked_at, hidden)
@@ -197,26 +199,22 @@ def shared_origin(contents: Sequence[Content]) -> Array:
     return np.asarray(ROUND_M * np.round(middle / ROUND_M), np.float64)
 
 
+def positions_of(content: Content) -> Array:
+    """Return the positions of a content in the fixed frame, (N, 3) m."""
+    if isinstance(content, ExactMap):
+        return content.middles()
+    if isinstance(content, ShownMesh):
+        return content.mesh.vertices
+    return content.trajectory.xyz if isinstance(content, Way) else content.position
+
+
 def place_of(contents: Sequence[Content]) -> Array:
     """Return a place worth looking at in the fixed frame, (3,) m."""
     ways = [content.trajectory.xyz for content in contents if isinstance(content, Way)]
     if ways and len(ways[0]):
         return np.asarray(ways[0][-1], np.float64)
-    for content in contents:
-        if isinstance(content, ExactMap) and len(content.moments):
-            return content.middle()
-        points = content.position if isinstance(content, Cloud) else None
-        points = content.mesh.vertices if isinstance(content, ShownMesh) else points
-        if points is not None and len(points):
-            return np.asarray(np.median(points, axis=0), np.float64)
-    return np.zeros(3)
-
-
-def vertices(contents: Sequence[Content], origin_m: Array) -> list[Array]:
-    """Return the vertices of meshes and the positions of trajectories, (N, 3) m each."""
-    meshes = [content.mesh.vertices for content in contents if isinstance(content, ShownMesh)]
-    ways = [content.trajectory.xyz for content in contents if isinstance(content, Way)]
-    return [xyz - origin_m for xyz in (*meshes, *ways)]
+    filled = [positions for positions in map(positions_of, contents) if len(positions)]
+    return np.asarray(np.median(filled[0], axis=0) if filled else np.zeros(3), np.float64)
 
 
 def box_of(positions: Sequence[Array]) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ or two for each of its values, 1.7 MB of text for the limit of surfels, which ke
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.resources import files
 import json
 from string import Template
@@ -69,7 +69,8 @@ def turning_view(
             f' The {summary["surfels"]:,} surfels are shown by {len(shown):,} of larger cells of '
             'the same points: planes, and of a large map parts far from the end of the trajectory.'
         )
-    choice = labelled('show', 'shown', ('surfels', *layers)) if layers else ''
+    options = ''.join(f'<option>{name}</option>' for name in ('surfels', *layers))
+    choice = f'<label>show <select id="shown">{options}</select></label>' if layers else ''
     for name, mesh in layers.items():
         if len(mesh) > MAX_TRIANGLES // len(layers):
             note += f' {len(mesh):,} triangles of the {name} are merged into fewer.'
@@ -79,12 +80,6 @@ def turning_view(
     )
     template = (files('surfel_mapper.viz') / 'page' / 'view.html').read_text(encoding='utf-8')
     return Template(template.strip()).substitute(choice=choice, note=note, data=data)
-
-
-def labelled(text: str, name: str, options: Sequence[str]) -> str:
-    """Return a labelled choice as HTML."""
-    kinds = ''.join(f'<option>{option}</option>' for option in options)
-    return f'<label>{text} <select id="{name}">{kinds}</select></label>'
 
 
 def most_shown(layers: Mapping[str, Mesh]) -> int:
