@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from surfel_mapper.alignment.correspondences import loop_candidates, path_lengths
 from surfel_mapper.alignment.loops import Loop, LoopSolution, solve_loops
-from surfel_mapper.alignment.recognition import Candidate, Recognition
+from surfel_mapper.alignment.recognition import Recognition
 from surfel_mapper.alignment.registration import Registration, RegistrationResult
 from surfel_mapper.alignment.surfel_planes import means, PlaneLevels
 from surfel_mapper.alignment.window import carried
@@ -75,7 +75,7 @@ class ScanPoints(Protocol):
 class Refusal:
     """A candidate that did not become a loop, and the reason."""
 
-    candidate: Candidate
+    candidate: Loop
     reason: str
 
 
@@ -177,7 +177,7 @@ class LoopSearch:
         verified = list(zip(self._ordered, solution.is_kept.tolist(), strict=True))
         for loop, is_kept in verified:
             if not is_kept:
-                self._refuse(as_candidate(loop), 'it contradicts odometry and the other loops')
+                self._refuse(loop, 'it contradicts odometry and the other loops')
         kept = tuple(loop for loop, is_kept in verified if is_kept)
         poses = carried(self._initial, self.keys, solution.T_map_key) if kept else self._initial
         return LoopClosure(
@@ -221,7 +221,7 @@ class LoopSearch:
     def _path_between(self, source: int, target: int) -> float:
         return float(self._path_m[self.keys[source]] - self._path_m[self.keys[target]])
 
-    def _near(self, T_map_key: Floats) -> list[Candidate]:
+    def _near(self, T_map_key: Floats) -> list[Loop]:
         """Return the keyframes near each other, with their pose by the present solution."""
         candidates = []
         sources: set[int] = set()
@@ -238,10 +238,10 @@ class LoopSearch:
             sources.add(source)
             if not is_done:
                 T = compose(inverse(T_map_key[target]), T_map_key[source])
-                candidates.append(Candidate(source, target, T))
+                candidates.append(Loop(source, target, T))
         return sorted(candidates, key=lambda candidate: (candidate.source, candidate.target))
 
-    def _verify(self, candidate: Candidate) -> None:
+    def _verify(self, candidate: Loop) -> None:
         """Register the local map of one keyframe to that of the other; keep or refuse the loop."""
         ends = (candidate.source, candidate.target)
         if ends in self._loops:
@@ -254,7 +254,7 @@ class LoopSearch:
         self._refusals.pop(ends, None)
         self._loops[ends] = Loop(*ends, result.T_map_sensor, result.support, candidate.votes)
 
-    def register(self, candidate: Candidate) -> RegistrationResult:
+    def register(self, candidate: Loop) -> RegistrationResult:
         """Return the pose of the source of a candidate on the local map of its target."""
         cells = self._cells(candidate.source)
         target = self._local_map(candidate.target)
@@ -288,7 +288,7 @@ class LoopSearch:
             return f'{len(result.degenerate)} of 6 directions are not determined'
         return ''
 
-    def _refuse(self, candidate: Candidate, reason: str) -> None:
+    def _refuse(self, candidate: Loop, reason: str) -> None:
         self._refusals[candidate.source, candidate.target] = Refusal(candidate, reason)
 
     def _refuse_unconfirmed(self) -> None:
@@ -300,7 +300,7 @@ class LoopSearch:
         ]
         for loop in alone:
             del self._loops[loop.source, loop.target]
-            self._refuse(as_candidate(loop), 'no loop between keyframes next to it confirms it')
+            self._refuse(loop, 'no loop between keyframes next to it confirms it')
 
     def _cells(self, key: int) -> Floats:
         """Return means of the surfels around a keyframe, at most RegistrationConfig.max_cells."""
@@ -357,8 +357,3 @@ def confirms(witness: Loop, loop: Loop) -> bool:
     is_other = (witness.source, witness.target) != (loop.source, loop.target)
     apart = max(abs(witness.source - loop.source), abs(witness.target - loop.target))
     return is_other and apart <= NEAR_KEYS
-
-
-def as_candidate(loop: Loop) -> Candidate:
-    """Return the candidate that a loop was."""
-    return Candidate(loop.source, loop.target, loop.T_target_source, loop.votes)

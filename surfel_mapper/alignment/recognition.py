@@ -13,41 +13,19 @@ Source: Gupta et al. 2024, Effectively Detecting Loop Closures using Point Cloud
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.alignment.loops import Loop
 from surfel_mapper.errors import DependencyError
-from surfel_mapper.geometry import inverse, Transform
+from surfel_mapper.geometry import inverse
 
 Floats = npt.NDArray[np.float64]
 
 LEAST_POINTS = 100
 """Local maps of fewer points are not compared: their density image has no features."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
-    """
-    Two keyframes that may show one place.
-
-    Attributes
-    ----------
-    source, target : int
-        Numbers of the keyframes, the later one first.
-    T_target_source : (4, 4) float64
-        Pose of the source in the frame of the target, about 1 m and 2 deg off if it is right.
-    votes : int
-        Number of features that agree with this pose; 0 if it follows from the poses alone.
-
-    """
-
-    source: int
-    target: int
-    T_target_source: Transform
-    votes: int = 0
 
 
 class Recognition:
@@ -71,7 +49,7 @@ class Recognition:
         self._closures = import_map_closures().MapClosures()
         self._numbers: list[int] = []
 
-    def add(self, number: int, points: Floats, num_candidates: int = 3) -> list[Candidate]:
+    def add(self, number: int, points: Floats, num_candidates: int = 3) -> list[Loop]:
         """
         Add the local map of a keyframe; return earlier keyframes that show the same place.
 
@@ -92,7 +70,7 @@ class Recognition:
         agreeing = [loop for loop in loops if loop.number_of_inliers >= self._min_votes]
         agreeing.sort(key=lambda loop: -loop.number_of_inliers)
         return [
-            Candidate(
+            Loop(
                 source=number,
                 target=self._numbers[loop.source_id],
                 T_target_source=inverse(np.asarray(loop.pose, np.float64)),

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.alignment.loop_search import key_numbers, LoopSearch
-from surfel_mapper.alignment.recognition import Candidate, Recognition
+from surfel_mapper.alignment.loops import Loop
+from surfel_mapper.alignment.recognition import Recognition
 from surfel_mapper.errors import DependencyError
 from test.alignment.circuit import circuit, drifted, gap, SAME_WAY, THERE_AND_BACK
 from test.fields import config_of
@@ -54,7 +55,7 @@ def test_a_loop_with_the_heading_reversed_closes():
 def test_a_wrong_candidate_is_refused_by_registration():
     seen = circuit(SAME_WAY)
     loops = search(seen, seen.poses)
-    found = loops.register(Candidate(20, 8, np.eye(4)))  # 60 m of another street between them
+    found = loops.register(Loop(20, 8, np.eye(4)))  # 60 m of another street between them
 
     assert loops.reason_against(20, found)
 
