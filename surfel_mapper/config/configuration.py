@@ -89,7 +89,9 @@ class Config:
     """Stages of layers of other packages, by name; see ``stage``."""
 
     filters: str = setting(
-        '', 'YAML file of the chain of filters applied to every scan before mapping; empty: none.'
+        '',
+        'YAML file of the chain of filters applied to every scan before mapping; empty: none.',
+        live=True,
     )
     autostart: bool = setting(
         True, 'The node configures and activates itself; false: a lifecycle manager does.'

@@ -267,6 +267,11 @@ class InputConfig(Stage):
         'Topics of the clouds or images, one a sensor; empty: points, or depth/image.',
         items=str,
     )
+    filters_directory: str = setting(
+        '',
+        'Directory of the files that filters may name while the node runs; empty: that of the '
+        'parameter file.',
+    )
     min_range_m: float = setting(
         0.1, 'Points nearer to the origin of their frame are ignored, m.', low=0.0, high=1e6
     )
@@ -400,7 +405,8 @@ class OutputConfig(Stage):
     )
     checkpoint_s: float = setting(
         0.0,
-        'The node saves the map this often while it changes, beside map_name, s; 0: never.',
+        'The node saves the map this often while it changes, s; the last two checkpoints are kept '
+        'beside map_name; 0: never.',
         low=0.0,
         high=1e9,
         live=True,

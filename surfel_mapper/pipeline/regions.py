@@ -10,8 +10,13 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-MAX_CORNERS = 1000
-"""Limit of the corners of a polygon: among 200,000 voxels they take a second."""
+from surfel_mapper.pipeline.kernels.polygons import cross_rows, mark_inside
+
+MAX_CORNERS = 10_000
+"""Limit of the corners of a polygon."""
+
+MAX_CROSSINGS = 500_000
+"""Limit of the rows of voxels that the edges of a polygon cross; these take 20 ms."""
 
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -109,15 +114,40 @@ class Prism:
             )
 
     def contains(self, points: Floats) -> Mask:
-        """Return which points are inside."""
+        """Return which points are inside; they cost least if many have the same y."""
         corners = np.array(self.corners, np.float64)
+        x, y = points[:, 0], points[:, 1]
         inside = (corners.min(axis=0) <= points[:, :2]).all(axis=1)
         inside &= (points[:, :2] <= corners.max(axis=0)).all(axis=1)
-        x, y = points[inside, :2].T
-        is_odd = np.zeros(len(x), np.bool_)  # the number of edges on the side of larger x
-        for (x0, y0), (x1, y1) in zip(np.roll(corners, 1, axis=0), corners, strict=True):
-            if y0 != y1:
-                crosses = (y0 <= y) != (y1 <= y)
-                is_odd ^= crosses & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
-        inside[inside] = is_odd
+        (near,) = np.nonzero(inside)
+        rows, row = np.unique(y[near], return_inverse=True)
+        first, last = self._rows_crossed(rows)
+        change = np.zeros(len(rows) + 1, np.int64)  # of the number of edges, at each row
+        np.add.at(change, first, 1)
+        np.subtract.at(change, last, 1)
+        starts = np.concatenate([[0], np.cumsum(np.cumsum(change)[:-1])])
+        crossings = np.empty(starts[-1])
+        cross_rows(corners, rows, first, last, starts, crossings)
+        marks = np.empty(len(near), np.bool_)
+        mark_inside(x[near], row.reshape(-1), starts, crossings, marks)
+        inside[near] = marks
         return np.asarray(inside)
+
+    def check_cost(self, rows: Floats) -> None:
+        """Raise ValueError if the edges cross rows of points at these y, sorted, too often."""
+        first, last = self._rows_crossed(rows)
+        cost = int((last - first).sum())
+        if cost > MAX_CROSSINGS:
+            raise ValueError(
+                f'polygon whose {len(self.corners)} edges cross {cost} rows of voxels, expected '
+                f'at most {MAX_CROSSINGS}; draw its outline with fewer corners'
+            )
+
+    def _rows_crossed(self, rows: Floats) -> tuple[npt.NDArray[np.int64], ...]:
+        """Return the first row that the edge ending at each corner crosses, and one past it."""
+        end = np.array([y for _, y in self.corners])
+        start = np.roll(end, 1)
+        return (
+            np.searchsorted(rows, np.minimum(start, end)),
+            np.searchsorted(rows, np.maximum(start, end)),
+        )

@@ -45,7 +45,7 @@ def run_node(ros_args: Sequence[str], signals: Signals) -> None:
     """
     keep_freed_memory()
     with context(ros_args):
-        node = create_node()
+        node = create_node(ros_args)
         try:
             with logging_to(node.get_logger()), executing(node):
                 run_tasks(node, signals)
@@ -53,7 +53,7 @@ def run_node(ros_args: Sequence[str], signals: Signals) -> None:
             node.destroy_node()
 
 
-def create_node() -> MapperNode:
+def create_node(ros_args: Sequence[str] = ()) -> MapperNode:
     """
     Create the node; the middleware starts its threads, and refuses here if it lacks security.
 
@@ -61,7 +61,7 @@ def create_node() -> MapperNode:
     """
     try:
         with real_time_threads():
-            return MapperNode()
+            return MapperNode(ros_args)
     except rclpy_implementation.RCLError as error:
         raise ConfigError(f'ROS cannot make the node: {explain(error)}') from error
 

@@ -40,6 +40,7 @@ from surfel_mapper.pipeline.scan_poses import standing_sensor
 from surfel_mapper.ros.base_node import BaseNode, result_of
 from surfel_mapper.ros.bond import Bond
 from surfel_mapper.ros.diagnostics import Diagnostics
+from surfel_mapper.ros.filter_files import check_chain, FilterFiles
 from surfel_mapper.ros.main_thread import TaskQueue
 from surfel_mapper.ros.parameters import as_declared, declare_settings, refusals, settings_among
 from surfel_mapper.ros.session import Session
@@ -58,6 +59,11 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
     refusal : Exception or None
         The reason why the last transition was refused.
 
+    Parameters
+    ----------
+    ros_args : sequence of str
+        The command line; see FilterFiles.
+
     Raises
     ------
     ConfigError
@@ -65,7 +71,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ros_args: Sequence[str] = ()) -> None:
         """Declare the parameters and create the services of the life cycle."""
         try:
             Node.__init__(self, 'surfel_mapper')
@@ -75,6 +81,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         self.refusal: Exception | None = None
         self._session: Session | None = None
         self._config = declare_settings(self)
+        self._filter_files = FilterFiles(self._config, ros_args)
         # reentrant, so that get_state is answered while kernels compile
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
         self._change_state = self._service_change_state.callback
@@ -295,7 +302,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         return done
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse values that the configuration refuses."""
+        """Refuse values that the configuration refuses, and invalid filter files."""
         try:
             self._changed(self._config, parameters)
         except ConfigError as error:
@@ -320,4 +327,10 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
 
     def _changed(self, config: Config, parameters: Sequence[Parameter]) -> Config:
         """Return a configuration with changed settings; raise ConfigError if one is refused."""
-        return config.replace(settings_among(parameters))
+        changes = settings_among(parameters)
+        if isinstance(changes.get('filters'), str):
+            changes['filters'] = self._filter_files.path(changes['filters'])
+        changed = config.replace(changes)
+        if changed.filters and changed.filters != config.filters:
+            check_chain(changed.filters)
+        return changed

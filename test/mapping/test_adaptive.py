@@ -285,7 +285,7 @@ def keys_of(surfels):
     return [(s, *i) for s, i in zip(surfels.size.tolist(), index, strict=True)]
 
 
-@pytest.mark.parametrize('batch', range(4))
+@pytest.mark.parametrize('batch', range(10))
 def test_cut_after_random_programs_is_that_of_a_new_map(batch):
     """100 programs a batch: changes add up to the cut, its digest is that of the live scans."""
     for seed in range(100 * batch, 100 * batch + 100):

@@ -9,6 +9,8 @@ comes between two scans.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -124,6 +126,15 @@ def test_scans_that_wait_together_are_mapped_together():
     assert two.map == one.map
 
 
+def filter_more(mapper):
+    """Double the points that the filters drop; without effect on mappers without filters."""
+    if mapper.config.filters:
+        path = Path(mapper.config.filters).with_name('more.yaml')
+        path.write_text(CHAIN.replace('start_step: 2', 'start_step: 4'))
+        changed = {**mapper.config.to_mapping(), 'filters': str(path)}
+        mapper.reconfigure(Config.from_mapping(changed))
+
+
 def shorten(mapper):
     mapper.reconfigure(Config.from_mapping({**mapper.config.to_mapping(), 'window.max_scans': 2}))
 
@@ -139,7 +150,9 @@ def carve(mapper):
 
 
 @WAYS
-@pytest.mark.parametrize('between', [shorten, gate, carve], ids=lambda act: act.__name__)
+@pytest.mark.parametrize(
+    'between', [shorten, gate, carve, filter_more], ids=lambda act: act.__name__
+)
 def test_changes_between_two_scans_hold_for_the_scan_that_waits(between, way, settings_of):
     one, two = (mapper_with(threads, **settings_of(way)) for threads in (1, 2))
     expected, found = drive(one, 1, 7), drive(two, 1, 8)  # two keeps the last
