@@ -60,3 +60,15 @@ def plane_frames(points: Array, weights: Array, starts: Indices) -> tuple[Array,
     values, axes = eigen(scatters / np.where(total > 0.0, total, 1.0)[:, None, None])
     normals = np.where(total[:, None] > 0.0, axes[:, 0], 0.0)
     return means, normals, values
+
+
+def oriented(axes: Array, towards: Array) -> Array:
+    """
+    Return frames (K, 3, 3) of eigenvectors, rows ascending by eigenvalue.
+
+    The normal is on the side of a direction (K, 3), and the largest component of x is positive.
+    """
+    side = np.where(np.einsum('ij,ij->i', axes[:, 0], towards) < 0.0, -1.0, 1.0)
+    z, x = axes[:, 0] * side[:, None], axes[:, 2]  # its largest component is positive
+    frames: Array = np.stack([x, np.cross(z, x), z], axis=1)
+    return frames

@@ -32,15 +32,9 @@ from surfel_mapper.models.kernels.growth import (
     find_facets,
     FREE,
     grow_patches,
-    rename_owners,
     SLOTS,
 )
-from surfel_mapper.models.kernels.joining import sort_owners
-from surfel_mapper.models.kernels.voxel_points import (
-    find_core,
-    neighbour_table,
-    owner_means,
-)
+from surfel_mapper.models.kernels.voxel_points import neighbour_table, owner_means
 from surfel_mapper.models.multi_model import Plane, Surface
 
 Array = npt.NDArray[np.float64]
@@ -54,7 +48,13 @@ FreeSurfels = tuple[Indices, npt.NDArray[np.bool_], Array, Array]
 """Number, flatness, mean and normal of the free points of every voxel, (V, ...) each."""
 
 CORE_SHARE, CORE_POINTS = 0.12, 8
-"""Sparse voxels have a smaller share of the points of their densest neighbour."""
+"""
+Sparse voxels have a smaller share of the points of their densest neighbour. If no voxel near one
+has CORE_POINTS, it is compared with voxels one farther away in each round, and then kept.
+"""
+
+WIDER_ROUNDS = 2
+"""See CORE_POINTS."""
 
 MOST_SPARSE = 0.3
 """If more voxels are sparse, they are outliers; planes alone clip fewer to sparse ones."""
@@ -128,10 +128,12 @@ class VoxelPoints:
 
     def core(self) -> npt.NDArray[np.bool_]:
         """Return which voxels are not outliers, (V,) bool."""
-        core = np.ones(len(self.starts) - 1, np.bool_)
-        if len(core):
-            find_core(self.starts, self.adjacent, CORE_SHARE, CORE_POINTS, core)
-        return core if 1.0 - core.mean() > MOST_SPARSE else np.ones_like(core)
+        counts = np.diff(self.starts)
+        most = most_around(counts, self.adjacent)
+        for _ in range(WIDER_ROUNDS):  # few points anywhere near: is it an outlier or far away?
+            most = np.where(most < CORE_POINTS, most_around(most, self.adjacent), most)
+        core: npt.NDArray[np.bool_] = (most < CORE_POINTS) | (counts >= CORE_SHARE * most)
+        return core if (~core).sum() > MOST_SPARSE * len(core) else np.ones_like(core)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,8 +213,19 @@ def grow(
     num = len(patches) + len(add_facets(voxels, owner, len(patches), (size_m, facet_m), config))
     table = owner_table(voxels, owner)
     index, normals, curved = join_patches(pieces_of(voxels, table, num), view, noise, size_m)
-    rename_owners(voxels.starts, group, index, owner)
+    groups = -1 - np.repeat(group, np.diff(voxels.starts))
+    owner = np.where(owner >= 0, np.append(index, 0)[owner], groups)
     return grown(owner, owner_table(voxels, owner), normals, curved, median_m)
+
+
+def most_around(values: Indices, adjacent: tuple[Indices, npt.NDArray[np.int32]]) -> Indices:
+    """Return the largest of the values (V,) of each voxel and its neighbours."""
+    first, near = adjacent
+    most, some = values.copy(), np.flatnonzero(np.diff(first))
+    if len(some):
+        around = np.maximum.reduceat(values[near[: first[-1]]], first[some])
+        most[some] = np.maximum(most[some], around)
+    return most
 
 
 def grown(
@@ -248,11 +261,11 @@ def sorted_table(
 ) -> tuple[Indices, npt.NDArray[np.int32], Array, Array]:
     """Return starts (number + 1,), voxels, means and counts by owner, from owner least on."""
     owners, means, counts, first = table
-    size = int((owners >= least).sum())
-    starts = np.empty(number + 1, np.int64)
-    out = starts, np.empty(size, np.int32), np.empty((size, 3)), np.empty(size)
-    sort_owners(first, owners, means, counts, least, out)
-    return out
+    order = np.argsort(owners, kind='stable')
+    order = order[np.count_nonzero(owners < least) :]
+    starts = np.searchsorted(owners[order], np.arange(least, least + number + 1))
+    voxel = np.repeat(np.arange(len(first) - 1, dtype=np.int32), np.diff(first))
+    return starts, voxel[order], means[order], counts[order]
 
 
 def extend_patches(

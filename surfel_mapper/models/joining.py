@@ -4,31 +4,25 @@
 Join patches that lie on one plane or on one smooth surface.
 
 Noise and curvature break a surface into pieces: a cylinder becomes strips, a wall whose noise
-exceeds a voxel becomes layers. Two touching patches are joined if one height field (a plane, a
-quadric or a quartic) explains the points of both better than one for each, by the Bayesian
+exceeds a voxel becomes layers. Two touching patches are joined if one height field (a plane
+or a quadric) explains the points of both better than one for each, by the Bayesian
 information criterion, which needs no threshold for the noise: two faces of a box are two planes,
-two strips of a cylinder one quadric. The pair that gains most is joined first.
+two strips of a cylinder one quadric. In each round a region joins the larger neighbour with which
+it gains most, if that one gains most with it, too, or is much larger.
 
 Source: Schwarz 1978 (the criterion); the rest is our own.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.frames import plane_frames
-from surfel_mapper.models.kernels.joining import touching_patches
-from surfel_mapper.models.kernels.region_joining import (
-    CHUNK,
-    describe_regions,
-    join_layers,
-    join_smooth,
-    Regions,
-)
+from surfel_mapper.models.frames import eigen, means_and_scatters
+from surfel_mapper.models.kernels.joining import compare_regions, touching_patches
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -36,8 +30,14 @@ Indices = npt.NDArray[np.int64]
 LEAST_TOUCH = 2
 """Voxels of a patch that touch another one, at least, as the mean of both."""
 
-LAYER_SHARE = 0.6
-"""Least share of the voxels of a layer that touch the larger patch."""
+LAYER_SHARE, LAYER_SIGMAS = 0.6, 3.0
+"""
+A layer of a larger patch touches it in this share of its voxels, and is as near in deviations of
+the noise.
+"""
+
+LARGER = 8.0
+"""A region larger by this factor takes all neighbours that gain most with it in a round."""
 
 LEAST_COSINE = 0.5
 """Noise is along the ray; at grazing incidence other errors dominate."""
@@ -89,6 +89,12 @@ class Pieces:
     first: Indices
     owners: npt.NDArray[np.int32]
 
+    @property
+    def num_points(self) -> Array:
+        """Points of each patch, (K,)."""
+        patch = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
+        return np.bincount(patch, self.weights, len(self.starts) - 1).astype(np.float64)
+
     def touching(self) -> Indices:
         """Return pairs of touching patches (R, 3): patch, other, voxels of the patch that do."""
         pairs = np.empty((64 * len(self.starts), 3), np.int64)
@@ -98,6 +104,40 @@ class Pieces:
             pairs = np.empty((num, 3), np.int64)
             touching_patches(*state, pairs)
         return pairs[:num]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regions:
+    """
+    Patches, or regions that are named by one of theirs, K rows.
+
+    Attributes
+    ----------
+    rows : (K,) int64
+        Numbers of means.
+    normals : (K, 3) float64
+        Sums of the normals of all points.
+    middles : (K, 3) float64, m
+    extents : (K,) float64, m
+        Half the width, about.
+
+    """
+
+    rows: Indices
+    normals: Array
+    middles: Array
+    extents: Array
+
+    def join(self, small: Indices, large: Indices) -> None:
+        """Add regions (n,) to others (n,), in place."""
+        weight = np.linalg.norm(self.normals, axis=1)
+        sums = weight[:, None] * self.middles
+        away = np.linalg.norm(self.middles[small] - self.middles[large], axis=1)
+        reach = np.maximum(self.extents[small], 0.5 * (away + self.extents[small]))
+        np.maximum.at(self.extents, large, reach)
+        for table in (self.rows, self.normals, weight, sums):
+            np.add.at(table, large, table[small])
+        self.middles[large] = sums[large] / np.maximum(weight[large], 1e-12)[:, None]
 
 
 def join_patches(
@@ -123,109 +163,176 @@ def join_patches(
         The new number of each patch, mean normals, and whether a patch is a curved surface.
 
     """
-    floor, pairs = (FLOOR_VOXELS * size_m) ** 2, pieces.touching()
-    regions = single_regions(pieces, view, noise, size_m)
-    state = pieces.means, pieces.weights, pieces.starts
-    join_layers(layers(pairs, pieces, regions), *state, regions)
-    edges, adjacent = touching_regions(pairs, regions.root)
-    join_smooth(edges, adjacent, *state, chunk_boxes(pieces.means), floor, regions)
-    index, normals, curved, is_worse = described(regions, state, size_m)
+    single, touching = Comparison.of(pieces, view, noise, size_m), pieces.touching()
+    root, layered = single.with_layers(touching)
+    root = layered.joined(root, touching)
+    index, normals, curved, is_worse = layered.described(root, size_m)
     if is_worse.any():
         undone = np.append(is_worse, np.True_)[index]  # the last: patches without points
-        regions = separated(regions, single_regions(pieces, view, noise, size_m), undone)
-        index, normals, curved, _ = described(regions, state, size_m)
+        root = np.where(undone, np.arange(len(root)), root)
+        normals = np.where(undone[:, None], single.normals, layered.normals)
+        sigma = np.where(undone, single.sigma, layered.sigma)
+        separated = replace(layered, normals=normals, sigma=sigma)
+        index, normals, curved, _ = separated.described(root, size_m)
     return index, normals, curved
 
 
-def separated(regions: Regions, single: Regions, undone: npt.NDArray[np.bool_]) -> Regions:
-    """Return regions whose undone patches (K,) are single ones."""
-    pairs = zip(single, regions, strict=True)
-    return Regions(*(np.where(undone if a.ndim == 1 else undone[:, None], a, b) for a, b in pairs))
-
-
-def described(
-    regions: Regions, state: tuple[Array, Array, Indices], size_m: float
-) -> tuple[npt.NDArray[np.int32], Array, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
     """
-    Return the result of join_patches, and which regions are worse planes than their patches.
+    Patches that are compared with each other.
 
-    state: means, weights and starts of the pieces
+    Attributes
+    ----------
+    pieces : Pieces
+        Their points.
+    means, covariances, extents : (K, 3), (K, 3, 3), (K,) float64, m
+        Moments of their points, and half their width, about.
+    normals : (K, 3) float64
+        Normals of the patches.
+    sigma : (K,) float64, m
+        Noise across them.
+    floor : float
+        Square of the residuals that are not resolved, m^2.
+
     """
-    has_points = regions.rows > 0  # patches without points are in no region
-    names = np.flatnonzero(has_points & (regions.root == np.arange(len(has_points))))
-    normals, figures = np.empty((len(names), 3)), np.empty((len(names), 4))
-    floor = (FLOOR_VOXELS * size_m) ** 2
-    limits = CURVED_GAIN, math.radians(LEAST_TURN_DEG), LEAST_BEND_VOXELS * size_m
-    context = *state, chunk_boxes(state[0]), floor
-    describe_regions(names, context, regions, limits, normals, figures)
-    index = np.searchsorted(names, regions.root).astype(np.int32)
-    points, every = regions.patch_points, len(names) + 1
-    squares = np.bincount(index, points * regions.patch_sigma**2, every)[:-1]
-    own = np.sqrt(squares / np.bincount(index, points, every)[:-1])
-    gains, turns, bends = (figures[:, :3] > limits).T
-    curved = gains & turns & bends & (figures[:, 2] > LEAST_BEND_SIGMAS * own)
-    is_worse = figures[:, 3] > np.maximum(MOST_WORSE * own, UNRESOLVED_VOXELS * size_m)
-    is_worse &= ~curved & (np.bincount(index, minlength=every)[:-1] > 1)
-    return index, normals, curved, is_worse
+
+    pieces: Pieces
+    means: Array
+    covariances: Array
+    extents: Array
+    normals: Array
+    sigma: Array
+    floor: float
+
+    @classmethod
+    def of(
+        cls, pieces: Pieces, view: Array, noise: tuple[float, float], size_m: float
+    ) -> Comparison:
+        """Describe every patch; the parameters are those of join_patches."""
+        _, means, scatters = means_and_scatters(pieces.means, pieces.weights, pieces.starts)
+        covariances = scatters / np.maximum(pieces.num_points, 1.0)[:, None, None]
+        values, axes = eigen(covariances)
+        towards, normals = view - means, axes[:, 0].copy()
+        normals[np.einsum('ij,ij->i', towards, normals) < 0.0] *= -1.0
+        range_sq = np.maximum(np.einsum('ij,ij->i', towards, towards), 1e-24)
+        cosine = np.abs(np.einsum('ij,ij->i', towards, normals)) / np.sqrt(range_sq)
+        sigma = (noise[0] + noise[1] * range_sq) * np.maximum(cosine, LEAST_COSINE)
+        floor = (FLOOR_VOXELS * size_m) ** 2
+        extents = np.sqrt(3.0 * values[:, 2]) + size_m
+        sigma = np.maximum(sigma, np.sqrt(np.maximum(values[:, 0], floor)))
+        return cls(pieces, means, covariances, extents, normals, sigma, floor)
+
+    def with_layers(self, touching: Indices) -> tuple[Indices, Comparison]:
+        """
+        Return for each patch the larger one (K,) of which it is a layer, or itself.
+
+        Noise beyond a voxel is cut into layers. In the second result these have the normals of
+        the larger patches, and their distances from them are noise.
+        """
+        points, (a, b, touch) = self.pieces.num_points, touching.T
+        is_layer = touch >= LAYER_SHARE * np.diff(self.pieces.starts)[a]
+        is_layer &= points[a] < points[b]
+        a, b = a[is_layer], b[is_layer]
+        normals = self.normals[b]
+        height = np.einsum('ij,ij->i', self.means[a] - self.means[b], normals)
+        thickness_sq = np.einsum('ij,ijk,ik->i', normals, self.covariances[a], normals)
+        away = np.sqrt(height**2 + thickness_sq)
+        near = np.flatnonzero(away < LAYER_SIGMAS * self.sigma[b])
+        near = near[np.argsort(points[b[near]], kind='stable')]
+        root, sigma = np.arange(len(points)), self.sigma.copy()
+        root[a[near]] = b[near]  # the last assignment is that of the largest
+        np.maximum.at(sigma, a[near], away[near])
+        while (root[root] != root).any():
+            root = root[root]
+        return root, replace(self, normals=self.normals[root], sigma=sigma)
+
+    def regions(self) -> Regions:
+        """Return a region for every patch."""
+        normals = self.normals * self.pieces.num_points[:, None]
+        rows = np.diff(self.pieces.starts)
+        return Regions(rows, normals, self.means.copy(), self.extents.copy())
+
+    def joined(self, root: Indices, touching: Indices) -> Indices:
+        """Return the region (K,) of each patch, given those of layers and touching patches."""
+        number, regions = len(root), self.regions()
+        layer = np.flatnonzero(root != np.arange(number))
+        regions.join(layer, root[layer])
+        pairs = touching_pairs(root[touching[:, :2]], touching[:, 2], number)
+        gains, is_stale = np.zeros(len(pairs)), np.full(number, True)
+        while len(pairs):
+            again = is_stale[pairs].any(axis=1)
+            gains[again] = self.compared(pairs[again], root, regions)[:, 0]
+            small, large = chosen_joins(pairs, gains, regions.rows)
+            if not len(small):
+                break
+            regions.join(small, large)
+            name = np.arange(number)
+            name[small] = large
+            root, pairs = name[root], np.sort(name[pairs], axis=1)
+            is_stale[:] = False
+            is_stale[large] = True
+            _, row = np.unique(pairs @ [number, 1], return_index=True)
+            row = row[pairs[row, 0] != pairs[row, 1]]
+            pairs, gains = pairs[row], gains[row]
+        return root
+
+    def compared(self, pairs: Indices, root: Indices, regions: Regions) -> Array:
+        """Return gains of pairs of regions, or descriptions: (R, 4), see compare_regions."""
+        pieces, out = self.pieces, np.empty((len(pairs), 4))
+        members = np.argsort(root, kind='stable')
+        groups = members, np.searchsorted(root[members], np.arange(len(root) + 1))
+        points = pieces.starts, pieces.means, pieces.weights, self.normals
+        tables = regions.normals, regions.middles, regions.extents, self.sigma
+        columns = np.empty((4, len(pieces.means) + 1))
+        compare_regions(pairs, groups, points, tables, self.floor, columns, out)
+        return out
+
+    def described(
+        self, root: Indices, size_m: float
+    ) -> tuple[npt.NDArray[np.int32], Array, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Return the result of join_patches, and which regions are worse planes than patches."""
+        number = len(root)
+        names = np.flatnonzero((np.diff(self.pieces.starts) > 0) & (root == np.arange(number)))
+        regions, totals = self.regions(), np.zeros((number, 3))
+        np.add.at(totals, root, regions.normals)
+        described = replace(regions, normals=totals)
+        figures = self.compared(np.stack([names, names], axis=1), root, described)
+        index = np.searchsorted(names, root).astype(np.int32)
+        points, every = self.pieces.num_points, len(names) + 1
+        squares = np.bincount(index, points * self.sigma**2, every)[:-1]
+        own = np.sqrt(squares / np.bincount(index, points, every)[:-1])
+        limits = CURVED_GAIN, math.radians(LEAST_TURN_DEG), LEAST_BEND_VOXELS * size_m
+        gains, turns, bends = (figures[:, :3] > limits).T
+        curved = gains & turns & bends & (figures[:, 2] > LEAST_BEND_SIGMAS * own)
+        is_worse = figures[:, 3] > np.maximum(MOST_WORSE * own, UNRESOLVED_VOXELS * size_m)
+        is_worse &= ~curved & (np.bincount(index, minlength=every)[:-1] > 1)
+        normals = totals[names]
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+        return index, normals, curved, is_worse
 
 
-def single_regions(
-    pieces: Pieces, view: Array, noise: tuple[float, float], size_m: float
-) -> Regions:
-    """Return a region for every patch."""
-    number = len(pieces.starts) - 1
-    means, normals, values = plane_frames(pieces.means, pieces.weights, pieces.starts)
-    towards = view - means
-    normals[np.einsum('ij,ij->i', towards, normals) < 0.0] *= -1.0
-    counts = np.diff(pieces.starts)
-    points = np.zeros(number)
-    np.add.at(points, np.repeat(np.arange(number), counts), pieces.weights)
-    range_sq = np.maximum(np.einsum('ij,ij->i', towards, towards), 1e-24)
-    cosine = np.abs(np.einsum('ij,ij->i', towards, normals)) / np.sqrt(range_sq)
-    sigma = (noise[0] + noise[1] * range_sq) * np.maximum(cosine, LEAST_COSINE)
-    floor = (FLOOR_VOXELS * size_m) ** 2
-    return Regions(
-        root=np.arange(number),
-        next_patch=np.full(number, -1),
-        last=np.arange(number),
-        patches=np.ones(number, np.int64),
-        rows=counts,
-        normal=normals * points[:, None],
-        mean=means,
-        extent=np.sqrt(3.0 * np.maximum(values[:, 2], 0.0)) + size_m,
-        patch_normal=normals,
-        patch_points=points,
-        patch_sigma=np.maximum(sigma, np.sqrt(np.maximum(values[:, 0], floor))),
-    )
+def touching_pairs(ends: Indices, voxels: Indices, number: int) -> Indices:
+    """Return distinct pairs (E, 2) of ends (R, 2) with enough voxels (R,), the lesser first."""
+    code, pair = np.unique(np.sort(ends, axis=1) @ [number, 1], return_inverse=True)
+    is_enough = np.bincount(pair.reshape(-1), voxels, len(code)) >= 2 * LEAST_TOUCH
+    pairs = np.stack(np.divmod(code[is_enough], max(number, 1)), axis=1)
+    distinct: Indices = pairs[pairs[:, 0] != pairs[:, 1]]
+    return distinct
 
 
-def chunk_boxes(points: Array) -> Array:
-    """Return the least and greatest coordinates of CHUNK points each, (C, 2, 3) m."""
-    if not len(points):
-        return np.empty((0, 2, 3))
-    starts = np.arange(0, len(points), CHUNK)
-    ends = [end.reduceat(points, starts) for end in (np.minimum, np.maximum)]
-    return np.stack(ends, axis=1)
-
-
-def layers(pairs: Indices, pieces: Pieces, regions: Regions) -> Indices:
-    """Return patches (R, 2) that may be layers of larger ones, those of the largest first."""
-    a, b, touch = pairs.T
-    points = regions.patch_points
-    is_layer = (touch >= LAYER_SHARE * np.diff(pieces.starts)[a]) & (points[a] < points[b])
-    chosen = pairs[is_layer, :2]
-    return chosen[np.argsort(-points[chosen[:, 1]], kind='stable')]
-
-
-def touching_regions(pairs: Indices, root: Indices) -> tuple[Indices, tuple[Indices, Indices]]:
-    """Return pairs (E, 2) of touching regions, and as first (K + 1,) and others (2 E,)."""
-    number = len(root)
-    ends = np.sort(root[pairs[:, :2]], axis=1)
-    code, edge = np.unique(ends[:, 0] * number + ends[:, 1], return_inverse=True)
-    voxels = np.bincount(edge.reshape(-1), pairs[:, 2], len(code))
-    edges = np.stack(np.divmod(code, max(number, 1)), axis=1)
-    edges = edges[(voxels >= 2 * LEAST_TOUCH) & (edges[:, 0] != edges[:, 1])]
-    both = np.concatenate([edges, edges[:, ::-1]])
-    both = both[np.argsort(both[:, 0], kind='stable')]
-    first = np.searchsorted(both[:, 0], np.arange(number + 1))
-    return edges, (first, np.ascontiguousarray(both[:, 1]))
+def chosen_joins(pairs: Indices, gains: Array, rows: Indices) -> tuple[Indices, Indices]:
+    """Return regions (n,) and the larger ones (n,) that they join in this round; see LARGER."""
+    order = np.argsort(gains, kind='stable')
+    ends = pairs[order[gains[order] > 0.0]]
+    partner: Indices = np.full(len(rows), -1)
+    partner[ends.ravel()] = ends[:, ::-1].ravel()  # the last assignment is that of most gain
+    small = np.flatnonzero(partner >= 0)
+    large = partner[small]
+    is_smaller = (rows[small] < rows[large]) | ((rows[small] == rows[large]) & (small > large))
+    is_smaller &= (partner[large] == small) | (LARGER * rows[small] < rows[large])
+    small = small[is_smaller]
+    joins = np.zeros(len(rows), np.bool_)
+    joins[small] = True
+    small = small[~joins[partner[small]]]
+    return small, partner[small]

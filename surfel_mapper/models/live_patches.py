@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.models.bspline import fit_cells, HeightField
+from surfel_mapper.models.frames import eigen, oriented
 from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.kernels.surfel_classes import FLAT
 from surfel_mapper.models.kernels.surfel_groups import mean_normals, merge_voxels, sample_voxels
@@ -143,7 +144,8 @@ class PatchFitter:
         thickness = np.full(len(rows), graph.limit_m)
         samples = PatchPoints(self._points(every), POINTS * starts, normals, thickness)
         frames, curved = self._frames(samples)
-        frames[~curved] = plane_frames(covariances[~curved], normals[~curved])
+        axes = eigen(covariances[~curved])[1]
+        frames[~curved] = oriented(axes, normals[~curved])
         positions = graph.position[every]
         boxes = np.stack(
             [end.reduceat(positions, starts[:-1]) for end in (np.minimum, np.maximum)], axis=1
@@ -297,17 +299,6 @@ def symmetric(packed: Array) -> Array:
     """Return matrices (K, 3, 3) from xx xy xz yy yz zz (K, 6)."""
     full: Array = packed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     return full
-
-
-def plane_frames(covariances: Array, normals: Array) -> Array:
-    """Return principal frames (K, 3, 3) of covariances, with z on the side of the normals."""
-    vectors = np.linalg.eigh(covariances)[1]
-    z, x = vectors[:, :, 0], vectors[:, :, 2]
-    z = z * np.where(np.einsum('ij,ij->i', z, normals) < 0.0, -1.0, 1.0)[:, None]
-    most = np.take_along_axis(x, np.abs(x).argmax(axis=1)[:, None], axis=1)
-    x = x * np.where(most < 0.0, -1.0, 1.0)
-    frames: Array = np.stack([x, np.cross(z, x), z], axis=1)
-    return frames
 
 
 def moved(field: HeightField, shift: Array) -> HeightField:

@@ -23,7 +23,6 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.models.joining import LEAST_COSINE
-from surfel_mapper.models.kernels.voxel_points import sample_cubes
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -162,15 +161,49 @@ def sampled_cubes(samples: NoiseSamples, edge_m: float) -> tuple[Array, Array, f
         level = np.floor(np.log2(np.maximum(range_m / EDGE_RANGE_M, 1.0)))
         halves *= 2.0 ** np.minimum(level, COARSEST)
         halves[range_m < NEAR_M] *= 0.5
-    z = np.stack([np.maximum.accumulate(means[:, 2]), np.minimum.accumulate(means[::-1, 2])[::-1]])
-    rows: Indices = np.empty((len(seeds), more * CUBE_POINTS), np.int64)
-    sample_cubes(samples.starts, means, z, seeds, halves, rows)
+    rows = sampled_rows(samples, seeds, halves, more * CUBE_POINTS)
     rows = rows[rows[:, LEAST_POINTS - 1] >= 0]
     weight = (rows >= 0).astype(np.float64)
     if samples.weights is not None:
         counts = samples.weights[rows] * weight
         weight = counts * (weight.sum(axis=1) / counts.sum(axis=1))[:, None]
     return samples.points[rows], weight, len(rows) / max(len(seeds), 1)
+
+
+def sampled_rows(samples: NoiseSamples, seeds: Indices, halves: Array, most: int) -> Indices:
+    """
+    Return rows of points (B, most), evenly from the voxels whose means are in cubes; -1 for none.
+
+    Parameters
+    ----------
+    samples : NoiseSamples
+        Points by voxel.
+    seeds : (B,) int64
+        Voxels in the middle of the cubes.
+    halves : (B,) float64, m
+        Half the edges of the cubes.
+    most : int
+        Points of a cube.
+
+    """
+    x, y, z = np.ascontiguousarray(samples.means.T)
+    # voxels of one layer follow each other, and so do the layers
+    first = np.searchsorted(np.maximum.accumulate(z), z[seeds] - halves)
+    last = np.searchsorted(np.minimum.accumulate(z[::-1])[::-1], z[seeds] + halves, 'right')
+    rows: Indices = np.full((len(seeds), most), -1)
+    for b, (seed, half) in enumerate(zip(seeds.tolist(), halves.tolist(), strict=True)):
+        layers = slice(first[b], last[b])
+        inside = np.abs(x[layers] - x[seed]) <= half
+        inside &= np.abs(y[layers] - y[seed]) <= half
+        inside &= np.abs(z[layers] - z[seed]) <= half
+        voxels = first[b] + np.flatnonzero(inside)
+        starts, ends = samples.starts[voxels], samples.starts[voxels + 1]
+        total = np.cumsum(ends - starts)
+        number = min(int(total[-1]), most)
+        sample = np.arange(number) * total[-1] // max(number, 1)
+        voxel = np.searchsorted(total, sample, 'right')
+        rows[b, :number] = ends[voxel] - total[voxel] + sample
+    return rows
 
 
 def trimmed_sigmas(points: Array, weight: Array) -> tuple[Array, Array, Array]:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models.bspline import fit_cells, HeightField
-from surfel_mapper.models.frames import eigen, means_and_scatters
+from surfel_mapper.models.frames import eigen, means_and_scatters, oriented
 from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.multi_model import Plane, Surface
 from surfel_mapper.models.segmentation import is_paper
@@ -140,18 +140,6 @@ def described(
     if mean_normal:
         frames[curved] = turned[curved]
     return means, covariances, frames, curved
-
-
-def oriented(axes: Array, towards: Array) -> Array:
-    """
-    Return frames (K, 3, 3) of eigenvectors, rows ascending by eigenvalue.
-
-    The normal is on the side of a direction (K, 3), and the largest component of x is positive.
-    """
-    side = np.where(np.einsum('ij,ij->i', axes[:, 0], towards) < 0.0, -1.0, 1.0)
-    z, x = axes[:, 0] * side[:, None], axes[:, 2]  # its largest component is positive
-    frames: Array = np.stack([x, np.cross(z, x), z], axis=1)
-    return frames
 
 
 def aligned(frames: Array, normals: Array) -> Array:

@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
+from surfel_mapper.models.frames import eigen, means_and_scatters, oriented
 from surfel_mapper.models.kernels.bisection import bisect_cloud, NOISE_SPREAD
-from surfel_mapper.models.kernels.charts import bisect_folded
 from surfel_mapper.models.kernels.region_merging import find_pairs, merge_pairs
 
 Array = npt.NDArray[np.float64]
@@ -30,6 +30,21 @@ Rows = TypeVar('Rows', npt.NDArray[np.int32], npt.NDArray[np.int64])
 FAR_GAP_VOXELS = 5.0
 NEAR_GAP_VOXELS = 3.0
 """Linked clusters have boxes nearer than FAR_GAP_VOXELS and points nearer than this."""
+
+MEANS_ITERATIONS = 20
+"""Most iterations of 2-means on normals."""
+
+STEADY_SHARE = 0.5
+"""
+2-means begins with the first axis of the map with this share of the largest variance. The normals
+of a ball vary alike in two directions, and their principal axis turns with every scan.
+"""
+
+FOLD_PERCENTILE, MOST_FOLDED = 98.0, 20
+"""
+A surface is folded unless this percentage of normals is near the mean, and at most this number is
+not: a cup on a table has less than 2 % of the voxels of both.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +56,7 @@ class Clusters:
     ----------
     points : (N, 3) float64, m
         Reordered, so that a cluster is a range of rows.
-    order : (N,) int64
+    order : (N,) int32
         The row that each point had before.
     rows : (K, 2) int64
         First row of each cluster and the one after its last; ascending, without gaps.
@@ -56,7 +71,7 @@ class Clusters:
     """
 
     points: Array
-    order: Indices
+    order: npt.NDArray[np.int32]
     rows: Indices
     flat: npt.NDArray[np.bool_]
     mean: Array
@@ -87,12 +102,10 @@ def is_paper(config: ModelsConfig) -> bool:
 
 def segment_cloud(points: Array, config: ModelsConfig, viewpoint: Array) -> Clusters:
     """Cluster (N, 3) points; normals face the viewpoint (3,), m."""
-    number = len(points)
-    moved, order = np.empty((number, 3)), np.empty(number, np.int64)
+    number, by_paper = len(points), is_paper(config)
+    moved, spare = np.ascontiguousarray(points.T), np.empty((4, number))
+    order, spare_order = np.arange(number, dtype=np.int32), np.empty(number, np.int32)
     rows, flat = np.empty((number, 2), np.int64), np.empty(number, np.bool_)
-    means, values = np.empty((2, number, 3))
-    frames = np.empty((number, 3, 3))
-    by_paper = is_paper(config)
     rules = (
         config.voxel_size_m,
         config.min_density_radius,
@@ -103,9 +116,13 @@ def segment_cloud(points: Array, config: ModelsConfig, viewpoint: Array) -> Clus
         0.0 if by_paper else config.noise_per_range_sq,
         0.0 if by_paper else 1.0,
     )
-    num = bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, values, frames)
+    num = bisect_cloud(moved, order, viewpoint, rules, spare, spare_order, rows, flat)
     at = np.argsort(rows[:num, 0])
-    return Clusters(moved, order, rows[at], flat[at], means[at], values[at], frames[at])
+    ordered, starts = np.ascontiguousarray(moved.T), np.append(rows[at, 0], number)
+    counts, means, scatters = means_and_scatters(ordered, np.ones(number), starts)
+    values, axes = eigen(scatters / np.maximum(counts - 1.0, 1.0)[:, None, None])
+    frames = oriented(axes, viewpoint - means)
+    return Clusters(ordered, order, rows[at], flat[at], means, values, frames)
 
 
 def thickness(means: Array, config: ModelsConfig, viewpoint: Array) -> Array:
@@ -209,6 +226,30 @@ def folded(
     clusters: Clusters, members: Indices, config: ModelsConfig
 ) -> npt.NDArray[np.bool_] | None:
     """Return how to bisect a region (n,) bool, or None if it is a chart."""
-    limit, side = math.cos(math.radians(config.fold_angle_deg)), np.empty(len(members), np.bool_)
+    limit = math.cos(math.radians(config.fold_angle_deg))
     normals, mean = clusters.frames[members, 2], mean_normal(clusters, members)
-    return side if bisect_folded(normals, mean, limit, side) else None
+    return bisected_normals(normals) if is_folded(normals, mean, limit) else None
+
+
+def is_folded(normals: Array, mean: Array, limit: float) -> bool:
+    """Return whether too many cosines of normals (n, 3) to their mean are below a limit."""
+    cosines = normals @ mean
+    below = np.count_nonzero(cosines < limit)
+    if len(normals) < 2 or below == 0 or below > MOST_FOLDED:
+        return len(normals) >= 2 and below > 0
+    return bool(np.percentile(cosines, 100.0 - FOLD_PERCENTILE) < limit)
+
+
+def bisected_normals(normals: Array) -> npt.NDArray[np.bool_] | None:
+    """Return one half (n,) of normals (n, 3) by 2-means, or None if the other one is empty."""
+    spread = normals.var(axis=0)
+    axis = int(np.argmax(spread >= STEADY_SHARE * spread.max()))
+    side = normals[:, axis] > normals[:, axis].mean()
+    for _ in range(MEANS_ITERATIONS):
+        if side.all() or not side.any():
+            return None
+        first, second = normals[side].mean(axis=0), normals[~side].mean(axis=0)
+        previous, side = side, normals @ (first - second) > 0.5 * (first @ first - second @ second)
+        if (side == previous).all():
+            break
+    return np.asarray(side, np.bool_)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.filters.shapes import eigen
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.outlines import areas, local_outline, triangles, triangulated
 
@@ -171,17 +170,9 @@ class Shapes:
 
 def ellipsoid_frames(gaussians: Gaussians) -> tuple[Array, Array]:
     """Return axes (G, 3, 3) as columns, right-handed, and half axes (G, 3), m, ascending."""
-    rows, columns = np.triu_indices(3)
-    values, axes = eigen(gaussians.covariance[:, rows, columns].T)
-    axes[values[:, 2] == 0.0] = np.eye(3)  # axes of a point are arbitrary
-    x, y, z = axes.transpose(1, 2, 0)
-    is_left = (
-        (x[1] * y[2] - x[2] * y[1]) * z[0]
-        + (x[2] * y[0] - x[0] * y[2]) * z[1]
-        + (x[0] * y[1] - x[1] * y[0]) * z[2]
-    ) < 0.0
-    axes[is_left, 2] *= -1.0
-    return np.swapaxes(axes, 1, 2), SIGMAS * np.sqrt(values)
+    values, axes = np.linalg.eigh(gaussians.covariance)
+    axes[np.linalg.det(axes) < 0.0, :, 2] *= -1.0
+    return axes, SIGMAS * np.sqrt(np.maximum(values, 0.0))
 
 
 def ellipsoid_corners(gaussians: Gaussians) -> Array:

@@ -155,28 +155,3 @@ def group_scatters(points, weights, starts, totals, means, scatters):
             scatters[k, 0, 1] = scatters[k, 1, 0] = xy - sx * y
             scatters[k, 0, 2] = scatters[k, 2, 0] = xz - sx * z
             scatters[k, 1, 2] = scatters[k, 2, 1] = yz - sy * z
-
-
-@inlined(error_model='numpy')
-def orient(vectors, mean, viewpoint):
-    """
-    Turn eigenvectors into a right-handed frame whose normal faces the viewpoint.
-
-    vectors  (3, 3) float64, rows ascending by eigenvalue; becomes rows x, y, z of the frame,
-             x along the largest with its largest component positive, z the normal
-    """
-    normal, x = np.empty(3), np.empty(3)
-    towards, most = 0.0, 0
-    for j in range(3):
-        normal[j], x[j] = vectors[0, j], vectors[2, j]
-        towards += normal[j] * (viewpoint[j] - mean[j])
-        if abs(x[j]) > abs(x[most]):
-            most = j
-    turn = -1.0 if towards < 0.0 else 1.0
-    flip = -1.0 if x[most] < 0.0 else 1.0
-    for j in range(3):
-        vectors[2, j] = turn * normal[j]
-        vectors[0, j] = flip * x[j]
-    for j in range(3):
-        k, m = (j + 1) % 3, (j + 2) % 3
-        vectors[1, j] = vectors[2, k] * vectors[0, m] - vectors[2, m] * vectors[0, k]

@@ -14,8 +14,6 @@ singular.
 
 import math
 
-import numpy as np
-
 from surfel_mapper.kernels.compiling import inlined, kernel
 
 ITERATIONS = 10
@@ -33,27 +31,37 @@ TERMS = 10
 """1, x, y, z, xx, xy, xz, yy, yz, zz: moments, and coefficients of a quadric."""
 
 
+STEEP = 1e9
+"""Slope of the first logarithm of the ratio, 1/m: points on either side of a plane are apart."""
+
+
 @inlined(error_model='numpy')
-def split_mixture(x, y, z, mean, share):
+def split_mixture(x, y, z, mean, plane, total, second, quadric, share):
     """
     Compute for each point the responsibility of the second of two Gaussians.
 
-    x, y, z  (n,) float64, m
-    mean     (3,) float64, of the points
-    share    (n,) float64, in place: responsibility of the second Gaussian; 0 or 1 at the start
+    x, y, z          (n,) float64, m
+    mean             (3,) float64, of the points
+    plane            (4,) float64, normal and offset from the mean: where EM starts
+    total            (TERMS,) float64, moments of the points about the mean
+    second, quadric  (TERMS,) float64, scratch
+    share            (n,) float64, out: responsibility of the second Gaussian
     """
-    total, second, quadric = np.empty(TERMS), np.empty(TERMS), np.empty(TERMS)
-    sum_moments(x, y, z, mean, share, total, second)
-    for _ in range(ITERATIONS):
+    quadric[:] = 0.0
+    quadric[0] = STEEP * plane[3]
+    for j in range(3):
+        quadric[1 + j] = -STEEP * plane[j]
+    for iteration in range(ITERATIONS + 1):
+        changing = em_step(x, y, z, mean, share, quadric, second)
         quadric[:] = 0.0
-        if not subtract_log_density(second, total[0], quadric, 1.0):
+        if iteration > 0 and changing == 0.0:
             break
-        for k in range(TERMS):
-            second[k] = total[k] - second[k]
-        if not subtract_log_density(second, total[0], quadric, -1.0):
-            break
-        if em_step(x, y, z, mean, share, quadric, second) == 0.0:
-            break
+        for side in range(2):
+            is_empty = not subtract_log_density(second, total[0], quadric, 1.0 - 2.0 * side)
+            for k in range(TERMS):
+                second[k] = total[k] - second[k]
+            if is_empty:
+                return
 
 
 @kernel(error_model='numpy', fastmath={'reassoc'})
@@ -105,32 +113,6 @@ def em_step(x, y, z, mean, share, quadric, second):
     second[4], second[5], second[6] = wxx, wxy, wxz
     second[7], second[8], second[9] = wyy, wyz, wzz
     return changing
-
-
-@inlined(error_model='numpy')
-def sum_moments(x, y, z, mean, share, total, second):
-    """Sum the moments (TERMS,) about the mean, of all points and of the second component."""
-    for side in range(2):
-        moments = second if side else total
-        moments[:] = 0.0
-        for i in range(len(x)):
-            weight = share[i] if side else 1.0
-            add_moments(moments, weight, x[i] - mean[0], y[i] - mean[1], z[i] - mean[2])
-
-
-@inlined(error_model='numpy')
-def add_moments(moments, weight, x, y, z):
-    """Add a weighted point to moments (TERMS,)."""
-    moments[0] += weight
-    moments[1] += weight * x
-    moments[2] += weight * y
-    moments[3] += weight * z
-    moments[4] += weight * x * x
-    moments[5] += weight * x * y
-    moments[6] += weight * x * z
-    moments[7] += weight * y * y
-    moments[8] += weight * y * z
-    moments[9] += weight * z * z
 
 
 @kernel(error_model='numpy')

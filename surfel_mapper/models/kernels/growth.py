@@ -296,18 +296,3 @@ def grow_facet(
                 region[size] = v
                 size += 1
     return size
-
-
-@kernel(error_model='numpy')
-def rename_owners(starts, group, index, owner):
-    """
-    Replace patch k by index[k], and no patch by -1 less the group of the voxel, in place.
-
-    starts  (V + 1,) int64, first point of each voxel
-    group   (V,) int32
-    index   (K,) int32
-    owner   (P,) int32
-    """
-    for v in range(len(group)):
-        for i in range(starts[v], starts[v + 1]):
-            owner[i] = index[owner[i]] if owner[i] >= 0 else -1 - group[v]

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which patches touch, and how well planes, quadrics and quartics fit their points.
+Which patches touch, and by how much a common height field of two regions is better than two.
 
 Points are the means by voxel and owner; those of patch k are rows starts[k] to starts[k + 1] - 1.
+The patches of region r are members[first[r]] to members[first[r + 1] - 1].
 """
 
 import math
@@ -12,43 +13,32 @@ import numpy as np
 
 from surfel_mapper.kernels.compiling import inlined, kernel
 
-TERMS = np.array([3, 6, 15])
-"""Coefficients of a plane, a quadric and a quartic height field."""
+PLANE, QUADRIC = 3, 6
+"""Terms of height fields."""
 
-POWERS = np.array([(a, d - a) for d in range(5) for a in range(d, -1, -1)])
+POWERS = np.array([(a, d - a) for d in range(3) for a in range(d, -1, -1)])
 """Powers of x and y in the terms of height fields, by degree."""
 
 RIDGE = 1e-10
 """Added to the normal equations of coordinates in [-1, 1], for points in one line."""
 
+JOIN_COSINE = math.cos(math.radians(50.0))
+"""Least cosine of the angle between the normals of joined regions at their means."""
 
-@kernel(error_model='numpy')
-def sort_owners(first, owners, means, counts, least, out):
-    """
-    Sort the means by owner, stably.
+CHART_COSINE = math.cos(math.radians(50.0))
+"""Least cosine between the normal of a patch and the mean normal of the surface it joins."""
 
-    first, owners, means, counts  (V + 1,) int64, (M,) int32, (M, 3), (M,) float64
-    least                         least owner; those below are left out
-    out                           starts (owners + 1,) int64, then voxel, means and counts sorted
-    """
-    starts, to_voxel, to_mean, to_count = out
-    starts[:] = 0
-    for i in range(len(owners)):
-        if owners[i] >= least:
-            starts[owners[i] - least + 1] += 1
-    next_row = np.empty(len(starts), np.int64)
-    for k in range(len(starts) - 1):
-        next_row[k] = starts[k]
-        starts[k + 1] += starts[k]
-    for v in range(len(first) - 1):
-        for i in range(first[v], first[v + 1]):
-            if owners[i] < least:
-                continue
-            row = next_row[owners[i] - least]
-            next_row[owners[i] - least] += 1
-            to_voxel[row], to_count[row] = v, counts[i]
-            for j in range(3):
-                to_mean[row, j] = means[i, j]
+COPLANAR_COSINE, COPLANAR_GROWTH = math.cos(math.radians(6.0)), 1.25
+"""Coplanar patches differ by less, and their common plane fits worse by less."""
+
+REACH = 2.0
+"""Only points within this many extents of the smaller region are compared."""
+
+MOST_ROWS = 600
+"""Points that are compared, at most; larger regions are subsampled."""
+
+POINTS_PER_TERM = 3.0
+"""A height field needs more points."""
 
 
 @kernel(error_model='numpy')
@@ -92,69 +82,11 @@ def touching_patches(starts, voxel, adjacent, first, owners, pairs):
 
 
 @inlined(error_model='numpy')
-def gather(rows, number, stride, points, weights, columns, low):
-    """
-    Copy every stride-th of the first ``number`` rows as height_errors takes them; return the end.
-
-    rows             (N,) int64
-    points, weights  (P, 3), (P,) float64
-    columns          (4, M) float64, out from column low on: x, y, z, weight
-    """
-    for n in range(0, number, stride):
-        i = rows[n]
-        for j in range(3):
-            columns[j, low] = points[i, j]
-        columns[3, low] = weights[i]
-        low += 1
-    return low
-
-
-@inlined(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
-def height_errors(points, low, high, normal, errors):
-    """
-    Fit height fields of degree 1, 2 and 4 over a plane; return by how much the quadric turns, rad.
-
-    Two errors leave out the quartic, which takes most of the time.
-
-    points     (4, n) float64: x, y, z, weight
-    low, high  columns low to high - 1 are used
-    normal     (3,) float64, of the plane
-    errors     (2,) or (3,) float64, out: weighted mean squares of the residuals, m^2
-
-    The Cholesky factor of the largest system contains those of the others, so one pass is enough.
-    The turn is that of the normals of the quadric, for a strip of constant curvature the angle
-    between its ends. Shares of the second pass are multiplied by the squared cosine of the slope
-    of the quadric, so that heights weigh as much as distances from the surface.
-    """
-    most = TERMS[len(errors) - 1]
-    local, powers = np.empty((4, high - low)), np.empty((9, high - low))
-    sums, right = np.empty((9, 9)), np.empty((5, 5))
-    terms, matrix = np.empty(most), np.empty((most, most))
-    scale = local_points(points, low, normal, local)
-    residual = turn = 0.0
-    for again in range(2):
-        size = most if again else TERMS[1]
-        degree = 4 if size > TERMS[1] else 2
-        residual = height_sums(local, degree, powers, sums, right)
-        solve_heights(size, sums, right, terms, matrix)
-        if not again:
-            solve_transposed(size, matrix, terms)
-            turn = turn_of(local, terms)
-    done = 0
-    for d in range(len(errors)):
-        for p in range(done, TERMS[d]):
-            residual -= terms[p] * terms[p]
-        done = TERMS[d]
-        errors[d] = max(residual, 0.0) * scale * scale
-    return turn
-
-
-@inlined(error_model='numpy')
 def local_points(points, low, normal, local):
     """
     Compute points over a plane, in [-1, 1]; return the factor to m.
 
-    points, low, normal  of height_errors
+    points, low, normal  of heights
     local                (4, n) float64, out: x, y, height, share of the weight
     """
     least = 0
@@ -194,53 +126,49 @@ def local_points(points, low, normal, local):
 
 
 @inlined(error_model='numpy')
-def height_sums(local, degree, powers, sums, right):
+def height_sums(local, powers, sums, right):
     """
     Sum monomials of x and y, and these times the height; return the weighted mean square height.
 
-    The normal equations of degree d have (2 d + 1) (d + 1) different entries of their
-    ((d + 1) (d + 2) / 2)^2, and a sum over all points at a time is four times as fast.
+    A sum over all points at a time is four times as fast as all sums at a point.
 
     local   of local_points
-    powers  (2 d + 1, n) float64, scratch
-    sums    (2 d + 1, 2 d + 1) float64, out: of share x^a y^b at [b, a], for a + b <= 2 d
-    right   (d + 1, d + 1) float64, out: of share z x^a y^b, for a + b <= d
+    powers  (5, n) float64, scratch
+    sums    (5, 5) float64, out: of share x^a y^b at [b, a], for a + b <= 4
+    right   (3, 3) float64, out: of share z x^a y^b, for a + b <= 2
     """
     squares = 0.0
     for n in range(local.shape[1]):
         value = local[3, n]
         squares += value * local[2, n] * local[2, n]
-        for a in range(2 * degree + 1):
+        for a in range(5):
             powers[a, n] = value
             value *= local[0, n]
-    for b in range(2 * degree + 1):
-        for a in range(2 * degree + 1 - b):
-            total = 0.0
+    for b in range(5):
+        for a in range(5 - b):
+            total = height = 0.0
             for n in range(local.shape[1]):
                 total += powers[a, n]
+                height += powers[a, n] * local[2, n]
             sums[b, a] = total
-        for a in range(degree + 1 - b):
-            total = 0.0
-            for n in range(local.shape[1]):
-                total += powers[a, n] * local[2, n]
-            right[b, a] = total
-        for a in range(2 * degree - b):
+            if a + b < 3:
+                right[b, a] = height
             for n in range(local.shape[1]):
                 powers[a, n] *= local[1, n]
     return squares
 
 
 @inlined(error_model='numpy')
-def solve_heights(size, sums, right, reduced, matrix):
+def solve_heights(sums, right, reduced, matrix):
     """
-    Solve the triangular part of a least squares fit of ``size`` terms.
+    Solve the triangular part of a least squares fit of a quadric.
 
     sums, right  of height_sums
-    reduced      (size,) float64 or longer, out: right side of the triangular system; its squares
-                 are the parts of the mean square that the terms explain, one after the other
-    matrix       (size, size) float64 or larger, out: its Cholesky factor
+    reduced      (6,) float64, out: right side of the triangular system; its squares are the
+                 parts of the mean square that the terms explain, one after the other
+    matrix       (6, 6) float64, out: its Cholesky factor
     """
-    for p in range(size):
+    for p in range(QUADRIC):
         x, y = POWERS[p, 0], POWERS[p, 1]
         reduced[p] = right[y, x]
         for q in range(p + 1):
@@ -255,10 +183,10 @@ def solve_heights(size, sums, right, reduced, matrix):
 
 
 @inlined(error_model='numpy')
-def solve_transposed(size, matrix, reduced):
+def solve_transposed(matrix, reduced):
     """Solve for the coefficients, in place; matrix and reduced of solve_heights."""
-    for p in range(size - 1, -1, -1):
-        for m in range(p + 1, size):
+    for p in range(QUADRIC - 1, -1, -1):
+        for m in range(p + 1, QUADRIC):
             reduced[p] -= matrix[m, p] * reduced[m]
         reduced[p] /= matrix[p, p]
 
@@ -283,3 +211,126 @@ def turn_of(local, terms):
     mean_sq = (sum_x * sum_x + sum_y * sum_y + sum_z * sum_z) / float(local.shape[1]) ** 2
     # unit normals: their mean square distance from the mean is 1 less its square
     return math.sqrt(12.0 * max(1.0 - mean_sq, 0.0))
+
+
+@kernel(error_model='numpy')
+def compare_regions(pairs, groups, pieces, regions, floor, columns, out):
+    """
+    Compute by how much one height field of a pair of regions is better than two.
+
+    pairs    (R, 2) int64; a pair of a region with itself describes the region
+    groups   members (K,) int64 and first (K + 1,) int64: see above
+    pieces   starts (K + 1,) int64, points (P, 3), weights (P,), patch normals (K, 3) float64
+    regions  sums of normals (K, 3), middles (K, 3), extents (K,), m, noise across them (K,), m
+    floor    square of the residuals that are not resolved, m^2
+    columns  (4, P + 1) float64, scratch
+    out      (R, 4) float64, out: gain of a pair, 0 for none; of a region: gain of the best height
+             field over a plane, turn, rad, and bend, m, of the quadric, rms from a plane, m
+
+    (Longer than other kernels: the points of both regions are copied by one loop.)
+    """
+    members, first = groups
+    starts, points, weights, patch_normals = pieces
+    totals, middles, extents, noise = regions
+    normals, ends, zero = np.empty((3, 3)), np.zeros(3, np.int64), np.int64(0)
+    for r in range(len(pairs)):
+        a, b = pairs[r, 0], pairs[r, 1]
+        out[r, 0] = 0.0
+        for j in range(3):
+            normals[0, j], normals[1, j] = totals[a, j], totals[b, j]
+            normals[2, j] = totals[a, j] + totals[b, j]
+        for i in range(3):
+            normalise(normals[i])
+        cosine, is_single = dot(normals[0], normals[1]), a == b
+        is_chart, num = cosine >= JOIN_COSINE or is_single, zero
+        small = a if extents[a] < extents[b] else b
+        x, y, z = middles[small, 0], middles[small, 1], middles[small, 2]
+        for side in range(1 if is_single else 2):
+            region, limit = b if side else a, REACH * extents[small]
+            limit_sq = np.inf if region == small or extents[region] < limit else limit * limit
+            for m in range(first[region], first[region + 1]):
+                patch = members[m]
+                if not is_single and dot(patch_normals[patch], normals[2]) < CHART_COSINE:
+                    is_chart = False
+                if not is_chart:
+                    break
+                for i in range(starts[patch], starts[patch + 1]):
+                    dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+                    columns[0, num], columns[1, num] = points[i, 0], points[i, 1]
+                    columns[2, num], columns[3, num] = points[i, 2], weights[i]
+                    num += dx * dx + dy * dy + dz * dz < limit_sq
+            ends[side + 1] = num
+        if not is_chart:
+            continue
+        stride, end, middle = 1 + num // MOST_ROWS, zero, zero
+        for side in range(1 if is_single else 2):
+            middle = end
+            for i in range(ends[side], ends[side + 1], stride):
+                for j in range(4):
+                    columns[j, end] = columns[j, i]
+                end += 1
+        if min(middle, end - middle) < 3 and not is_single:
+            continue
+        both = heights(columns, zero, end, normals[2], floor)
+        gain, out[r, 1], out[r, 2], out[r, 3] = both[1] - both[0], both[3], both[4], both[2]
+        if not is_single:
+            gain, rms_m = -both[0], max(noise[a], noise[b])
+            for side in range(2):
+                low, high = (middle, end) if side else (zero, middle)
+                own = heights(columns, low, high, normals[side], floor)
+                gain, rms_m = gain + own[0], max(rms_m, own[2])
+            if cosine > COPLANAR_COSINE and both[2] < COPLANAR_GROWTH * rms_m:
+                gain = max(gain, float(min(middle, end - middle)))
+        out[r, 0] = max(gain, 0.0)
+
+
+@kernel(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
+def heights(points, low, high, normal, floor):
+    """
+    Fit a plane and a quadric over a plane to columns low to high - 1 of points (4, n).
+
+    Returns cost, cost of a plane, rms from a plane m, turn rad, and bend m of the quadric.
+
+    The Cholesky factor of the quadric contains the plane's, so one solution is enough for both.
+    The turn is that of the normals of the quadric, for a strip of constant curvature the angle
+    between its ends. Shares of the second pass are multiplied by the squared cosine of the slope
+    of the quadric, so that heights weigh as much as distances from the surface.
+    """
+    number = high - low
+    local, powers = np.empty((4, number)), np.empty((5, number))
+    sums, right = np.empty((5, 5)), np.empty((3, 3))
+    terms, matrix = np.empty(QUADRIC), np.empty((QUADRIC, QUADRIC))
+    scale = local_points(points, low, normal, local)
+    plane_sq = quadric_sq = turn = 0.0
+    for again in range(2):
+        plane_sq = height_sums(local, powers, sums, right)
+        solve_heights(sums, right, terms, matrix)
+        if not again:
+            solve_transposed(matrix, terms)
+            turn = turn_of(local, terms)
+    for p in range(PLANE):
+        plane_sq -= terms[p] * terms[p]
+    quadric_sq = plane_sq
+    for p in range(PLANE, QUADRIC):
+        quadric_sq -= terms[p] * terms[p]
+    plane_sq = max(plane_sq, 0.0) * scale * scale
+    quadric_sq = max(quadric_sq, 0.0) * scale * scale
+    best = plane = number * math.log(plane_sq + floor) + PLANE * math.log(number)
+    if number > POINTS_PER_TERM * QUADRIC:
+        best = min(best, number * math.log(quadric_sq + floor) + QUADRIC * math.log(number))
+    bend = math.sqrt(12.0 * max(plane_sq - quadric_sq, 0.0))
+    return best, plane, math.sqrt(plane_sq + floor), turn, bend
+
+
+@inlined(error_model='numpy')
+def normalise(vector):
+    """Scale a vector (3,) to unit length, in place; 0 stays 0."""
+    length = max(math.sqrt(dot(vector, vector)), 1e-12)
+    for j in range(3):
+        vector[j] /= length
+
+
+@inlined(error_model='numpy')
+def dot(a, b):
+    """Return the scalar product of vectors (3,)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -12,9 +12,6 @@ import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel
 
-WIDER_ROUNDS = 2
-"""Outliers without points around them are compared with voxels one farther away in each round."""
-
 
 @kernel(error_model='numpy')
 def neighbour_table(keys, to_y, to_z, starts, rows):
@@ -49,34 +46,6 @@ def neighbour_table(keys, to_y, to_z, starts, rows):
 
 
 @kernel(error_model='numpy')
-def find_core(starts, adjacent, share, least, core):
-    """
-    Find voxels that are not sparse compared with the densest voxel near them.
-
-    starts    (V + 1,) int64, first point of each voxel
-    adjacent  starts and rows of neighbour_table
-    share   of the points of the densest neighbour
-    least   neighbourhoods with fewer points in every voxel are widened to three voxels, and if
-            these have no more, their voxels are core voxels
-    core    (V,) bool, out
-    """
-    first, rows = adjacent
-    most = np.empty(len(core), np.int64)
-    for v in range(len(core)):
-        most[v] = starts[v + 1] - starts[v]
-        for k in range(first[v], first[v + 1]):
-            most[v] = max(most[v], starts[rows[k] + 1] - starts[rows[k]])
-    for _ in range(WIDER_ROUNDS):
-        previous = most.copy()
-        for v in range(len(core)):
-            if previous[v] < least:  # few points anywhere near: is it an outlier or far away?
-                for k in range(first[v], first[v + 1]):
-                    most[v] = max(most[v], previous[rows[k]])
-    for v in range(len(core)):
-        core[v] = most[v] < least or starts[v + 1] - starts[v] >= share * most[v]
-
-
-@kernel(error_model='numpy')
 def owner_means(points, starts, owner, owners, means, counts, first):
     """
     Average the points of each voxel that have the same owner; return how many means there are.
@@ -107,37 +76,3 @@ def owner_means(points, starts, owner, owners, means, counts, first):
                 means[k, j] /= counts[k]
     first[len(starts) - 1] = num
     return num
-
-
-@kernel(error_model='numpy')
-def sample_cubes(starts, means, ends, seeds, halves, rows):
-    """
-    Sample the points of cubes about voxels evenly: those of the voxels with their means inside.
-
-    starts  (V + 1,) int64, first point of each voxel
-    means   (V, 3) float64, m
-    ends    (2, V) float64, m: greatest z up to each voxel, and least from it on
-    seeds   (B,) int64, voxels
-    halves  (B,) float64, m: half the edge of their cubes
-    rows    (B, n) int64, out: rows of points, -1 behind the last
-    """
-    inside, rows[:] = np.empty(len(means), np.int64), -1
-    for b in range(len(seeds)):
-        x, y, z = means[seeds[b]]
-        half, num, total = halves[b], 0, 0
-        stop = np.searchsorted(ends[1], z + half, 'right')
-        for v in range(np.searchsorted(ends[0], z - half), stop):
-            if (
-                abs(means[v, 0] - x) <= half
-                and abs(means[v, 1] - y) <= half
-                and abs(means[v, 2] - z) <= half
-            ):
-                inside[num] = v
-                num += 1
-                total += starts[v + 1] - starts[v]
-        most, last, k = min(total, rows.shape[1]), 0, 0
-        for i in range(num):
-            last += starts[inside[i] + 1] - starts[inside[i]]
-            while k < most and k * total // most < last:
-                rows[b, k] = starts[inside[i] + 1] - last + k * total // most
-                k += 1

@@ -13,7 +13,12 @@ from surfel_mapper.models.kernels.bisection import (
     SETTLED_SHARE,
     split_two_means,
 )
-from surfel_mapper.models.kernels.gaussian_mixture import ITERATIONS, SETTLED, split_mixture
+from surfel_mapper.models.kernels.gaussian_mixture import (
+    ITERATIONS,
+    SETTLED,
+    split_mixture,
+    TERMS,
+)
 
 
 def two_sheets(number, seed):
@@ -34,8 +39,8 @@ def frame_of(points):
 def test_two_means_equal_lloyd_from_the_principal_axis(number):
     points = two_sheets(number, 3)
     mean, values, frame = frame_of(points)
-    share = np.empty(number)
-    second = split_two_means(*points, mean, values, frame, share, np.empty((4, MEANS_SAMPLE)))
+    share, plane, sums = np.empty(number), np.append(frame[0], 0.0), np.empty(8)
+    split_two_means(*points, mean, plane, share, sums)
 
     sample = (points - mean[:, None])[:, :: 1 + number // MEANS_SAMPLE]
     reach = np.sqrt(2.0 * values[2] / np.pi) * frame[0]
@@ -46,9 +51,8 @@ def test_two_means_equal_lloyd_from_the_principal_axis(number):
             break
         centres = np.stack([sample[:, ~side].mean(axis=1), sample[:, side].mean(axis=1)])
         before = side
-    expected = nearer_second(points - mean[:, None], centres)
-    np.testing.assert_array_equal(share, expected)
-    assert second == expected.sum()
+    np.testing.assert_array_equal(share, nearer_second(points - mean[:, None], centres))
+    assert sums[3] == share.sum()
 
 
 def nearer_second(points, centres):
@@ -61,11 +65,14 @@ def test_mixture_equals_textbook_expectation_maximisation():
 
     points = two_sheets(180, 4)
     mean = points.mean(axis=1)
-    share = (points[0] > np.median(points[0])).astype(np.float64)
-    expected = share.copy()
-    split_mixture(*points, mean, share)
-
     away = (points - mean[:, None]).T
+    middle = np.median(away[:, 0])
+    expected = (away[:, 0] > middle).astype(np.float64)
+    products = (away.T @ away)[np.triu_indices(3)]
+    total, plane = np.concatenate([[180.0], np.zeros(3), products]), np.array([1.0, 0, 0, middle])
+    share = expected.copy()
+    split_mixture(*points, mean, plane, total, np.empty(TERMS), np.empty(TERMS), share)
+
     for _ in range(ITERATIONS):
         densities = []
         for weights in (1.0 - expected, expected):

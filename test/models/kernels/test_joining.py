@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.models.growth import owner_table, pieces_of
-from surfel_mapper.models.joining import (
-    described,
-    join_patches,
-    separated,
-    single_regions,
-)
-from surfel_mapper.models.kernels.region_joining import (
-    join_pair,
-)
+from surfel_mapper.models.joining import Comparison, join_patches
 from surfel_mapper.models.thinning import thin
 
 SIZE_M = 0.05
@@ -72,14 +64,12 @@ def test_joins_that_are_much_worse_planes_than_their_patches_are_undone():
     steps = np.where((owner < 6) & (owner % 2 == 0), 0.1, 0.0)  # six stairs up and down, a floor
     z = steps + 0.005 * rng.standard_normal(len(x))
     given = pieces(np.column_stack([x, y, z]), owner)
-    single, regions = (single_regions(given, VIEW, (0.005, 0.0), SIZE_M) for _ in range(2))
-    for small, large in ((1, 0), (2, 0), (3, 0), (4, 0), (5, 0), (7, 6)):
-        join_pair(small, large, regions)
-    state = given.means, given.weights, given.starts
-    index, _, curved, is_worse = described(regions, state, SIZE_M)
+    comparison = Comparison.of(given, VIEW, (0.005, 0.0), SIZE_M)
+    root = np.array([0, 0, 0, 0, 0, 0, 6, 6])
+    index, _, curved, is_worse = comparison.described(root, SIZE_M)
+    assert index.tolist() == [0, 0, 0, 0, 0, 0, 1, 1]
     assert (curved.tolist(), is_worse.tolist()) == ([False, False], [True, False])
-    regions = separated(regions, single, is_worse[index])
-    index, normals, _, is_worse = described(regions, state, SIZE_M)
-    assert index.tolist() == [0, 1, 2, 3, 4, 5, 6, 6]
-    np.testing.assert_allclose(normals[:6], single.patch_normal[:6], atol=1e-12)
-    assert not is_worse.any()
+    index, _, curved = join_patches(given, VIEW, (0.005, 0.0), SIZE_M)
+    assert not curved.any()
+    assert index[6] == index[7]
+    assert np.bincount(index).max() <= 3
