@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from surfel_mapper.models.bspline_solvers import FieldSamples, is_direct, relax, solve_band
 from surfel_mapper.models.grid import Cells
-from surfel_mapper.models.kernels.splines import basis_functions, tensor_heights, tensor_rows
+from surfel_mapper.models.kernels.splines import basis_functions, tensor_heights
 
 Array = npt.NDArray[np.float64]
 
@@ -175,10 +175,11 @@ def design(field: HeightField, xy: Array) -> tuple[npt.NDArray[np.int64], Array]
 
     """
     (first_x, x, _), (first_y, y, _) = (field._basis(xy, axis) for axis in range(2))
-    shape = len(xy), (field.degrees[0] + 1) * (field.degrees[1] + 1)
-    rows, weights = np.empty(shape, np.int64), np.empty(shape)
-    tensor_rows(first_x, x, first_y, y, field.control.shape[1], rows, weights)
-    return rows, weights
+    along_x, along_y = (np.arange(degree + 1) for degree in field.degrees)
+    rows = (first_x[:, None] + along_x)[:, :, None] * field.control.shape[1]
+    rows = rows + (first_y[:, None] + along_y)[:, None]
+    weights = x[:, :, None] * y[:, None]
+    return rows.reshape(len(xy), -1), weights.reshape(len(xy), -1)
 
 
 def initial_field(

@@ -20,8 +20,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.splines import add_equations
-
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -94,8 +92,7 @@ def solve_band(
     reach = samples.rows[:, -1:] - samples.rows[:, :1] if len(samples.rows) else np.zeros((1, 1))
     width = max(int(reach.max()), 2 * shape[1], 2) + 1
     number = shape[0] * shape[1]
-    band, right = np.zeros((width, number)), np.zeros(number)
-    add_equations(samples.rows, samples.weights, samples.z, samples.share, band, right)
+    band, right = equations(samples, width, number)
     grid = band.reshape(width, *shape)
     for axis in range(2):
         second = second_differences(positions[axis])
@@ -107,6 +104,17 @@ def solve_band(
     grid[0] += ridge
     solution = solveh_banded(band, right, lower=True, check_finite=False, overwrite_ab=True)
     return np.array(solution.reshape(shape), np.float64)  # a view would keep the band
+
+
+def equations(samples: FieldSamples, width: int, number: int) -> tuple[Array, Array]:
+    """Return the lower band (width, number) and right side (number,) of the normal equations."""
+    rows, weighted = samples.rows, samples.share[:, None] * samples.weights
+    right = np.bincount(rows.ravel(), (weighted * samples.z[:, None]).ravel(), number)
+    i, j = np.triu_indices(rows.shape[1])
+    row, column = rows[:, j], rows[:, i]  # element k, c of the band is that of row c + k, column c
+    place, products = (row - column) * number + column, weighted[:, i] * samples.weights[:, j]
+    band = np.bincount(place.ravel(), products.ravel(), width * number)
+    return band.reshape(width, number).astype(np.float64), right.astype(np.float64)
 
 
 def relax(

@@ -29,6 +29,9 @@ Indices = npt.NDArray[np.int64]
 LEAST_POINTS = 6
 """Points in the cells of a dense patch, at least; each cell counts by its points."""
 
+LEAST_MEAN = 1.0
+"""Patches with fewer points in the area of a cell have too many gaps, and are not looked at."""
+
 LEAST_SHARE = 0.25
 """A cell is covered if its points weigh this share of those in a usual cell of its patch."""
 
@@ -56,14 +59,21 @@ def covered(model: MultiModel, points: npt.NDArray[Any], view: Array) -> MultiMo
         Position of the sensor.
 
     """
-    patches, pitch_m = model.patches, model.voxel_size_m
-    if not patches:
+    every, pitch_m = model.patches, model.voxel_size_m
+    number = np.bincount(model.labels[model.labels >= 0], minlength=len(every))
+    cells = [np.count_nonzero(p.grid.filled) * (p.grid.pitch_m / pitch_m) ** 2 for p in every]
+    chosen = np.flatnonzero(number[: len(every)] >= LEAST_MEAN * np.array(cells))
+    if not len(chosen):
         return model
+    patches = [every[k] for k in chosen]
+    index = np.full(len(number) + 1, -1, np.int32)
+    index[chosen] = np.arange(len(chosen))
+    labels = model.labels if len(chosen) == len(every) else index[model.labels]
     frames = np.array([[*patch.R_patch_map, patch.mean] for patch in patches])
     table = VoxelCells.around([patch.grid for patch in patches], pitch_m)
     counts, weights = np.zeros(len(table.of), np.int64), np.zeros(len(table.of))
     grids = table.first, table.corners, table.sizes
-    count_points(points, model.labels, frames, view, grids, pitch_m, counts, weights)
+    count_points(points, labels, frames, view, grids, pitch_m, counts, weights)
     counts[table.is_margin] = 0
     total = np.maximum(np.add.reduceat(counts, table.first), 1)
     usual_count = np.add.reduceat(counts * counts, table.first) / total
@@ -73,10 +83,9 @@ def covered(model: MultiModel, points: npt.NDArray[Any], view: Array) -> MultiMo
     rim = filled & (table.around_each(filled, SIDES) < len(SIDES))
     dense = usual_count >= LEAST_POINTS
     dense &= table.share_of_gaps([patch.grid for patch in patches], filled) <= MOST_GAPS
-    finer = [
-        replace(patch, grid=table.grid(k, filled, rim)) if dense[k] else patch
-        for k, patch in enumerate(patches)
-    ]
+    finer = list(every)
+    for k in np.flatnonzero(dense).tolist():
+        finer[chosen[k]] = replace(patches[k], grid=table.grid(k, filled, rim))
     return replace(
         model,
         planes=finer[: len(model.planes)],

@@ -44,7 +44,7 @@ from surfel_mapper.models.live_seams import rows_beyond
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Surface
 from surfel_mapper.models.shapes import ellipsoid_corners, Shapes
 from surfel_mapper.models.surfel_graph import GraphChange, SurfelGraph
-from surfel_mapper.models.surfel_joining import SurfelJoining
+from surfel_mapper.models.surfel_joining import join_charts
 from surfel_mapper.models.surfel_noise import map_noise, MOST_VOXELS
 
 __all__ = ['LiveModels', 'ModelUpdate']
@@ -83,7 +83,6 @@ class LiveModels:
         self.versions: dict[int, int] = {}
         self._graph = SurfelGraph(config, surfel_map)
         self._fitter = PatchFitter(self._graph)
-        self._joining = SurfelJoining(self._graph, config)
         self._next_id = 0
         self._estimate_at, self._updates = (0.0, 0.0), 0
         self.clear()
@@ -93,7 +92,6 @@ class LiveModels:
         self._cleared = (*getattr(self, '_cleared', ()), *self.versions)
         self.versions.clear()
         self._graph.clear()
-        self._joining.clear()
         self._patches: dict[int, Tracked] = {}
         self._charts: dict[int, list[Rows]] = {}
         self._surfels: Surfels | None = None
@@ -107,7 +105,7 @@ class LiveModels:
             self._follow_noise()
         change = self._graph.update()
         self._recut(change)
-        members, ends = self._sorted(self._joined(change.rows))
+        members, ends = self._sorted(self._joined())
         ids, matched = self._matched(members, ends)
         self._next_id += len(matched.created)
         born, changed, died = self._relabel(members, ends, ids)
@@ -233,7 +231,7 @@ class LiveModels:
             # a view would keep the rows of all charts
             self._charts.setdefault(int(graph.component[chart[0]]), []).append(chart.copy())
 
-    def _joined(self, changed: Rows) -> Rows:
+    def _joined(self) -> Rows:
         """Return the patch of each row, -1 for none: charts with what they grow over, joined."""
         graph = self._graph
         owner = np.full(len(graph.key), -1, np.int32)
@@ -242,7 +240,7 @@ class LiveModels:
             owner[np.concatenate(charts)] = np.repeat(np.arange(len(charts)), [*map(len, charts)])
         hosted = np.flatnonzero(graph.host >= 0)
         owner[hosted] = owner[graph.host[hosted]]
-        return self._joining.update(owner, changed)
+        return join_charts(graph, owner)
 
     def _sorted(self, group: Rows) -> tuple[Rows, Indices]:
         """Return rows with a group sorted by it, and the start of each group."""

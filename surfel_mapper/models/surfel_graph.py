@@ -177,7 +177,6 @@ class SurfelGraph:
         self._find_hosts(filled, near)
         return GraphChange(
             num_voxels=len(changed) + len(gone.key),
-            rows=filled,
             relinked=unique_components(relinked),
             touched=unique_components([touched]),
             gone=gone.remaining,
@@ -354,8 +353,6 @@ class GraphChange:
     ----------
     num_voxels : int
         Voxels that appeared, changed or disappeared.
-    rows : (N,) int32
-        Rows of changed voxels, and of those whose class or normal changed with them.
     relinked : (C,) int32
         Components whose connectivity may have changed.
     touched : (C,) int32
@@ -366,7 +363,6 @@ class GraphChange:
     """
 
     num_voxels: int
-    rows: Rows
     relinked: Rows
     touched: Rows
     gone: Rows

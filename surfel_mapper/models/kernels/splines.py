@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-B-splines: basis functions at many parameters, tensor products, and the band of their equations.
+B-splines: basis functions at many parameters, and sums of their tensor products.
 
 A room has dozens of curved patches of some thousand points. In numpy half of the time of a fit was
 spent here, in a dozen passes over short arrays for each patch.
@@ -68,39 +68,3 @@ def tensor_heights(first_x, along_x, first_y, along_y, control, heights):
                 row += along_y[m, j] * control[first_x[m] + i, first_y[m] + j]
             total += along_x[m, i] * row
         heights[m] = total
-
-
-@kernel(error_model='numpy')
-def tensor_rows(first_x, along_x, first_y, along_y, num_y, rows, weights):
-    """
-    List the control points on which each location depends, y within x, and their weights.
-
-    num_y    control points along y
-    rows     (M, W) int64, out
-    weights  (M, W) float64, out
-    """
-    for m in range(len(rows)):
-        k = 0
-        for i in range(along_x.shape[1]):
-            for j in range(along_y.shape[1]):
-                rows[m, k] = (first_x[m] + i) * num_y + first_y[m] + j
-                weights[m, k] = along_x[m, i] * along_y[m, j]
-                k += 1
-
-
-@kernel(error_model='numpy')
-def add_equations(rows, weights, z, share, band, right):
-    """
-    Add the normal equations of samples to a lower band and a right side.
-
-    rows, weights  (M, W): see tensor_rows; rows ascend
-    z, share       (M,) float64, heights and weights of the samples
-    band           (B, N) float64, in place: element k, i is that of row i + k, column i
-    right          (N,) float64, in place
-    """
-    for m in range(len(z)):
-        for i in range(rows.shape[1]):
-            weighted, column = share[m] * weights[m, i], rows[m, i]
-            right[column] += weighted * z[m]
-            for j in range(i, rows.shape[1]):
-                band[rows[m, j] - column, column] += weighted * weights[m, j]

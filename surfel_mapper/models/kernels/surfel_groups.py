@@ -240,49 +240,6 @@ def merge_voxels(rows, starts, count, position, covariance, total, mean, merged)
 
 
 @kernel(error_model='numpy')
-def find_pieces(owner, block, key, piece):
-    """
-    Find the voxel of least key of each group in each block.
-
-    owner  (R,) int32, group of each row, -1 for none
-    block  (R,) int32, block of each row with an owner
-    key    (R,) int64
-    piece  (R,) int32, out: row of that voxel, -1 for none
-
-    The pieces of a group are a chain; neighbouring rows mostly are of the same one.
-    """
-    number = 0
-    for group in owner:
-        number = max(number, group + 1)
-    head, recent = np.empty(number, np.int32), np.empty(number, np.int32)
-    next_piece, least = np.empty(len(owner), np.int32), np.empty(len(owner), np.int32)
-    head[:] = -1
-    recent[:] = -1
-    num = 0
-    for row in range(len(owner)):
-        piece[row] = -1
-        group = owner[row]
-        if group < 0:
-            continue
-        at = recent[group]
-        if at < 0 or block[least[at]] != block[row]:
-            at = head[group]
-            while at >= 0 and block[least[at]] != block[row]:
-                at = next_piece[at]
-            if at < 0:
-                at = num
-                next_piece[at], least[at], head[group] = head[group], row, at
-                num += 1
-            recent[group] = at
-        if key[row] < key[least[at]]:
-            least[at] = row
-        piece[row] = at
-    for row in range(len(owner)):
-        if piece[row] >= 0:
-            piece[row] = least[piece[row]]
-
-
-@kernel(error_model='numpy')
 def common_labels(labels, starts, common):
     """
     Find the groups whose members all have the same label.
