@@ -14,11 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.surfel_groups import (
-    connected_components,
-    find_doubtful,
-    mean_normals,
-)
+from surfel_mapper.models.frames import mean_normals
 from surfel_mapper.models.segmentation import bisected_normals, height_fields, is_folded
 from surfel_mapper.models.surfel_graph import SurfelGraph
 
@@ -62,17 +58,19 @@ def chart_components(
         Charts of fewer voxels are dropped.
 
     """
-    means, doubtful = np.empty((len(starts) - 1, 3)), np.empty(len(starts) - 1, np.bool_)
-    flat = np.ones(len(graph.key), np.bool_)
-    mean_normals(rows, starts, flat, graph.normal, means)
-    rules = (math.cos(math.radians(angles_deg[0])), STACKED_VOXELS * graph.map.voxel_size_m)
-    find_doubtful(rows, starts, means, graph.normal, graph.position, rules, doubtful)
+    means, fold = mean_normals(graph.normal[rows], starts), math.cos(math.radians(angles_deg[0]))
+    axis = np.repeat(means, np.diff(starts), axis=0)
+    cosine = np.einsum('ij,ij->i', graph.normal[rows], axis)
+    height = np.einsum('ij,ij->i', graph.position[rows], axis)
+    extent = np.maximum.reduceat(height, starts[:-1]) - np.minimum.reduceat(height, starts[:-1])
+    doubtful = np.minimum.reduceat(cosine, starts[:-1]) < fold
+    doubtful |= extent > STACKED_VOXELS * graph.map.voxel_size_m
     charts: list[Rows] = []
     for k in range(len(means)):
         members = rows[starts[k] : starts[k + 1]]
         if doubtful[k]:
             ordered = members[np.argsort(graph.key[members])]
-            charts += bisected(graph, ordered, rules[0], least)
+            charts += bisected(graph, ordered, fold, least)
         else:
             charts.append(members)
     limit = math.cos(math.radians(angles_deg[1]))
@@ -153,9 +151,8 @@ def stacked_side(points: Array, normal: Array, size_m: float) -> npt.NDArray[np.
 
 def connected_parts(graph: SurfelGraph, rows: Rows) -> list[Rows]:
     """Return the connected components of rows, each in the order of the rows."""
-    parent = np.empty(len(rows), np.int64)
-    connected_components(rows, graph.links, graph.neighbours, graph.index_of, parent)
-    if not parent.any():  # the usual case: one component
+    component = graph.connected(rows)
+    if not component.any():  # the usual case: one component
         return [rows]
-    order = np.argsort(parent, kind='stable')
-    return np.split(rows[order], np.flatnonzero(np.diff(parent[order])) + 1)
+    order = np.argsort(component, kind='stable')
+    return np.split(rows[order], np.flatnonzero(np.diff(component[order])) + 1)

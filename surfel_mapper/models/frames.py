@@ -16,6 +16,10 @@ PACKED = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Place of each element of a symmetric matrix among xx xy xz yy yz zz."""
 
 
+LEAST_SHARE = 0.4
+"""Least length of the mean of unit normals within 60 deg of it, with some outliers."""
+
+
 def means_and_scatters(
     points: Array, weights: Array, starts: Indices
 ) -> tuple[Array, Array, Array]:
@@ -60,6 +64,34 @@ def plane_frames(points: Array, weights: Array, starts: Indices) -> tuple[Array,
     values, axes = eigen(scatters / np.where(total > 0.0, total, 1.0)[:, None, None])
     normals = np.where(total[:, None] > 0.0, axes[:, 0], 0.0)
     return means, normals, values
+
+
+def mean_normals(normals: Array, starts: Indices) -> Array:
+    """
+    Return the mean unit normals (K, 3) of groups.
+
+    Normals of a chart lie within a cone. If they cancel, the voxels have no common viewpoint; they
+    are then flipped to the side of the majority.
+
+    Parameters
+    ----------
+    normals : (M, 3) float64
+        Unit normals, group after group; 0 for none.
+    starts : (K + 1,) int64
+        First normal of each group, and M.
+
+    """
+    totals: Array = np.add.reduceat(normals, starts[:-1])
+    number = np.add.reduceat(normals.any(axis=1).astype(np.int64), starts[:-1])
+    cancelled = (np.linalg.norm(totals, axis=1) <= LEAST_SHARE * number) & (number > 0)
+    for k in np.flatnonzero(cancelled):
+        own = normals[starts[k] : starts[k + 1]]
+        totals[k] = own[own.any(axis=1).argmax()]
+        for _ in range(2):
+            side = np.where(own @ totals[k] < 0.0, -1.0, 1.0)
+            totals[k] = side @ own
+    totals /= np.maximum(np.linalg.norm(totals, axis=1), 1e-300)[:, None]
+    return totals
 
 
 def oriented(axes: Array, towards: Array) -> Array:

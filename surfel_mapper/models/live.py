@@ -30,21 +30,15 @@ from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.charts import bisected, chart_components
+from surfel_mapper.models.frames import PACKED
 from surfel_mapper.models.id_matching import IdMatches, match
 from surfel_mapper.models.kernels.surfel_classes import FLAT, NONE, YOUNG
-from surfel_mapper.models.kernels.surfel_groups import (
-    common_labels,
-    connected_components,
-    name_components,
-    rows_of_groups,
-    sort_by_group,
-)
-from surfel_mapper.models.live_patches import Described, PatchFitter, symmetric, Tracked
+from surfel_mapper.models.live_patches import Described, PatchFitter, Tracked
 from surfel_mapper.models.live_seams import rows_beyond
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Surface
 from surfel_mapper.models.shapes import ellipsoid_corners, Shapes
 from surfel_mapper.models.surfel_graph import GraphChange, SurfelGraph
-from surfel_mapper.models.surfel_joining import join_charts
+from surfel_mapper.models.surfel_joining import join_charts, renumbered
 from surfel_mapper.models.surfel_noise import map_noise, MOST_VOXELS
 
 __all__ = ['LiveModels', 'ModelUpdate']
@@ -105,7 +99,7 @@ class LiveModels:
             self._follow_noise()
         change = self._graph.update()
         self._recut(change)
-        members, ends = self._sorted(self._joined())
+        members, ends = sorted_rows(self._joined())
         ids, matched = self._matched(members, ends)
         self._next_id += len(matched.created)
         born, changed, died = self._relabel(members, ends, ids)
@@ -154,7 +148,7 @@ class LiveModels:
                     id=graph.label[rows].astype(np.int64),
                     num_points=graph.count[rows],
                     mean=graph.position[rows],
-                    covariance=symmetric(graph.covariance[rows]),
+                    covariance=graph.covariance[rows][:, PACKED],
                 ),
                 labels=labels,
                 voxel_size_m=self.map.voxel_size_m,
@@ -210,19 +204,18 @@ class LiveModels:
     def _recut(self, change: GraphChange) -> None:
         """Recompute connected components around changes, and cut these into charts."""
         graph, least = self._graph, self.config.min_voxels
-        size = len(graph.key)
-        rows: Rows = np.empty(size, np.int32)
-        flags = np.zeros(size, np.bool_)
+        flags = np.zeros(len(graph.key) + 1, np.bool_)  # the last: no component
         flags[change.relinked] = flags[change.touched] = True
         self._charts = {name: kept for name, kept in self._charts.items() if not flags[name]}
         single = (graph.kind == FLAT) & (graph.component < 0)
-        apart = rows[: rows_of_groups(graph.component, flags, single, rows)].copy()
-        parent = np.empty(len(apart), np.int64)
-        connected_components(apart, graph.links, graph.neighbours, graph.index_of, parent)
-        name_components(apart, parent, graph.key, graph.component)
-        number = np.full(size, -1, np.int32)
-        number[apart] = graph.component[apart]
-        rows, starts = self._sorted(number)
+        apart = np.flatnonzero(flags[graph.component] | single).astype(np.int32)
+        component = graph.connected(apart)
+        order = np.lexsort((graph.key[apart], component))
+        _, first = np.unique(component[order], return_index=True)
+        graph.component[apart] = apart[order[first]][component]
+        named = np.full(len(graph.key), -1, np.int32)
+        named[apart] = graph.component[apart]
+        rows, starts = sorted_rows(named)
         large = np.diff(starts) >= least
         ends = np.concatenate([[0], np.cumsum(np.diff(starts)[large])])
         kept = rows[np.repeat(large, np.diff(starts))]
@@ -242,18 +235,11 @@ class LiveModels:
         owner[hosted] = owner[graph.host[hosted]]
         return join_charts(graph, owner)
 
-    def _sorted(self, group: Rows) -> tuple[Rows, Indices]:
-        """Return rows with a group sorted by it, and the start of each group."""
-        rows = np.flatnonzero(group >= 0).astype(np.int32)
-        ordered, starts = np.empty_like(rows), np.empty(len(rows) + 1, np.int64)
-        num = sort_by_group(rows, group, self._graph.index_of, ordered, starts)
-        return ordered, starts[: num + 1]
-
     def _matched(self, members: Rows, ends: Indices) -> tuple[Indices, IdMatches]:
         """Return the ids of patches (K,), and those of patches with other voxels than before."""
-        labels, ids = self._graph.label[members], np.empty(len(ends) - 1, np.int64)
-        common_labels(labels, ends, ids)
-        sizes = np.diff(ends)
+        labels, sizes = self._graph.label[members], np.diff(ends)
+        low, high = (end.reduceat(labels, ends[:-1]) for end in (np.minimum, np.maximum))
+        ids = np.where(low == high, low, -1).astype(np.int64)
         for k, number in enumerate(ids.tolist()):
             tracked = self._patches.get(number)
             if tracked is None or len(tracked.rows) != sizes[k]:
@@ -323,6 +309,14 @@ class LiveModels:
             self.versions[number] = 1
         for number in changed:
             self.versions[number] += 1
+
+
+def sorted_rows(group: Rows) -> tuple[Rows, Indices]:
+    """Return rows with a group (R,), sorted by its first row, and the start of each group."""
+    rows = np.flatnonzero(group >= 0).astype(np.int32)
+    number = renumbered(group[rows])
+    starts = np.concatenate([[0], np.cumsum(np.bincount(number))])
+    return rows[np.argsort(number, kind='stable')], starts
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ without changes stay the same.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 import math
 
 import numpy as np
@@ -19,10 +20,14 @@ import numpy.typing as npt
 
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.models.bspline import fit_cells, HeightField
-from surfel_mapper.models.frames import eigen, oriented
+from surfel_mapper.models.frames import (
+    eigen,
+    mean_normals,
+    means_and_scatters,
+    oriented,
+    PACKED,
+)
 from surfel_mapper.models.grid import Cells
-from surfel_mapper.models.kernels.surfel_classes import FLAT
-from surfel_mapper.models.kernels.surfel_groups import mean_normals, merge_voxels, sample_voxels
 from surfel_mapper.models.multi_model import Plane, Surface
 from surfel_mapper.models.patches import (
     cells_of,
@@ -39,8 +44,8 @@ Indices = npt.NDArray[np.int64]
 
 PLANE_PITCH_VOXELS = 2.0
 """Edge of the cells of a plane."""
-POINTS = 9
-"""Points across each surfel."""
+STEPS = np.array(list(product((-1.0, 0.0, 1.0), repeat=2)))
+"""Points across each surfel, in half its edges."""
 
 STILL = 0.1
 """A frame stays while its boundary would move by less than this share of the thickness."""
@@ -139,10 +144,9 @@ class PatchFitter:
         graph, every = self._graph, np.concatenate([np.empty(0, np.int32), *rows])
         starts = np.cumsum([0, *(len(group) for group in rows)])
         total, means, covariances = self._merged(every, starts)
-        normals = np.empty_like(means)
-        mean_normals(every, starts, graph.kind == FLAT, graph.normal, normals)
+        normals = mean_normals(graph.flat_normals(every), starts)
         thickness = np.full(len(rows), graph.limit_m)
-        samples = PatchPoints(self._points(every), POINTS * starts, normals, thickness)
+        samples = PatchPoints(self._points(every), len(STEPS) * starts, normals, thickness)
         frames, curved = self._frames(samples)
         axes = eigen(covariances[~curved])[1]
         frames[~curved] = oriented(axes, normals[~curved])
@@ -225,21 +229,21 @@ class PatchFitter:
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
         """Return number, mean and covariance of all points of groups of voxels."""
-        number, graph = len(starts) - 1, self._graph
-        total, merged = np.empty(number, np.int64), np.empty((number, 6))
-        means = np.empty((number, 3))
-        merge_voxels(
-            rows, starts, graph.count, graph.position, graph.covariance, total, means, merged
-        )
-        return total, means, symmetric(merged)
+        graph, counts = self._graph, self._graph.count[rows].astype(np.float64)
+        total, means, scatters = means_and_scatters(graph.position[rows], counts, starts)
+        own = (counts - 1.0)[:, None] * graph.covariance[rows]
+        scatters += np.add.reduceat(own, starts[:-1])[:, PACKED]
+        scale = 1.0 / np.maximum(total - 1.0, 1.0)
+        return total.astype(np.int64), means, scale[:, None, None] * scatters
 
     def _points(self, rows: Rows) -> Array:
         """Return the points (9 n, 3) across surfels, m."""
         graph = self._graph
         low = unpack_keys(graph.key[rows]) * self._size_m
-        points = np.empty((POINTS * len(rows), 3))
-        sample_voxels(rows, graph.position, graph.axes, low, self._size_m, points)
-        return points
+        away = np.tensordot(graph.axes[rows], STEPS, ((1,), (1,))).swapaxes(1, 2)
+        points = graph.position[rows][:, None] + away
+        clipped: Array = np.clip(points, low[:, None], low[:, None] + self._size_m)
+        return clipped.reshape(-1, 3)
 
     def _frames(self, groups: PatchPoints) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Return the frames (K, 3, 3) of groups as surfaces, and whether they are curved."""
@@ -293,12 +297,6 @@ def turned(x: Array, normals: Array) -> Array:
     along = x - np.einsum('ij,ij->i', x, normals)[:, None] * normals
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     return np.stack([along, np.cross(normals, along), normals], axis=1)
-
-
-def symmetric(packed: Array) -> Array:
-    """Return matrices (K, 3, 3) from xx xy xz yy yz zz (K, 6)."""
-    full: Array = packed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    return full
 
 
 def moved(field: HeightField, shift: Array) -> HeightField:

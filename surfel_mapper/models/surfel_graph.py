@@ -87,8 +87,6 @@ class SurfelGraph:
         Whether that is a Gaussian of this voxel.
     is_material : (R,) bool
         Whether its last change is worth reporting.
-    places : (R,) int32
-        All -1; scratch for kernels.
     noise_m : float
         Assumed noise of the sensor, sigma, m.
 
@@ -138,7 +136,7 @@ class SurfelGraph:
         self.kind = self.own_kind = self.level = np.empty(0, np.uint8)
         self.links = np.empty(0, np.uint64)
         self.neighbours = np.empty((0, len(self._neighbour_steps)), np.int32)
-        self.host, self.component, self.label, self.index_of = (none,) * 4
+        self.host, self.component, self.label = (none,) * 3
         self.is_gaussian = self.is_material = np.empty(0, np.bool_)
         self._marks = self._is_here = np.empty(0, np.bool_)
         self._reported_position, self._reported_normal = np.empty((2, 0, 3))
@@ -204,6 +202,21 @@ class SurfelGraph:
         self._is_here[changed] = self._marks[marked[:num]] = False
         return self.component[marked[:num]]
 
+    def connected(self, rows: Rows) -> Rows:
+        """Return the connected component (M,) of linked rows, in the order of their first rows."""
+        from scipy.sparse import coo_array  # 0.2 s that maps without models save
+        from scipy.sparse.csgraph import connected_components
+
+        index = np.full(len(self.key), -1, np.int32)
+        index[rows] = np.arange(len(rows))
+        bits = np.arange(self.neighbours.shape[1] // 2, dtype=np.uint64)
+        first, step = np.nonzero(self.links[rows, None] >> bits & np.uint64(1))
+        second = index[self.neighbours[rows[first], step]]
+        ends = first[second >= 0], second[second >= 0]
+        links = coo_array((np.ones(len(ends[0]), np.bool_), ends), (len(rows), len(rows)))
+        component: Rows = connected_components(links, directed=False)[1]
+        return component
+
     def surfels(self) -> Surfels:
         """Return all voxels as surfels, in the order of their rows."""
         rows = np.flatnonzero(self.key >= 0)
@@ -244,7 +257,7 @@ class SurfelGraph:
         more = max(num_rows, 2 * len(self.key)) - len(self.key)
         if num_rows <= len(self.key):
             return
-        empty = dict.fromkeys(('key', 'host', 'component', 'label', 'index_of', 'neighbours'), -1)
+        empty = dict.fromkeys(('key', 'host', 'component', 'label', 'neighbours'), -1)
         for name, values in vars(self).items():
             if isinstance(values, np.ndarray) and name != '_neighbour_steps':
                 added = np.full((more, *values.shape[1:]), empty.get(name, 0), values.dtype)
@@ -316,6 +329,10 @@ class SurfelGraph:
         moved |= (normals != self.normal[around]).any(axis=1)
         self._is_here[rows] = False
         return around[moved], old_kind[moved]
+
+    def flat_normals(self, rows: npt.NDArray[Any]) -> Array:
+        """Return the normals (K, 3) of flat voxels, 0 for others."""
+        return np.where((self.kind[rows] == FLAT)[:, None], self.normal[rows], 0.0)
 
     def is_thin(self, rows: npt.NDArray[Any], normals: Array) -> npt.NDArray[np.bool_]:
         """Return which voxels (K,) are thin enough along directions (K, 3) to lie on a plane."""

@@ -20,8 +20,7 @@ from surfel_mapper.models.coarse_growth import (
     grow_coarse,
     SPARSE_SHARE,
 )
-from surfel_mapper.models.kernels.surfel_classes import FLAT
-from surfel_mapper.models.kernels.surfel_groups import mean_normals
+from surfel_mapper.models.frames import mean_normals
 from surfel_mapper.models.surfel_graph import SurfelGraph
 
 Array = npt.NDArray[np.float64]
@@ -56,10 +55,8 @@ def join_charts(graph: SurfelGraph, owner: Rows) -> Rows:
     was_free = patch < 0
     order = np.argsort(patch, kind='stable')[was_free.sum() :]
     starts = np.searchsorted(patch[order], np.arange(number + 1))
-    normals: Array = np.empty((number, 3))
+    normals = mean_normals(graph.flat_normals(rows[order]), starts)
     curved: npt.NDArray[np.bool_] = np.zeros(number, np.bool_)
-    members = rows[order].astype(np.int32)
-    mean_normals(members, starts, graph.kind == FLAT, graph.normal, normals)
     points = graph.position[rows]
     rules = CoarseRules(size_m, graph.thickness_m, (graph.noise_m, 0.0))
     for factor in FACTORS:

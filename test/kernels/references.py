@@ -46,7 +46,6 @@ REFERENCES = {
     'models/kernels/region_merging.py': 'models/kernels/test_patches.py',
     'models/kernels/splines.py': 'models/test_bspline.py',
     'models/kernels/surfel_classes.py': 'models/kernels/test_surfels.py',
-    'models/kernels/surfel_groups.py': 'models/test_live.py',
     'models/kernels/surfel_links.py': 'models/test_live.py',
     'models/kernels/voxel_means.py': 'models/test_thinning.py',
     'models/kernels/voxel_points.py': 'models/kernels/test_growth.py',
