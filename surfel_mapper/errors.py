@@ -28,7 +28,7 @@ any exception of a parser an error of its reader.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 import logging
 from pathlib import Path
@@ -156,26 +156,19 @@ class DependencyError(SurfelMapperError, ImportError):
 
 
 @contextmanager
-def refusing(name: str | Path, error: Callable[[str], Exception]) -> Iterator[None]:
+def refusing(name: str | Path) -> Iterator[None]:
     """
-    Turn every exception of a with-block that parses input into the error of its reader.
+    Turn every exception of a with-block that reads a file into a FileFormatError that names it.
 
-    Each reader has one around all that it does: which exceptions libraries raise for damaged
-    content is not known in advance (TokenError, OverflowError and MemoryError were missed).
-
-    Parameters
-    ----------
-    name : str or Path
-        File or topic, named in errors.
-    error : callable of str to Exception
-        Class of the errors of the reader.
-
+    Each reader has one around all that it does, as libraries raise errors of many types for
+    damaged content. Errors of this package and a lack of memory pass.
     """
     try:
         yield
-    except SurfelMapperError:
+    except (SurfelMapperError, MemoryError):
         raise
     except OSError as cause:
-        raise error(f'{name}: cannot be read: {cause.strerror or cause}') from cause
-    except Exception as cause:  # MemoryError too
-        raise error(f'{name}: damaged: {type(cause).__name__}: {cause}') from cause
+        raise FileFormatError(f'{name}: cannot be read: {cause.strerror or cause}') from cause
+    except Exception as cause:
+        problem = f'damaged, or of another format: {type(cause).__name__}: {cause}'
+        raise FileFormatError(f'{name}: {problem}') from cause

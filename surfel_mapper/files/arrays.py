@@ -55,7 +55,7 @@ def read_points(path: str | Path) -> Columns:
         If it cannot be read, has no such array, pickled objects, or a map.
 
     """
-    with refusing(path, FileFormatError), open_regular(path) as file:
+    with refusing(path), open_regular(path) as file:
         if Path(path).suffix.lower() == '.npy':
             return columns_of(path, np.load(file, allow_pickle=False))
         if is_map(Path(path)):

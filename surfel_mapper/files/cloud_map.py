@@ -10,13 +10,12 @@ has too few points a voxel for a normal, but may have normals: each point then s
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError, MapError
-from surfel_mapper.files.point_columns import NORMAL_NAMES
+from surfel_mapper.files.point_columns import normals_in
 from surfel_mapper.files.scan_files import read_scan, SUFFIXES
 from surfel_mapper.mapping.moments import looks_like_other_unit, ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -106,14 +105,6 @@ def check_density(path: Path, moments: ScanMoments, points: Floats) -> None:
         f'{share:.0%} are in voxels of {LEAST_POINTS} or more, expected {LEAST_SHARE:.0%}; '
         f'{reason}'
     )
-
-
-def normals_in(columns: dict[str, npt.NDArray[Any]]) -> Floats | None:
-    """Return the normals in the columns of a file, (N, 3); None without."""
-    for names in NORMAL_NAMES:
-        if columns.keys() >= {*names}:
-            return np.column_stack([columns[name] for name in names]).astype(np.float64)
-    return None
 
 
 def discs(points: Floats, normals: Floats, radius_m: float) -> Floats:

@@ -8,7 +8,8 @@ E57 has several scans, each with its pose: ``read_e57`` returns all in the frame
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 import os
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.point_columns import Columns, NORMALS, RGB
 from surfel_mapper.libraries import library
 
@@ -36,38 +37,30 @@ def decoder(name: str, path: str | Path, extra: str) -> Any:
     return library(name, f'reads {Path(path).suffix}', f"'surfel_mapper[{extra}]'")
 
 
-def decoded(path: Path, read: Callable[[], Columns]) -> Columns:
-    """Return columns of a decoder; raise FileFormatError for its errors."""
+@contextmanager
+def decoding(path: Path) -> Iterator[None]:
+    """Turn errors of a decoder that opens a file by its name into a FileFormatError."""
     try:
-        with open_regular(path):
-            pass
-        return read()
-    except (DependencyError, FileFormatError, MemoryError):
-        raise
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except Exception as error:  # those of many decoders
-        raise FileFormatError(
-            f'{path}: no {path.suffix} that can be read: {type(error).__name__}: {error}; '
-            'expected one, or points as .ply, .pcd, .las, .xyz, .npy'
-        ) from error
+        with refusing(path), open_regular(path):  # a pipe would block
+            yield
+    except FileFormatError as error:
+        if error.__cause__ is None:  # our own, which says more
+            raise
+        formats = f'expected {path.suffix}, or points as .ply, .pcd, .las, .xyz, .npy'
+        raise FileFormatError(f'{error}; {formats}') from error
 
 
-def read_e57(path: str | Path, number: int | None = None) -> Columns:
-    """Return the points of all scans of an E57 file, or of one, in its frame; see decoded."""
+def read_e57(path: str | Path) -> Columns:
+    """Return the points of all scans of an E57 file, in its frame; see decoding."""
     path = Path(path)
     pye57 = decoder('pye57', path, 'clouds')
 
-    def read() -> Columns:
-        with pye57.E57(str(path)) as file:
-            numbers = range(file.scan_count) if number is None else [number]
-            scans = [e57_scan(file, at) for at in numbers]
-        if not scans:
-            raise FileFormatError(f'{path}: no scans in it')
-        names = [name for name in scans[0] if all(name in scan for scan in scans)]
-        return {name: np.concatenate([scan[name] for scan in scans]) for name in names}
-
-    return decoded(path, read)
+    with decoding(path), pye57.E57(str(path)) as file:
+        scans = [e57_scan(file, number) for number in range(file.scan_count)]
+    if not scans:
+        raise FileFormatError(f'{path}: no scans in it')
+    names = [name for name in scans[0] if all(name in scan for scan in scans)]
+    return {name: np.concatenate([scan[name] for scan in scans]) for name in names}
 
 
 def e57_scan(file: Any, number: int) -> Columns:
@@ -76,35 +69,16 @@ def e57_scan(file: Any, number: int) -> Columns:
     return {E57_COLUMNS[name]: columns[name] for name in E57_COLUMNS if name in columns}
 
 
-def e57_poses(path: Path) -> npt.NDArray[np.float64]:
-    """Return the poses of the scanner, T_file_scanner (S, 4, 4); see decoded."""
-    pye57 = decoder('pye57', path, 'clouds')
-    poses: list[npt.NDArray[np.float64]] = []
-
-    def read() -> Columns:
-        with pye57.E57(str(path)) as file:
-            for number in range(file.scan_count):
-                header, pose = file.get_header(number), np.eye(4)
-                if header.has_pose():
-                    pose[:3, :3], pose[:3, 3] = header.rotation_matrix, header.translation
-                poses.append(pose)
-        return {}
-
-    decoded(path, read)
-    return np.array(poses).reshape(-1, 4, 4)
-
-
 def read_vtk(path: str | Path) -> Columns:
-    """Return the points of a VTK file, legacy or XML, and their scalars; see decoded."""
+    """Return the points of a VTK file, legacy or XML, and their scalars; see decoding."""
     path = Path(path)
     is_legacy = path.suffix.lower() == '.vtk'
     module = decoder(f'vtkmodules.vtkIO{"Legacy" if is_legacy else "XML"}', path, 'clouds')
     numpy_of = decoder('vtkmodules.util.numpy_support', path, 'clouds').vtk_to_numpy
     decoder('vtkmodules.vtkCommonCore', path, 'clouds').vtkObject.GlobalWarningDisplayOff()
     decoder('vtkmodules.vtkCommonDataModel', path, 'clouds')
-
-    def read() -> Columns:
-        names = {'.vtk': 'vtkGenericDataObjectReader', '.vtp': 'vtkXMLPolyDataReader'}
+    names = {'.vtk': 'vtkGenericDataObjectReader', '.vtp': 'vtkXMLPolyDataReader'}
+    with decoding(path):
         reader = getattr(module, names.get(path.suffix.lower(), 'vtkXMLUnstructuredGridReader'))()
         reader.SetFileName(str(path))
         reader.Update()
@@ -115,13 +89,11 @@ def read_vtk(path: str | Path) -> Columns:
         table = np.array(numpy_of(points.GetData()))
         columns = dict(zip('xyz', table.T, strict=True))
         attributes = data.GetPointData()
-        for at in range(attributes.GetNumberOfArrays()):
-            array = attributes.GetArray(at)
+        arrays = [attributes.GetArray(at) for at in range(attributes.GetNumberOfArrays())]
+        for at, array in enumerate(arrays):
             if array is not None and array.GetNumberOfTuples() == len(table):
                 columns |= vtk_columns(array.GetName() or f'array_{at}', np.array(numpy_of(array)))
-        return columns
-
-    return decoded(path, read)
+    return columns
 
 
 def vtk_columns(name: str, values: npt.NDArray[Any]) -> Columns:
@@ -144,11 +116,10 @@ def has_faces(path: Path) -> bool:
 
 
 def read_obj(path: str | Path) -> Columns:
-    """Return the vertices of an OBJ file without faces, and their colours; see decoded."""
+    """Return the vertices of an OBJ file without faces, and their colours; see decoding."""
     path = Path(path)
     trimesh = decoder('trimesh', path, 'meshes')
-
-    def read() -> Columns:
+    with decoding(path):
         cloud = trimesh.load(path, process=False)
         if not isinstance(cloud, trimesh.PointCloud):
             raise FileFormatError(f'{path}: a mesh, expected points; evaluate and view take it')
@@ -157,18 +128,13 @@ def read_obj(path: str | Path) -> Columns:
             columns |= dict(zip(RGB, np.asarray(cloud.colors, np.uint8).T[:3], strict=True))
         return columns
 
-    return decoded(path, read)
-
 
 def read_feather(path: str | Path) -> Columns:
-    """Return the columns of a feather file, float16 as float32; see decoded."""
+    """Return the columns of a feather file, float16 as float32; see decoding."""
     path = Path(path)
     feather = decoder('pyarrow.feather', path, 'formats')
-
-    def read() -> Columns:
+    with decoding(path):
         table = feather.read_table(str(path))
         columns = {name: table[name].to_numpy() for name in table.column_names}
-        is_half = {name: values.dtype == np.float16 for name, values in columns.items()}
-        return {n: v.astype(np.float32) if is_half[n] else v for n, v in columns.items()}
-
-    return decoded(path, read)
+    is_half = {name: values.dtype == np.float16 for name, values in columns.items()}
+    return {n: v.astype(np.float32) if is_half[n] else v for n, v in columns.items()}

@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.files.point_columns import Columns, RGB
+from surfel_mapper.files.point_columns import Columns, RGB, shape_columns
 from surfel_mapper.libraries import library
 from surfel_mapper.mapping.surfels import quality_columns
 
@@ -70,15 +70,14 @@ def read_points(path: str | Path) -> Columns:
 
     """
     laspy = import_laspy()
-    try:
-        backend = laspy.LazBackend.Lazrs
-        with open_regular(path) as file, laspy.open(file, laz_backend=backend) as reader:
-            stated = reader.header.point_count
-            las = reader.read()
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except Exception as error:  # of decoders
-        raise FileFormatError(f'{path}: no LAS or LAZ file: {error}') from error
+    lazrs = laspy.LazBackend.Lazrs
+    with (
+        refusing(path),
+        open_regular(path) as file,
+        laspy.open(file, laz_backend=lazrs) as reader,
+    ):
+        stated = reader.header.point_count
+        las = reader.read()
     if len(las) < stated:
         raise FileFormatError(f'{path}: {len(las)} points, expected {stated}; truncated?')
     is_kept = np.asarray(las.withheld) == 0
@@ -184,13 +183,7 @@ def write_surfels(
     header.offsets = np.floor(position.mean(axis=0)) if len(surfels) else np.zeros(3)
     if np.abs(position - header.offsets).max(initial=0.0) / RESOLUTION_M > MAX_STEPS:
         raise FileFormatError(f'{path}: surfels farther apart than 214 km; expected a smaller map')
-    extra = {
-        **dict(zip(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32).T, strict=True)),
-        'planarity': surfels.planarity.astype(np.float32),
-        'curvature': surfels.curvature.astype(np.float32),
-        'num_points': surfels.num_points.astype(np.uint32),
-        **quality_columns(surfels),
-    }
+    extra = {**shape_columns(surfels), **quality_columns(surfels)}
     header.add_extra_dims([laspy.ExtraBytesParams(n, v.dtype) for n, v in extra.items()])
     las = laspy.LasData(header)
     las.x, las.y, las.z = position.T

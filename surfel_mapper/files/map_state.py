@@ -12,7 +12,7 @@ voxels and counts are checked, and the digest is compared.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -129,37 +129,42 @@ def load_map(
     arrays, attributes = load_state(path)
     if attributes.get('kind') != KIND:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
-    found_m: Any = attributes.get('voxel_size_m')
-    if voxel_size_m is not None and found_m != voxel_size_m:
-        raise FileFormatError(
-            f'{path}: voxel size {found_m} m, expected map.voxel_size_m = {voxel_size_m} m'
-        )
-    with refusing(path, FileFormatError), map_errors(path):
-        surfel_map = SurfelMap(
-            found_m,
-            columns=tuple(attributes['columns']),
-            level=attributes['level'],
-            origin_m=attributes.get('origin_m', NO_ORIGIN),
-        )
+    with refusing(path), map_errors(path):
+        surfel_map = empty_map(path, attributes, voxel_size_m)
         surfel_map.insert(_moments(arrays, 'map', surfel_map))
         scans = _scans(arrays, attributes, surfel_map)
-        of_window = SurfelMap(
-            found_m,
-            columns=surfel_map.columns,
-            level=surfel_map.level,
-            origin_m=surfel_map.origin_m,
-        )
+        of_window = surfel_map.emptied()
         for scan in scans:
             of_window.insert(scan.moments)
         check_held(surfel_map.moments(), of_window.moments())
         if f'map.{SCANS}' not in arrays:
             surfel_map = with_scans_of(surfel_map, of_window.moments())
-    digest = surfel_map.digest()
-    if digest != attributes.get('digest'):
-        raise FileFormatError(
-            f'{path}: damaged: digest {digest}, expected {attributes.get("digest")}'
-        )
+    check_digest(path, attributes, surfel_map)
     return surfel_map, scans
+
+
+def empty_map(
+    path: str | Path, attributes: Mapping[str, Any], voxel_size_m: float | None
+) -> SurfelMap:
+    """Return an empty map with the attributes of a file, which must have a voxel size if given."""
+    stated_m = attributes['voxel_size_m']
+    if voxel_size_m is not None and stated_m != voxel_size_m:
+        raise FileFormatError(
+            f'{path}: voxel size {stated_m} m, expected map.voxel_size_m = {voxel_size_m} m'
+        )
+    return SurfelMap(
+        stated_m,
+        columns=tuple(attributes['columns']),
+        level=attributes['level'],
+        origin_m=attributes.get('origin_m', NO_ORIGIN),
+    )
+
+
+def check_digest(path: str | Path, attributes: Mapping[str, Any], surfel_map: SurfelMap) -> None:
+    """Raise FileFormatError if a map has another digest than its file states."""
+    digest, stated = surfel_map.digest(), attributes.get('digest')
+    if digest != stated:
+        raise FileFormatError(f'{path}: damaged: digest {digest}, expected {stated}')
 
 
 def with_scans_of(surfel_map: SurfelMap, window: ScanMoments) -> SurfelMap:
@@ -211,7 +216,7 @@ def window_stamps_ns(path: str | Path) -> list[int]:
     arrays, attributes = load_state(path)
     if attributes.get('kind') != KIND or 'scans.stamp_ns' not in arrays:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
-    with refusing(path, FileFormatError):
+    with refusing(path):
         _num_scans(arrays)
     stamps: list[int] = arrays['scans.stamp_ns'].tolist()
     return stamps

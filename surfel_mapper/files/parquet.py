@@ -22,9 +22,14 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.files.map_state import checked_moments, NO_ORIGIN
+from surfel_mapper.files.map_state import (
+    check_digest,
+    checked_moments,
+    empty_map,
+    map_errors,
+)
 from surfel_mapper.libraries import library
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import pack_keys
@@ -103,29 +108,18 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
 
     """
     _, parquet = import_pyarrow()
-    try:
-        with open_regular(path) as opened:
-            content = parquet.ParquetFile(opened)
-            attributes = read_attributes(path, content.schema_arrow.metadata or {})
-            surfel_map = map_of(attributes, voxel_size_m, path)
-            in_file = content.schema_arrow.names
-            names = moment_names(surfel_map, in_file)
-            unknown = {*in_file} - {*names, *DERIVED, *QUALITY, *COVARIANCE}
-            if unknown:
-                raise ValueError(f'unknown columns {sorted(unknown)}')
-            columns = moment_columns(content.read(columns=[*names]), surfel_map)
-            surfel_map.insert(checked_moments(columns, surfel_map, 'rows'))
-    except FileFormatError:
-        raise
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except Exception as error:  # of pyarrow, and of attributes of any size and type
-        raise FileFormatError(f'{path}: damaged, or not what write_map wrote: {error}') from error
-    actual = surfel_map.digest()
-    if actual != attributes.get('digest'):
-        raise FileFormatError(
-            f'{path}: damaged: digest {actual}, expected {attributes.get("digest")}'
-        )
+    with refusing(path), map_errors(path), open_regular(path) as file:
+        content = parquet.ParquetFile(file)
+        attributes = read_attributes(path, content.schema_arrow.metadata or {})
+        surfel_map = empty_map(path, attributes, voxel_size_m)
+        in_file = content.schema_arrow.names
+        names = moment_names(surfel_map, in_file)
+        unknown = {*in_file} - {*names, *DERIVED, *QUALITY, *COVARIANCE}
+        if unknown:
+            raise ValueError(f'unknown columns {sorted(unknown)}')
+        columns = moment_columns(content.read(columns=[*names]), surfel_map)
+        surfel_map.insert(checked_moments(columns, surfel_map, 'rows'))
+    check_digest(path, attributes, surfel_map)
     return surfel_map
 
 
@@ -215,23 +209,6 @@ def read_attributes(path: str | Path, metadata: Mapping[bytes, bytes]) -> dict[s
             f'version {VERSION}'
         )
     return attributes
-
-
-def map_of(
-    attributes: Mapping[str, Any], voxel_size_m: float | None, path: str | Path
-) -> SurfelMap:
-    """Return an empty map with the attributes of a file."""
-    found_m = attributes['voxel_size_m']
-    if voxel_size_m is not None and found_m != voxel_size_m:
-        raise FileFormatError(
-            f'{path}: voxel size {found_m} m, expected map.voxel_size_m = {voxel_size_m} m'
-        )
-    return SurfelMap(
-        found_m,
-        columns=tuple(attributes['columns']),
-        level=attributes['level'],
-        origin_m=attributes.get('origin_m', NO_ORIGIN),
-    )
 
 
 def int64_column(table: Any, name: str) -> npt.NDArray[np.int64]:

@@ -29,9 +29,9 @@ import numpy.typing as npt
 
 from surfel_mapper.arguments import MAX_SQUARE_ERROR
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import check_names, replace_file
-from surfel_mapper.files.point_columns import Columns, RGB
+from surfel_mapper.files.point_columns import Columns, RGB, table_of
 from surfel_mapper.files.text_table import read_table
 from surfel_mapper.libraries import library
 from surfel_mapper.mapping.surfels import file_positions, packed_rgb, surfel_columns
@@ -122,10 +122,7 @@ def write_points(
     if columns.keys() >= {*RGB} and all(columns[name].dtype == np.uint8 for name in RGB):
         rgb = packed_rgb(*(columns[name] for name in RGB))
         columns = {**{k: v for k, v in columns.items() if k not in RGB}, 'rgb': rgb}
-    layout = np.dtype([(name, v.dtype.newbyteorder('<')) for name, v in columns.items()])
-    table = np.empty(len(next(iter(columns.values()))), layout)
-    for name, values in columns.items():
-        table[name] = values
+    table = table_of(columns)
     types = [values.dtype for values in columns.values()]
     header = (
         '# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n'
@@ -153,21 +150,16 @@ def read_points(path: str | Path) -> Columns:
         If it is binary_compressed and the module lzf is not installed.
 
     """
-    try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            header = read_header(path, file)
-            num_bytes = size - file.tell()
-            if header.encoding == 'binary_compressed':
-                return compressed_columns(path, header, file)
-            if header.encoding == 'binary':
-                table = binary_table(path, header, file, num_bytes)
-            else:
-                table = read_table(path, file, header.layout, header.num_points)
-            names = header.layout.names or ()
-            return {name: np.ascontiguousarray(table[name]) for name in names}
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    with refusing(path), open_regular(path) as file:
+        header = read_header(path, file)
+        if header.encoding == 'binary_compressed':
+            return compressed_columns(path, header, file)
+        if header.encoding == 'binary':
+            table = binary_table(path, header, file)
+        else:
+            table = read_table(path, file, header.layout, header.num_points)
+        names = header.layout.names or ()
+        return {name: np.ascontiguousarray(table[name]) for name in names}
 
 
 def read_viewpoint(path: str | Path) -> tuple[float, ...]:
@@ -180,11 +172,8 @@ def read_viewpoint(path: str | Path) -> tuple[float, ...]:
         If the file cannot be read or is not a PCD.
 
     """
-    try:
-        with open_regular(path) as file:
-            return read_header(path, file).viewpoint
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    with refusing(path), open_regular(path) as file:
+        return read_header(path, file).viewpoint
 
 
 def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
@@ -235,10 +224,9 @@ def field_of(name: str, kind: str, size: int, count: int, number: int) -> tuple[
     return (unique, code) if count == 1 else (unique, code, (count,))
 
 
-def binary_table(
-    path: str | Path, header: PcdHeader, file: BinaryIO, num_bytes: int
-) -> npt.NDArray[Any]:
+def binary_table(path: str | Path, header: PcdHeader, file: BinaryIO) -> npt.NDArray[Any]:
     """Return the points of an uncompressed file."""
+    num_bytes = os.fstat(file.fileno()).st_size - file.tell()
     size = header.num_points * header.layout.itemsize
     if size > num_bytes:
         raise FileFormatError(

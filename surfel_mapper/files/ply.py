@@ -21,16 +21,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 import os
 from pathlib import Path
-import struct
 from typing import Any, BinaryIO, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import check_names, replace_file
-from surfel_mapper.files.point_columns import Columns, RGB
+from surfel_mapper.files.point_columns import Columns, RGB, shape_columns, table_of
 from surfel_mapper.files.text_table import read_table
 from surfel_mapper.mapping.surfels import covariance_columns, file_positions, quality_columns
 
@@ -38,27 +37,16 @@ if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
     from surfel_mapper.tsdf.mesh import Mesh
 
-TYPES = {
-    'char': 'i1',
-    'uchar': 'u1',
-    'short': 'i2',
-    'ushort': 'u2',
-    'int': 'i4',
-    'uint': 'u4',
-    'float': 'f4',
-    'double': 'f8',
-    'int8': 'i1',
-    'uint8': 'u1',
-    'int16': 'i2',
-    'uint16': 'u2',
-    'int32': 'i4',
-    'uint32': 'u4',
-    'float32': 'f4',
-    'float64': 'f8',
-}
+CODES = ('i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8')
+
+OLD_NAMES = ('char', 'uchar', 'short', 'ushort', 'int', 'uint', 'float', 'double')
+
+NEW_NAMES = ('int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'float32', 'float64')
+
+TYPES = {**dict(zip(OLD_NAMES, CODES, strict=True)), **dict(zip(NEW_NAMES, CODES, strict=True))}
 """NumPy dtypes of the scalar types of PLY, each of which has an old and a new name."""
 
-NAMES = {np.dtype(TYPES[name]): name for name in list(TYPES)[:8]}
+NAMES = {np.dtype(code): name for name, code in zip(OLD_NAMES, CODES, strict=True)}
 
 ORDERS = {'binary_little_endian': '<', 'binary_big_endian': '>', 'ascii': '<'}
 
@@ -91,10 +79,7 @@ def write_surfels(
     """
     values = {
         **file_positions(path, surfels, origin_m),
-        **dict(zip(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32).T, strict=True)),
-        'planarity': surfels.planarity.astype(np.float32),
-        'curvature': surfels.curvature.astype(np.float32),
-        'num_points': surfels.num_points.astype(np.uint32),
+        **shape_columns(surfels),
         **quality_columns(surfels),
         **channel_columns(surfels),
         **covariance_columns(surfels),
@@ -143,10 +128,7 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
 
 def as_table(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[str, npt.NDArray[Any]]:
     """Return columns as the lines of a header and as a structured array."""
-    layout = np.dtype([(name, v.dtype.newbyteorder('<')) for name, v in columns.items()])
-    table = np.empty(len(next(iter(columns.values()))), layout)
-    for name, values in columns.items():
-        table[name] = values
+    table = table_of(columns)
     properties = ''.join(
         f'property {NAMES[values.dtype.newbyteorder("=")]} {name}\n'
         for name, values in columns.items()
@@ -199,8 +181,7 @@ def read_points(path: str | Path) -> Columns:
         If the file cannot be read, is not a PLY, has no vertices or is truncated.
 
     """
-    columns, _ = read_elements(path, ('vertex',))
-    return {name: values for name, values in columns['vertex'].items() if is_single(values)}
+    return read_elements(path, ('vertex',))['vertex']
 
 
 def read_mesh(path: str | Path) -> Mesh | None:
@@ -217,15 +198,13 @@ def read_mesh(path: str | Path) -> Mesh | None:
     """
     from surfel_mapper.tsdf.mesh import Mesh
 
-    elements, has_all = read_elements(path, ('vertex', 'face'))
-    columns = elements['vertex']
-    corners = [v for v in elements.get('face', {}).values() if not is_single(v)]
-    number = len(next(iter(columns.values())))
-    if not has_all or not any(map(len, elements['face'].values())):
+    elements = read_elements(path, ('vertex', 'face'))
+    columns, triangles = elements['vertex'], elements.get('face', {}).get('corners')
+    if triangles is None or not len(triangles):
         return None
-    if not corners or not {'x', 'y', 'z'} <= columns.keys():
-        raise FileFormatError(f'{path}: faces without a list of vertices, or no x, y, z')
-    triangles = fans(corners[0])
+    if not {'x', 'y', 'z'} <= columns.keys():
+        raise FileFormatError(f'{path}: faces, but no x, y, z of vertices')
+    number = len(columns['x'])
     if not ((triangles >= 0) & (triangles < number)).all():
         raise FileFormatError(f'{path}: faces with other than the {number} vertices')
     colours = [columns[name] for name in RGB if name in columns]
@@ -234,49 +213,72 @@ def read_mesh(path: str | Path) -> Mesh | None:
         vertices=np.stack([columns[name].astype(np.float64) for name in 'xyz'], axis=1),
         triangles=triangles.astype(np.int32),
         colors=np.stack(colours, axis=1) if is_coloured else np.empty((0, 3), np.uint8),
-        labels=columns['label'].astype(np.int32) if 'label' in columns else np.empty(0, np.int32),
+        labels=columns.get('label', np.empty(0)).astype(np.int32),
     )
 
 
-def is_single(values: npt.NDArray[Any]) -> bool:
-    """Return whether a property has one value a row; lists have several, or are objects."""
-    return values.ndim == 1 and values.dtype != object
-
-
-def fans(corners: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    """Return the triangles (T, 3) of faces with corners (F, C), or (F,) objects of any number."""
-    if corners.dtype == object:
-        rows = [(face[0], *pair) for face in corners for pair in pairwise(face[1:])]
-        return np.array(rows, np.int64).reshape(-1, 3)
-    columns = [[0, k, k + 1] for k in range(1, corners.shape[1] - 1)]
-    return corners[:, columns].reshape(-1, 3).astype(np.int64)
-
-
-def read_elements(path: str | Path, wanted: Sequence[str]) -> tuple[dict[str, Columns], bool]:
-    """Return elements up to the last wanted one, and whether all of these are in the file."""
+def read_elements(path: str | Path, wanted: Sequence[str]) -> dict[str, Columns]:
+    """Return the elements of a file up to the last wanted one; those of faces as triangles."""
     tables: dict[str, Columns] = {}
-    try:
-        with open_regular(path) as file:
-            elements, is_text = read_header(path, file)
-            size = os.fstat(file.fileno()).st_size
-            for element in elements:
-                is_last = element is elements[-1]
-                check_size(path, element, size - file.tell(), is_text=is_text, is_last=is_last)
-                if element.has_lists:
-                    tables[element.name] = list_columns(path, file, element, is_text=is_text)
-                    continue
-                if is_text:
-                    layout, count = element.layout, element.count
-                    table = read_table(path, file, layout, count, is_last=is_last)
-                else:
-                    content = file.read(element.count * element.layout.itemsize)
-                    table = np.frombuffer(content, element.layout)
-                tables[element.name] = native(table)
-                if {*wanted} <= tables.keys():
-                    break
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    return tables, {*wanted} <= tables.keys()
+    with refusing(path), open_regular(path) as file:
+        elements, is_text = read_header(path, file)
+        size = os.fstat(file.fileno()).st_size
+        for element in elements:
+            is_last = element is elements[-1]
+            check_size(path, element, size - file.tell(), is_text=is_text, is_last=is_last)
+            if element.name == 'face' and 'face' in wanted:
+                tables['face'] = {'corners': read_faces(path, file, element, is_text=is_text)}
+            else:
+                columns = read_columns(path, file, element, is_text=is_text, is_last=is_last)
+                tables[element.name] = columns
+            if {*wanted} <= tables.keys():
+                break
+    return tables
+
+
+def read_columns(
+    path: str | Path, file: BinaryIO, element: Element, *, is_text: bool, is_last: bool
+) -> Columns:
+    """Return the properties of the next element of a file, without those that are lists."""
+    if element.has_lists:
+        singles = [(n, t) for n, t, length in element.properties if length is None]
+        at = [row for row, (_, _, length) in enumerate(element.properties) if length is None]
+        rows = list_rows(path, file, element, is_text=is_text)
+        return native(np.array([tuple(row[k] for k in at) for row in rows], np.dtype(singles)))
+    if is_text:
+        return native(read_table(path, file, element.layout, element.count, is_last=is_last))
+    content = file.read(element.count * element.layout.itemsize)
+    return native(np.frombuffer(content, element.layout))
+
+
+def read_faces(
+    path: str | Path, file: BinaryIO, element: Element, *, is_text: bool
+) -> npt.NDArray[Any]:
+    """Return the triangles (T, 3) of the next element, whose first list has the corners."""
+    lists = [at for at, (_, _, length) in enumerate(element.properties) if length is not None]
+    if not lists:
+        raise FileFormatError(f'{path}: faces without a list of vertices')
+    if not is_text and (table := rows_of_three(file, element)) is not None:
+        return np.asarray(table[element.properties[lists[0]][0]])
+    faces = [row[lists[0]] for row in list_rows(path, file, element, is_text=is_text)]
+    fans = [(face[0], *pair) for face in faces for pair in pairwise(face[1:])]
+    return np.array(fans, np.int64).reshape(-1, 3)
+
+
+def rows_of_three(file: BinaryIO, element: Element) -> npt.NDArray[Any] | None:
+    """Return the rows of a binary element as a table; None if a list has not three values."""
+    fields: list[Any] = []
+    for name, type_, length in element.properties:
+        fields += [(name, type_)] if length is None else []
+        fields += [] if length is None else [(f'{name} length', length), (name, type_, (3,))]
+    start, layout = file.tell(), np.dtype(fields)
+    content = file.read(element.count * layout.itemsize)
+    if len(content) == element.count * layout.itemsize:
+        table = np.frombuffer(content, layout)
+        if all((table[n] == 3).all() for n in layout.names or () if n.endswith(' length')):
+            return table
+    file.seek(start)
+    return None
 
 
 def native(table: npt.NDArray[Any]) -> Columns:
@@ -287,85 +289,50 @@ def native(table: npt.NDArray[Any]) -> Columns:
     }
 
 
-def list_columns(path: str | Path, file: BinaryIO, element: Element, *, is_text: bool) -> Columns:
-    """Return the properties of an element with lists: (K, C) for lists of C values, or objects."""
-    start = file.tell()
-    if not is_text and (table := equal_rows(file, element)) is not None:
-        lengths = {f'{name} length' for name, _, _ in element.properties}
-        return {name: v for name, v in native(table).items() if name not in lengths}
-    file.seek(start)
+def list_rows(
+    path: str | Path, file: BinaryIO, element: Element, *, is_text: bool
+) -> list[list[Any]]:
+    """Return the rows of an element with lists, each a list of numbers and of arrays or lists."""
     read_row = text_row if is_text else binary_row
     try:
-        rows = [read_row(file, element) for _ in range(element.count)]
-    except (ValueError, IndexError, struct.error) as error:
+        return [read_row(file, element) for _ in range(element.count)]
+    except (ValueError, IndexError) as error:
         raise FileFormatError(
             f'{path}: {element.count} x {element.name}: other numbers than stated; truncated?'
         ) from error
-    columns: Columns = {}
-    for at, (name, type_, length) in enumerate(element.properties):
-        values = [row[at] for row in rows]
-        is_equal = length is None or len({len(row) for row in values}) == 1
-        if is_equal:
-            columns[name] = np.array(values).astype(type_.newbyteorder('='))
-        else:
-            columns[name] = np.empty(len(rows), object)
-            columns[name][:] = values
-    return columns
-
-
-def equal_rows(file: BinaryIO, element: Element) -> npt.NDArray[Any] | None:
-    """Return the rows of a binary element as a table; None if their lists differ in length."""
-    start = file.tell()
-    try:
-        row = binary_row(file, element) if element.count else []
-    except (ValueError, struct.error):
-        return None
-    fields: list[Any] = []
-    for (name, type_, length), value in zip(element.properties, row, strict=False):
-        if length is not None:
-            fields.append((f'{name} length', length))
-        fields.append((name, type_) if length is None else (name, type_, (len(value),)))
-    layout = np.dtype(fields)
-    file.seek(start)
-    content = file.read(element.count * layout.itemsize)
-    if not fields or len(content) < element.count * layout.itemsize:
-        return None
-    table = np.frombuffer(content, layout)
-    lengths = [table[name] for name in layout.names or () if name.endswith(' length')]
-    return table if all((values == values[0]).all() for values in lengths) else None
 
 
 def binary_row(file: BinaryIO, element: Element) -> list[Any]:
-    """Return the values of the next row, a tuple for a list."""
+    """Return the values of the next row, an array for a list."""
     row: list[Any] = []
     for _, type_, length in element.properties:
-        number = 1 if length is None else unpack(file, length, 1)[0]
+        number = 1 if length is None else int(unpack(file, length, 1)[0])
         values = unpack(file, type_, number)
         row.append(values[0] if length is None else values)
     return row
 
 
-def unpack(file: BinaryIO, type_: np.dtype[Any], number: int) -> tuple[Any, ...]:
+def unpack(file: BinaryIO, type_: np.dtype[Any], number: int) -> npt.NDArray[Any]:
     """Return a number of values of a type; raise ValueError if there cannot be as many."""
     if not 0 <= number <= MAX_LIST:
         raise ValueError(f'a list of {number}')
-    order = '>' if type_.str[0] == '>' else '<'
-    return struct.unpack(f'{order}{number}{type_.char}', file.read(number * type_.itemsize))
+    return np.frombuffer(file.read(number * type_.itemsize), type_, number)
 
 
 def text_row(file: BinaryIO, element: Element) -> list[Any]:
     """Return the values of the next line, a list for a list."""
-    words, row, at = list(map(float, file.readline().split())), list[Any](), 0
+    words, row = list(map(float, file.readline().split())), list[Any]()
     for _, _, length in element.properties:
         if length is None:
-            row.append(words[at])
-            at += 1
+            row.append(words.pop(0))
             continue
-        number = int(words[at])
-        row.append(words[at + 1 : at + 1 + number])
-        at += 1 + number
-    if len(words) != at:
-        raise ValueError(f'{len(words)} numbers, expected {at}')
+        number = int(words[0])
+        if not 0 <= number < len(words):
+            raise ValueError(f'a list of {number}')
+        row.append(words[1 : 1 + number])
+        del words[: 1 + number]
+    if words:
+        raise ValueError(f'{len(words)} numbers too many')
     return row
 
 

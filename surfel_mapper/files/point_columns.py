@@ -10,10 +10,13 @@ A colour is the column ``rgb``, (N, 3) uint8, whatever the file has: red green b
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from surfel_mapper.mapping.surfels import Surfels
 
 Columns = dict[str, npt.NDArray[Any]]
 
@@ -28,6 +31,33 @@ NORMALS = ('nx', 'ny', 'nz')
 
 NORMAL_NAMES = (NORMALS, ('normal_x', 'normal_y', 'normal_z'))
 """Names of normals in files."""
+
+
+def shape_columns(surfels: Surfels) -> Columns:
+    """Return normal, planarity and curvature of surfels, float32, and their points, uint32."""
+    return {
+        **dict(zip(NORMALS, surfels.normal.astype(np.float32).T, strict=True)),
+        'planarity': surfels.planarity.astype(np.float32),
+        'curvature': surfels.curvature.astype(np.float32),
+        'num_points': surfels.num_points.astype(np.uint32),
+    }
+
+
+def normals_in(columns: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float64] | None:
+    """Return the normals in the columns of a file, (N, 3); None without."""
+    for names in NORMAL_NAMES:
+        if columns.keys() >= {*names}:
+            return np.column_stack([columns[name] for name in names]).astype(np.float64)
+    return None
+
+
+def table_of(columns: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """Return columns of equal length as a structured array of little endian values."""
+    layout = np.dtype([(name, v.dtype.newbyteorder('<')) for name, v in columns.items()])
+    table = np.empty(len(next(iter(columns.values()))), layout)
+    for name, values in columns.items():
+        table[name] = values
+    return table
 
 
 def named_columns(table: npt.NDArray[Any]) -> Columns:

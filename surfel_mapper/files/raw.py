@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, refusing
 
 WIDTHS = (4, 3, 5, 6)
 """Numbers of columns in the order of preference: KITTI's first."""
@@ -192,14 +192,10 @@ def read_raw(path: Path, layout: RawLayout) -> npt.NDArray[Any]:
         If it cannot be read, or has a part of a point.
 
     """
-    try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            if size % layout.point_bytes:
-                raise FileFormatError(
-                    f'{path}: {size} bytes, expected {layout.point_bytes} for every point '
-                    f'({layout})'
-                )
-            return np.fromfile(file, layout.type_).reshape(-1, layout.width)
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    with refusing(path), open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size % layout.point_bytes:
+            raise FileFormatError(
+                f'{path}: {size} bytes, expected {layout.point_bytes} for every point ({layout})'
+            )
+        return np.fromfile(file, layout.type_).reshape(-1, layout.width)

@@ -43,7 +43,6 @@ def save_state(
     attributes: Mapping[str, Any],
     *,
     compress: bool = False,
-    lasting: bool = True,
 ) -> None:
     """
     Write arrays and attributes to a file, atomically.
@@ -58,8 +57,6 @@ def save_state(
         JSON values; tuples come back as lists.
     compress : bool
         Compress with zlib: a map gets 1.7 times smaller and takes 4 times as long.
-    lasting : bool
-        Whether to wait until the bytes are on the disk; False for temporary files.
 
     Raises
     ------
@@ -86,7 +83,7 @@ def save_state(
         ],
     }
     manifest['sha256'] = content_sha256(manifest, contiguous.values())
-    with replace_file(path, lasting=lasting) as file:
+    with replace_file(path) as file:
         write_archive(
             file, manifest, contiguous, zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
         )
@@ -129,7 +126,7 @@ def load_state(path: str | Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str,
         If the file cannot be read, is of another format or version, or is damaged.
 
     """
-    with refusing(path, FileFormatError), open_regular(path) as file:
+    with refusing(path), open_regular(path) as file:
         try:
             with zipfile.ZipFile(file) as archive:
                 return read_archive(path, archive)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.point_columns import Columns, named_columns
 
 ALWAYS = ('.xyz', '.xyzrgb', '.xyzn', '.pts', '.asc')
@@ -94,7 +94,7 @@ def read_points(path: str | Path) -> Columns:
         If it cannot be read, has no row of three numbers, rows of several lengths, or poses.
 
     """
-    try:
+    with refusing(path):
         layout = text_layout(Path(path))
         if layout is None or not layout.is_points:
             seen = '' if layout is None else f'{layout.width} columns {", ".join(layout.names)}'
@@ -112,10 +112,6 @@ def read_points(path: str | Path) -> Columns:
                 usecols=range(layout.width),
                 encoding='utf-8-sig',
             )
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except (ValueError, MemoryError) as error:
-        raise FileFormatError(f'{path}: {error}') from error
     if layout.names:
         columns = dict(zip(layout.names, np.ascontiguousarray(table.T), strict=True))
         return {name: values for name, values in columns.items() if name}  # pandas' index has none

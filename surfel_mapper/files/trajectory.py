@@ -5,7 +5,7 @@ Trajectories as text: reading those of most programs, writing TUM.
 
 A line is a pose: a stamp or nothing, x y z and a quaternion, or a matrix; the first line decides.
 Read are TUM (with an id behind it: RTAB-Map; in nanoseconds: ORB-SLAM3), KITTI, matrices of four
-rows (Replica) in a line or in four (Redwood, 7-Scenes), KITTI-360 with the number of the scan
+rows in a line (Replica), KITTI-360 with the number of the scan
 before them, g2o's VERTEX_SE3, and CSV with names of its columns (EuRoC, Newer College).
 
 Coordinates are written with the digits that restore the same float64, stamps with all nanoseconds
@@ -34,7 +34,7 @@ from surfel_mapper.files.text_table import read_lines, Rows, table_rows, TextLin
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw, quaternions
 from surfel_mapper.poses.buffer import seconds
 
-SUFFIXES = ('.tum', '.txt', '.csv', '.kitti', '.g2o', '.log')
+SUFFIXES = ('.tum', '.txt', '.csv', '.kitti', '.g2o')
 """Endings of trajectories."""
 
 FORMATS = ('tum', 'kitti', 'csv', 'g2o')
@@ -198,17 +198,11 @@ class Trajectory:
             raise ValueError(f'T_fixed_sensor: shape {poses.shape}, expected (S, 4, 4)')
         for row, pose in enumerate(poses):
             check_rigid(f'T_fixed_sensor[{row}]', pose)
-        stamps = None if stamp_ns is None else as_array('stamp_ns', stamp_ns)
-        if stamps is not None:
-            if stamps.dtype.kind not in 'iu':
-                raise ValueError(f'stamp_ns: {stamps.dtype}, expected whole nanoseconds (int64)')
-            if stamps.shape != poses.shape[:1] or (np.diff(stamps.astype(np.int64)) <= 0).any():
-                raise ValueError(
-                    f'stamp_ns: shape {stamps.shape}, expected ({len(poses)},), ascending'
-                )
-            stamps = stamps.astype(np.int64)
         turns = np.array([q_xyzw(pose) for pose in poses]).reshape(-1, 4)
-        return cls(stamps, poses[:, :3, 3].copy(), turns)
+        trajectory = cls(stamp_ns, poses[:, :3, 3].copy(), turns)  # type: ignore[arg-type]
+        if trajectory.stamp_ns is not None and (np.diff(trajectory.stamp_ns) <= 0).any():
+            raise ValueError('stamp_ns: expected ascending stamps')
+        return trajectory
 
     @property
     def matrices(self) -> npt.NDArray[np.float64]:
@@ -296,9 +290,8 @@ def trajectory_beside(path: Path) -> Path | None:
 
 
 def guessed(path: str | Path, texts: Sequence[str]) -> str:
-    """Return the format that the first line looks like; before a matrix it may have 3 numbers."""
-    is_headed = len(texts[0].split()) == 3 and len(texts) > 4
-    line = texts[1 if is_headed else 0]
+    """Return the format that the first line looks like."""
+    line = texts[0]
     words = line.split()
     if words[0].startswith(('VERTEX', 'EDGE', 'FIX', 'PARAMS')):
         return 'g2o'
@@ -306,11 +299,11 @@ def guessed(path: str | Path, texts: Sequence[str]) -> str:
         return 'csv'
     if len(words) in (TUM, RTABMAP):
         return 'tum'
-    if len(words) not in (4, *MATRICES):
+    if len(words) not in MATRICES:
         raise FileFormatError(
             f'{path}: {len(words)} columns in the first line, expected 8 (TUM; 9 with an id), 12 '
             '(KITTI) or 16 (4 x 4) of a matrix, 13 or 17 with the number of the scan before it '
-            f'(KITTI-360), four lines of 4, commas (CSV), or {VERTEX} (g2o)'
+            f'(KITTI-360), commas (CSV), or {VERTEX} (g2o)'
         )
     return 'kitti'
 
@@ -395,9 +388,7 @@ def column_name(text: str) -> tuple[str, str]:
 
 
 def matrix_poses(lines: TextLines) -> Trajectory:
-    """Return the poses of a file of matrices, in a line each, perhaps numbered, or in four."""
-    if len(lines.texts[0].split()) in (3, 4):
-        lines = joined_by_four(lines)
+    """Return the poses of a file of matrices, in a line each, perhaps numbered."""
     width = len(lines.texts[0].split())
     rows = table_rows(lines, width if width in MATRICES else 12, meaning=': 3 or 4 rows of 4')
     first = width % 4
@@ -410,17 +401,6 @@ def matrix_poses(lines: TextLines) -> Trajectory:
         return numbered_poses(table, rows.numbers([0])[:, 0].astype(np.int64))
     stamps = kitti_stamps(Path(lines.path).with_name(KITTI_TIMES), len(poses))
     return Trajectory(stamps, table[:, :3], table[:, 3:])
-
-
-def joined_by_four(lines: TextLines) -> TextLines:
-    """Return matrices of four lines as a line each, without the three numbers that Redwood has."""
-    at = [row for row, text in enumerate(lines.texts) if len(text.split()) != 3]
-    if len(at) % 4 or not at:
-        raise FileFormatError(
-            f'{lines.path}: {len(at)} lines of a matrix, expected four for each pose'
-        )
-    texts = [' '.join(lines.texts[row] for row in at[k : k + 4]) for k in range(0, len(at), 4)]
-    return TextLines(lines.path, [lines.numbers[row] for row in at[::4]], texts)
 
 
 def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:

@@ -14,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.libraries import library
 
@@ -46,16 +46,9 @@ def read_triangles(path: Path) -> Mesh:
     from surfel_mapper.tsdf.mesh import Mesh
 
     trimesh = import_trimesh()
-    try:
-        with open_regular(path):  # a pipe would block
-            scene = trimesh.load_scene(path, process=False)
+    with refusing(path), open_regular(path):  # a pipe would block
+        scene = trimesh.load_scene(path, process=False)
         mesh = scene.to_mesh() if scene.geometry else trimesh.Trimesh()
-    except MemoryError:
-        raise
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except Exception as error:  # those of many decoders
-        raise FileFormatError(f'{path}: no {path.suffix[1:]} file: {error}') from error
     if not len(mesh.faces):
         raise FileFormatError(f'{path}: no triangles')
     if path.suffix.lower() in GLTF:

@@ -112,7 +112,7 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
                 f'{path}: {name} {value}, expected layers.tsdf.{name} = {wanted}'
             )
     blocks = BlockMap(config)
-    with refusing(path, FileFormatError):
+    with refusing(path):
         content = checked(blocks, arrays)
     blocks.insert(content)
     return blocks

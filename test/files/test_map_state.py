@@ -89,7 +89,7 @@ def test_frames_that_are_not_those_of_the_scans_are_refused(tmp_path, frame_ids)
     save_map(tmp_path / 'map.npz', *driven())
     arrays, attributes = load_state(tmp_path / 'map.npz')
     save_state(tmp_path / 'map.npz', arrays, {**attributes, 'frame_ids': frame_ids})
-    with pytest.raises(FileFormatError, match=r'damaged: .*frames'):
+    with pytest.raises(FileFormatError, match=r'damaged, .*frames'):
         load_map(tmp_path / 'map.npz')
 
 

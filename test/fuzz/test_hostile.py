@@ -29,10 +29,10 @@ from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns, parse_
 from surfel_mapper.messages.poses import raw_poses
 
 
-@pytest.mark.parametrize('error', [OverflowError('x'), MemoryError(), AttributeError('a\nb')])
+@pytest.mark.parametrize('error', [OverflowError('x'), AttributeError('a\nb')])
 def test_any_exception_of_a_parser_becomes_an_error_of_its_reader(error):
-    expected = pytest.raises(FileFormatError, match=f'a.npz: damaged: {type(error).__name__}')
-    with expected as caught, refusing('a.npz', FileFormatError):
+    expected = pytest.raises(FileFormatError, match=f'a.npz: damaged, .*{type(error).__name__}')
+    with expected as caught, refusing('a.npz'):
         raise error
     assert caught.value.__cause__ is error
     assert '\n' not in str(caught.value)
