@@ -12,23 +12,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-import fcntl
 import json
 import math
 import os
 from pathlib import Path
 import re
-import secrets
+import shutil
+import tempfile
 from typing import Any, BinaryIO
 
 from surfel_mapper.errors import FileFormatError
 
 PART = '.surfel_mapper-'
-"""Start of the names of temporary files, which end with ``.part``."""
+"""Start of the name of a temporary file: one that a killed process leaves is written again."""
 
 
 @contextmanager
-def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO]:
+def replace_file(path: str | Path) -> Iterator[BinaryIO]:
     """
     Open a binary file that replaces ``path`` at the end of the block, and is removed on an error.
 
@@ -37,8 +37,6 @@ def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO
     path : str or Path
         The target; of a symbolic link, the file that it leads to. The directory must exist. The
         permissions of the new file follow the umask.
-    lasting : bool
-        Whether to wait until the bytes are on the disk; False for temporary files.
 
     Raises
     ------
@@ -50,46 +48,50 @@ def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO
     target = Path(os.path.realpath(path))
     if os.path.exists(target) and not os.path.isfile(target):
         raise FileFormatError(f'{path}: not a regular file, expected one, or a new name')
-    temporary = target.with_name(f'{PART}{secrets.token_hex(8)}.part')
+    temporary = target.with_name(f'{PART}{target.name}.part')
     try:
-        file = open(temporary, 'x+b')  # noqa: SIM115 - closed before it is renamed
-    except OSError as error:
-        raise cannot_write(path, error) from error
-    except BaseException:  # without memory for the object: the file has been made
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
-    try:
-        with file:
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        temporary.unlink(missing_ok=True)  # of a killed process, or a link that is a trap
+        with open(temporary, 'x+b') as file:
             yield file
             file.flush()
-            if lasting:
-                os.fsync(file.fileno())
+            os.fsync(file.fileno())
             os.replace(temporary, target)
-        if lasting:
-            sync_directory(target.parent)
+        sync(target.parent)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # there is none, or no such directory
+            temporary.unlink()
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
             raise cannot_write(path, error) from error
         raise
 
 
-def remove_abandoned(directory: Path) -> list[Path]:
-    """Remove the temporary files of processes that have died, which hold no lock; return them."""
-    removed = []
-    for path in directory.glob(f'{PART}*.part'):
-        with suppress(OSError):  # locked, gone, or a link
-            file = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                path.unlink()
-                removed.append(path)
-            finally:
-                os.close(file)
-    return removed
+@contextmanager
+def replace_directory(path: Path) -> Iterator[Path]:
+    """
+    Yield the path of a directory to make, which replaces ``path`` at the end of the block.
+
+    It has the same name, in a hidden directory that is removed in any case. If it is not made, or
+    an error leaves the block, ``path`` stays as it is. Errors are raised unchanged.
+    """
+    hidden = Path(tempfile.mkdtemp(prefix=f'.{path.name}.', dir=path.parent))
+    fresh, replaced = hidden / path.name, hidden / f'{path.name}.replaced'
+    try:
+        yield fresh
+        if not fresh.exists():
+            return
+        for made in (*fresh.rglob('*'), fresh):
+            sync(made)
+        try:
+            if path.exists():
+                path.rename(replaced)
+            fresh.rename(path)
+        except BaseException:  # an interrupt too: the hidden directory is removed in any case
+            if replaced.exists() and not path.exists():
+                replaced.rename(path)
+            raise
+        sync(path.parent)
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
 
 
 def check_free(path: Path, overwrite: bool) -> None:
@@ -138,9 +140,9 @@ def nearest_directory(directory: Path) -> Path:
     return nearest
 
 
-def sync_directory(directory: Path) -> None:
-    """Wait until the names in a directory are on the disk, if the file system supports it."""
-    descriptor = os.open(directory, os.O_RDONLY)
+def sync(path: Path) -> None:
+    """Wait until a file, or the names in a directory, are on the disk, if that is supported."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         with suppress(OSError):  # some network file systems refuse
             os.fsync(descriptor)

@@ -11,17 +11,14 @@ write_map, so read_map reads it, and all tiles together are a dataset partitione
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 import re
-import secrets
-import shutil
 from typing import NamedTuple
 
 import numpy as np
 
 from surfel_mapper.errors import FileFormatError, MapError
-from surfel_mapper.files.atomic import make_directory, sync_directory
+from surfel_mapper.files.atomic import cannot_write, make_directory, replace_directory
 from surfel_mapper.files.parquet import read_map, write_map
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -102,16 +99,15 @@ def write_tiles(directory: str | Path, surfel_map: SurfelMap) -> None:
 
     """
     check_dataset(directory)
-    wanted = Path(directory).resolve()
-    fresh = wanted.with_name(f'.{wanted.name}-{secrets.token_hex(8)}.part')
+    path = Path(directory).resolve()
+    make_directory(path.parent)
     try:
-        for tile, content in tiles_of(surfel_map):
-            make_directory((fresh / tile.path).parent)
-            write_map(fresh / tile.path, content)
-        if fresh.exists():
-            take_name(fresh, wanted)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
+        with replace_directory(path) as fresh:
+            for tile, content in tiles_of(surfel_map):
+                make_directory((fresh / tile.path).parent)
+                write_map(fresh / tile.path, content)
+    except OSError as error:
+        raise cannot_write(directory, error) from error
 
 
 def tiles_of(surfel_map: SurfelMap) -> Iterator[tuple[Tile, SurfelMap]]:
@@ -120,12 +116,7 @@ def tiles_of(surfel_map: SurfelMap) -> Iterator[tuple[Tile, SurfelMap]]:
     index = unpack_keys(moments.key)[:, :2] >> TILE_BITS
     tiles, rows = np.unique(index, axis=0, return_inverse=True)
     for number, tile in enumerate(tiles.tolist()):
-        content = SurfelMap(
-            surfel_map.voxel_size_m,
-            columns=surfel_map.columns,
-            level=surfel_map.level,
-            origin_m=surfel_map.origin_m,
-        )
+        content = surfel_map.emptied()
         content.insert(moments.select(np.flatnonzero(rows.ravel() == number)))
         yield Tile(*tile), content
 
@@ -140,28 +131,3 @@ def check_dataset(directory: str | Path) -> None:
 def is_tiles(path: Path) -> bool:
     """Return whether a path in a dataset is a directory of tiles."""
     return path.is_dir() and path.name.startswith('tile_i=')
-
-
-def take_name(fresh: Path, wanted: Path) -> None:
-    """
-    Rename a finished dataset to the name wanted; an earlier dataset of this name is removed.
-
-    If that fails, or is interrupted before the name is taken, the earlier one has it again.
-    """
-    old = wanted.with_name(f'.{wanted.name}-{secrets.token_hex(8)}.old')
-    try:
-        for directory in (*fresh.iterdir(), fresh):  # those of the files are synced with them
-            sync_directory(directory)
-        try:
-            if wanted.exists():
-                wanted.rename(old)
-            fresh.rename(wanted)
-        except BaseException:
-            if old.exists() and not wanted.exists():
-                old.rename(wanted)
-            raise
-    except OSError as error:
-        raise FileFormatError(f'{wanted}: cannot be written: {error.strerror}') from error
-    with suppress(OSError):  # the new dataset has its name
-        sync_directory(wanted.parent)
-    shutil.rmtree(old, ignore_errors=True)

@@ -10,10 +10,12 @@ take them, and read back with the same bits. The file has no name and vanishes w
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import tempfile
+from threading import Lock
 from typing import Any
 import weakref
 
@@ -21,9 +23,6 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
-
-Layout = tuple[int, tuple[int, ...], np.dtype[Any]]
-"""Offset in the file, bytes; shape and type of an array."""
 
 
 class ScanSpool:
@@ -38,102 +37,69 @@ class ScanSpool:
     Raises
     ------
     FileFormatError
-        If no file can be made there.
+        If no file can be made there, or, later, it cannot be written or read.
 
     """
 
     def __init__(self, directory: str | Path = '') -> None:
         self._directory = str(directory) or tempfile.gettempdir()
-        try:
+        self._offsets: list[dict[str, int]] = []
+        self._lock = Lock()
+        with self._refusing('no file for the points of scans'):
             self._file = tempfile.TemporaryFile(dir=self._directory)  # noqa: SIM115  kept open
-        except OSError as error:
-            raise FileFormatError(
-                f'{self._directory}: no file for the points of scans: {error.strerror} '
-                '(loops.directory)'
-            ) from error
         weakref.finalize(self, self._file.close)
-        self._size = 0
-        self._layouts: list[dict[str, Layout]] = []
 
     def __len__(self) -> int:
         """Return the number of scans."""
-        return len(self._layouts)
+        return len(self._offsets)
 
     @property
     def nbytes(self) -> int:
         """Size of the file, bytes."""
-        return self._size
+        return os.fstat(self._file.fileno()).st_size
 
     def append(self, points: npt.NDArray[Any], columns: Mapping[str, npt.NDArray[Any]]) -> None:
         """
-        Add a scan.
+        Add a scan: points (N, 3), float32 or float64, and columns (N,).
 
-        Parameters
-        ----------
-        points : (N, 3) float32 or float64
-            The points.
-        columns : mapping of str to (N,) array
-            Columns of the points.
-
-        Raises
-        ------
-        FileFormatError
-            If the disk is full; the scan is not added then.
-
+        A scan that cannot be written, as the disk is full, is not added.
         """
-        start = self._size
-        arrays = {'': np.asarray(points).T, **{f'.{n}': a for n, a in columns.items()}}
-        try:
-            self._file.seek(start)
-            layout = {name: self._write(array) for name, array in arrays.items()}
-        except OSError as error:
-            self._size = start
-            raise FileFormatError(
-                f'{self._directory}: the points of scan {len(self)} cannot be written after '
-                f'{start / 1e9:.1f} GB: {error.strerror}; loops.directory names another disk'
-            ) from error
-        self._layouts.append(layout)
+        offsets = {}
+        with self._refusing(f'the points of scan {len(self)} cannot be written'), self._lock:
+            for name, array in {'': np.asarray(points).T, **columns}.items():
+                offsets[name] = self._file.seek(0, os.SEEK_END)
+                np.save(self._file, np.ascontiguousarray(array), allow_pickle=False)
+            self._file.flush()
+        self._offsets.append(offsets)
 
     def points(self, number: int) -> npt.NDArray[Any]:
         """Return the points of a scan, (N, 3), in Fortran order."""
-        array: npt.NDArray[Any] = self._read(self._layouts[number][''])
-        return np.asarray(array.T)
+        return self._read(self._offsets[number]['']).T
 
     def columns(self, number: int) -> dict[str, npt.NDArray[Any]]:
         """Return the columns of a scan."""
-        layout = self._layouts[number]
-        return {name[1:]: self._read(entry) for name, entry in layout.items() if name}
+        offsets = self._offsets[number]
+        return {name: self._read(offset) for name, offset in offsets.items() if name}
 
     def clear(self) -> None:
         """Forget all scans and free the disk."""
         self._file.truncate(0)
-        self._size = 0
-        self._layouts.clear()
+        self._offsets.clear()
 
-    def _write(self, array: npt.NDArray[Any]) -> Layout:
-        data = np.ascontiguousarray(array)
-        layout = (self._size, data.shape, data.dtype)
-        self._file.write(data.data.cast('B') if data.size else b'')
-        self._file.flush()
-        self._size += data.nbytes
-        return layout
+    def _read(self, offset: int) -> npt.NDArray[Any]:
+        """Return the array at an offset of the file."""
+        with self._refusing('points of scans cannot be read'), self._lock:
+            self._file.seek(offset)
+            array: npt.NDArray[Any] = np.load(self._file, allow_pickle=False)
+            return array
 
-    def _read(self, layout: Layout) -> npt.NDArray[Any]:
-        offset, shape, dtype = layout
-        array = np.empty(shape, dtype)
-        if array.size:
-            buffer = array.data.cast('B')
-            done = 0
-            while done < len(buffer):
-                try:
-                    num_read = os.preadv(self._file.fileno(), [buffer[done:]], offset + done)
-                except OSError as error:
-                    reason = f'{self._directory}: points of scans cannot be read: {error.strerror}'
-                    raise FileFormatError(reason) from error
-                if not num_read:
-                    raise FileFormatError(
-                        f'{self._directory}: the points of a scan end {len(buffer) - done} bytes '
-                        'early; was the disk full?'
-                    )
-                done += num_read
-        return array
+    @contextmanager
+    def _refusing(self, problem: str) -> Iterator[None]:
+        """Name the directory in errors of the system, and of arrays that are cut off."""
+        try:
+            yield
+        except (OSError, ValueError) as error:
+            raise FileFormatError(
+                f'{self._directory}: {problem}: {getattr(error, "strerror", None) or error}; '
+                'loops.directory names another disk'
+            ) from error
