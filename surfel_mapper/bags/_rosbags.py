@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from rosbags.rosbag2.storage_mcap import McapReader as McapReader
     from rosbags.typesys.store import Typestore as Typestore
 
+    IndexedBag = Rosbag1 | Rosbag2
+
 TRANSIENT_LOCAL = re.compile(r'durability:\s*(1|transient_local)\b', re.IGNORECASE)
 """Durability of a latched topic in the YAML of a bag: a number or a name, by its version."""
 
@@ -43,7 +45,7 @@ def import_rosbags() -> None:
     library('rosbags.rosbag2', 'knows the types of the messages in bags', 'rosbags')
 
 
-def open_indexed(path: Path) -> Rosbag1 | Rosbag2 | None:
+def open_indexed(path: Path) -> IndexedBag | None:
     """
     Return rosbags' reader of a file, opened; None for mcap without a whole index.
 

@@ -12,9 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from functools import lru_cache
 import logging
-import os
 from pathlib import Path
 from typing import Any
 
@@ -109,19 +107,11 @@ def metadata(directory: Path) -> Mapping[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        state = path.stat()
-        return information_in(path.absolute(), state.st_mtime_ns, state.st_size)
+        information = read_yaml(path, as_text=True)['rosbag2_bagfile_information']
+        if not isinstance(information, Mapping):
+            raise TypeError(f'rosbag2_bagfile_information is a {type(information).__name__}')
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise damaged_metadata(path, error) from error
-
-
-@lru_cache(maxsize=16)
-def information_in(path: Path, _mtime_ns: int, _size: int) -> Mapping[str, Any]:
-    """Return the content of a metadata.yaml, cached: parsing takes 10 ms."""
-    content = read_yaml(path, as_text=True)
-    information = content['rosbag2_bagfile_information']
-    if not isinstance(information, Mapping):
-        raise TypeError(f'rosbag2_bagfile_information is a {type(information).__name__}')
     return information
 
 
@@ -143,7 +133,7 @@ def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
         raise BagError(
             f'{directory / METADATA}: lists {", ".join(foreign)}, expected .mcap or .db3 files'
         )
-    return files if all(map(os.path.isfile, files)) else replaced_files(directory, files)
+    return files if all(map(Path.is_file, files)) else replaced_files(directory, files)
 
 
 def replaced_files(directory: Path, files: list[Path]) -> list[Path]:
@@ -156,22 +146,16 @@ def replaced_files(directory: Path, files: list[Path]) -> list[Path]:
         If there are fewer or more of them.
 
     """
-    present = [file for file in directory.iterdir() if is_storage(file)]
-    present = loose_files(directory) if present else present
-    by_name = {unpacked_name(file): file for file in present}
-    replaced = [by_name.get(unpacked_name(file)) for file in files]
-    if len(present) == len(files) and None in replaced:
-        replaced = [*present]
-    missing = ', '.join(file.name for file in files if not os.path.isfile(file))
-    if None in replaced:
-        hint = f'; without {METADATA} the rest is read: {", ".join(sorted(by_name))}'
+    present = loose_files(directory)
+    missing = ', '.join(file.name for file in files if not file.is_file())
+    names = ', '.join(file.name for file in present)
+    if len(present) != len(files):
         raise BagError(
-            f'{directory}: {missing} of its {METADATA} is missing{hint if present else ""}'
+            f'{directory}: {missing} of its {METADATA} is missing; without {METADATA} the rest is '
+            f'read: {names}'
         )
-    chosen = [file for file in replaced if file is not None]
-    names = ', '.join(file.name for file in chosen)
     _log.warning('%s: %s of its %s is missing; %s is read', directory, missing, METADATA, names)
-    return chosen
+    return present
 
 
 def loose_files(directory: Path) -> list[Path]:

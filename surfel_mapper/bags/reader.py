@@ -16,8 +16,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
+from functools import cache
 import heapq
-from itertools import islice
 import logging
 from pathlib import Path
 import tempfile
@@ -26,14 +26,16 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 from surfel_mapper.bags._rosbags import (
     is_latched,
     is_readable,
+    jazzy_types,
     member_names,
+    ros1_types,
+    ros2_hash,
     serialization,
     type_name,
 )
 from surfel_mapper.bags.compression import import_zstd, unpack_file, ZSTD_MAGIC
-from surfel_mapper.bags.decoders import Decoders
 from surfel_mapper.bags.paths import files_of, is_packed, stated_counts, unpacked_name
-from surfel_mapper.bags.storage import damaged, described, open_storage, Storage, suffix
+from surfel_mapper.bags.storage import damaged, described, open_storage
 from surfel_mapper.bags.streamed_mcap import StreamedMcap
 from surfel_mapper.bags.topics import CLOUD, SAME_AS, Topic, Topics
 from surfel_mapper.errors import BagError, SurfelMapperError
@@ -41,7 +43,8 @@ from surfel_mapper.messages.livox import MEMBERS, parse_livox
 from surfel_mapper.messages.pointcloud2 import parse_cloud
 
 if TYPE_CHECKING:
-    from surfel_mapper.bags._rosbags import Connection
+    from surfel_mapper.bags._rosbags import Connection, Typestore
+    from surfel_mapper.bags.storage import Storage
 
 LIVOX_PARSERS = dict.fromkeys(
     ('livox_ros_driver/msg/CustomMsg', 'livox_ros_driver2/msg/CustomMsg'), parse_livox
@@ -88,7 +91,6 @@ class BagReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.cuts: list[str] = []
-        self._latched: set[str] | None = None
         self._whole: dict[frozenset[str], list[BagMessage]] = {}
         self._storages: list[tuple[Path, Storage]] = []
         with ExitStack() as files:
@@ -98,7 +100,7 @@ class BagReader:
             self.topics = Topics(self.path, self._indexed_topics(), self._cloud_types())
             if not any(topic.count for topic in self.topics):
                 raise BagError(f'{self.path}: a bag without messages')
-            self._decoders = Decoders(self._connections, is_ros1=self.is_ros1)
+            self._decoder = cache(self._new_decoder)
             self._files = files.pop_all()
         for cut in self.cuts:
             log.warning(cut)
@@ -123,7 +125,7 @@ class BagReader:
 
     def is_latched(self, name: str) -> bool:
         """Return whether a topic is latched: late subscribers get its last messages."""
-        return name in self._latched_topics()
+        return any(c.topic == name and is_latched(c) for c in self._connections())
 
     def messages(
         self,
@@ -182,7 +184,7 @@ class BagReader:
         if parse is not None:
             return parse(message.raw, ros1=self.is_ros1, topic=message.topic)
         try:
-            store, type_ = self._decoders.find(message.type)
+            store, type_ = self._decoder(message.type)
             if self.is_ros1:
                 return store.deserialize_ros1(message.raw, type_)
             return store.deserialize_cdr(message.raw, type_)
@@ -204,11 +206,32 @@ class BagReader:
             If the messages are not CDR, or the bag has no definition that can be copied.
 
         """
+        if type_ in jazzy_types().fielddefs:
+            return None
         try:
-            return self._decoders.definition(type_)
+            connection = self._connection(type_)
+            if not is_readable(connection):
+                raise ValueError('its messages are not CDR')
+            if not connection.msgdef.data:
+                raise ValueError('the bag has no definition of it')
+            return connection.msgdef.data, ros2_hash(connection)
         except Exception as error:  # of a text from the bag
             reason = f'no definition of {error}' if isinstance(error, KeyError) else error
             raise BagError(f'{self.path}: {type_} cannot be copied: {reason}') from error
+
+    def _new_decoder(self, type_: str) -> tuple[Typestore, str]:
+        """Return type store and name of a type: Jazzy's, or those of a definition of ROS 1."""
+        if not self.is_ros1:
+            return jazzy_types(), type_
+        connection = self._connection(type_)
+        return ros1_types(connection), connection.msgtype
+
+    def _connection(self, type_: str) -> Connection:
+        """Return the first connection of a type; raise KeyError if there is none."""
+        for connection in self._connections():
+            if type_name(connection) == type_:
+                return connection
+        raise KeyError(type_)
 
     def _open(self, paths: list[Path], files: ExitStack) -> None:
         """Open the files of the bag; the last of several may be unreadable, as after a crash."""
@@ -243,12 +266,6 @@ class BagReader:
             size = path.stat().st_size
             self.cuts.append(f'{path}: the compressed file is cut off at byte {size}')
         return target
-
-    def _latched_topics(self) -> set[str]:
-        """Return the latched topics, found once."""
-        if self._latched is None:
-            self._latched = {c.topic for c in self._connections() if is_latched(c)}
-        return self._latched
 
     def _connections(self) -> Iterator[Connection]:
         """Yield the connections of all files."""
@@ -295,7 +312,7 @@ class BagReader:
             return
         unpack, done = import_zstd().decompress, 0
         try:
-            for connection, record_ns, raw in self._rows(path, storage, wanted, start_ns, stop_ns):
+            for connection, record_ns, raw in storage.messages(wanted, start_ns, stop_ns):
                 if raw[:4] == ZSTD_MAGIC and not self.is_ros1:
                     raw = unpack(raw)
                 type_ = SAME_AS.get(connection.msgtype, connection.msgtype)
@@ -305,39 +322,6 @@ class BagReader:
             raise
         except Exception as error:  # rosbags raises many types for damaged files
             raise damaged(path, f'damaged after {done} messages', error) from error
-
-    def _rows(
-        self,
-        path: Path,
-        storage: Storage,
-        wanted: list[Connection],
-        start_ns: int | None,
-        stop_ns: int | None,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield the messages of rosbags; from a damaged chunk of mcap on, those of its stream."""
-        done = 0
-        try:
-            for row in storage.messages(wanted, start_ns, stop_ns):
-                yield row
-                done += 1
-        except Exception:  # rosbags raises many types for damaged files
-            if suffix(path) != '.mcap' or isinstance(storage, StreamedMcap):
-                raise
-            streamed = self._open_stream(path, storage)
-            yield from islice(streamed.messages(wanted, start_ns, stop_ns), done, None)
-
-    def _open_stream(self, path: Path, storage: Storage) -> StreamedMcap:
-        """Replace rosbags' reader of an mcap file by the one that skips damaged chunks."""
-        streamed = StreamedMcap(storage.path)
-        self._files.callback(streamed.close)
-        self._storages = [
-            (name, streamed if opened is storage else opened) for name, opened in self._storages
-        ]
-        for loss in streamed.losses(path):
-            if loss not in self.cuts:  # of an iterator begun earlier
-                self.cuts.append(loss)
-                log.warning(loss)
-        return streamed
 
     def _check_complete(self, read: Counter[str], names: Collection[str] | None) -> None:
         """Compare the number of messages read of each readable topic with the index."""

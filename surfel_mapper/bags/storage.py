@@ -9,10 +9,9 @@ exception that damaged files lead to becomes a BagError here.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
 from pathlib import Path
 import struct
-from typing import Any, Protocol, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from surfel_mapper.bags._rosbags import import_rosbags, open_indexed
 from surfel_mapper.bags.paths import is_ros1, unpacked_name
@@ -20,7 +19,9 @@ from surfel_mapper.bags.streamed_mcap import StreamedMcap
 from surfel_mapper.errors import BagError
 
 if TYPE_CHECKING:
-    from surfel_mapper.bags._rosbags import Connection
+    from surfel_mapper.bags._rosbags import IndexedBag
+
+    Storage = IndexedBag | StreamedMcap
 
 RECOVER = 'sqlite3 {0} .recover | sqlite3 mended.db3'
 
@@ -39,40 +40,6 @@ all rows if the upper pages of its tree are behind the cut.
 
 HEADER = struct.Struct('>H10xI')
 """Size and number of the pages of a database, at byte 16."""
-
-
-class Storage(Protocol):
-    """A reader of one file: those of rosbags, and StreamedMcap."""
-
-    path: Any
-    """The file."""
-
-    @property
-    def connections(self) -> list[Connection]:
-        """The topics, with the number of messages."""
-
-    @property
-    def message_count(self) -> int:
-        """Number of all messages."""
-
-    @property
-    def start_time(self) -> int:
-        """Record time of the first message."""
-
-    @property
-    def end_time(self) -> int:
-        """One after the record time of the last message."""
-
-    def messages(
-        self,
-        connections: Collection[Connection],
-        start: int | None = None,
-        stop: int | None = None,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield connection, record time and bytes of messages, in order of record time."""
-
-    def close(self) -> None:
-        """Close the file."""
 
 
 def open_storage(path: Path, named: Path) -> Storage:
@@ -106,11 +73,12 @@ def open_storage(path: Path, named: Path) -> Storage:
         streamed = StreamedMcap(path)
     except (OSError, ValueError) as error:
         raise damaged(named, 'cannot be read', error) from error
-    if streamed.message_count or (streamed.cut_at is None and not streamed.skipped_at):
+    if streamed.message_count or streamed.cut_at is None:
         return streamed
     streamed.close()
-    reason = streamed.skip_reason or f'no whole message before byte {streamed.cut_at}'
-    raise BagError(f'{named}: cannot be read: {reason}; {advice(named)}')
+    raise BagError(
+        f'{named}: cannot be read: no whole message before byte {streamed.cut_at}; {advice(named)}'
+    )
 
 
 def is_short(path: Path) -> bool:

@@ -6,7 +6,7 @@ Reading of mcap files without a usable index, record by record.
 A killed recorder, a full disk or an interrupted copy leaves a file without its index. rosbags
 refuses it. The StreamReader of the mcap package reads its whole records, so up to one chunk before
 the cut is lost. Opening the file counts the messages and checks each chunk; a damaged chunk is
-skipped and reported. Of a chunk only its offset and first record time are kept.
+taken for the cut. Of a chunk only its offset and first record time are kept.
 """
 
 from __future__ import annotations
@@ -44,10 +44,6 @@ class StreamedMcap:
         Bytes of the file.
     cut_at : int, optional
         Offset of the first record that is not whole; None if the file is complete.
-    skipped_at : list of int
-        Offsets of the damaged chunks, which are skipped.
-    skip_reason : str
-        Why the first of them is damaged.
     connections : list of Connection
         With the number of messages found.
     start_time, end_time : int
@@ -58,8 +54,6 @@ class StreamedMcap:
     def __init__(self, path: Path) -> None:
         library('mcap', 'reads mcap files that have no index', 'mcap')
         self.cut_at: int | None = None
-        self.skipped_at: list[int] = []
-        self.skip_reason = ''
         self.start_time, self.end_time = END_NS, 0
         self.path = path
         self.size = path.stat().st_size
@@ -99,19 +93,13 @@ class StreamedMcap:
                     heapq.heappush(waiting, (message.log_time, at, number, message))
 
     def losses(self, named: Path) -> list[str]:
-        """Return a sentence for the cut and one for the damaged chunks, if there are some."""
-        sentences = []
-        if self.cut_at is not None:
-            sentences.append(
-                f'{named}: the file is cut off or damaged at byte {self.cut_at} of {self.size}; '
-                f'the {self.message_count} messages found are read'
-            )
-        if self.skipped_at:
-            sentences.append(
-                f'{named}: {len(self.skipped_at)} damaged chunks are skipped, the first at byte '
-                f'{self.skipped_at[0]}: {self.skip_reason}'
-            )
-        return sentences
+        """Return a sentence for the cut, if the file is cut off."""
+        if self.cut_at is None:
+            return []
+        return [
+            f'{named}: the file is cut off or damaged at byte {self.cut_at} of {self.size}; '
+            f'the {self.message_count} messages found are read'
+        ]
 
     def _survey(self) -> None:
         """Note each whole record; raise ValueError if the file does not begin like mcap."""
@@ -130,15 +118,10 @@ class StreamedMcap:
             self.cut_at = at
 
     def _note(self, at: int, record: Any) -> None:
-        """Note schemas, channels and messages of a record; skip a damaged chunk."""
+        """Note schemas, channels and messages of a record; raise an error if it is damaged."""
         from mcap.records import Channel, Schema
 
-        try:
-            inner = opened(record)
-        except Exception as error:  # of decompression or damaged bytes, of many types
-            self.skipped_at.append(at)
-            self.skip_reason = self.skip_reason or str(error)
-            return
+        inner = opened(record)
         self._schemas.update((r.id, r) for r in inner if isinstance(r, Schema))
         self._channels.update((r.id, r) for r in inner if isinstance(r, Channel))
         messages = messages_among(inner)

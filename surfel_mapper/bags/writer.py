@@ -11,21 +11,18 @@ names the storage file after its directory, so the hidden directory contains one
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
-import os
+from contextlib import contextmanager, ExitStack, suppress
 from pathlib import Path
-import shutil
 import sqlite3
-import tempfile
 from typing import Any, TYPE_CHECKING
-
-import numpy as np
 
 from surfel_mapper.bags._rosbags import jazzy_types, latched_profile, new_writer
 from surfel_mapper.bags.paths import is_storage, METADATA
+from surfel_mapper.bags.topics import CLOUD, ODOMETRY, TF
 from surfel_mapper.errors import BagError
-from surfel_mapper.files.atomic import sync_directory, use_of
-from surfel_mapper.messages.pointcloud2 import CloudBytes
+from surfel_mapper.files.atomic import replace_directory, use_of
+from surfel_mapper.messages.cdr import MessageWriter, write_header
+from surfel_mapper.messages.pointcloud2 import cloud_bytes, CloudBytes
 from surfel_mapper.messages.poses import StampedPose
 
 if TYPE_CHECKING:
@@ -82,42 +79,25 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         """Begin the bag in a hidden directory beside its path."""
         self._store = jazzy_types()
-        with self._refusing():
-            self._missing = [p for p in self.path.parents if not p.exists()]
+        with self._refusing(), ExitStack() as hidden:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            prefix = f'.{self.path.name}.'
-            self._hidden = Path(tempfile.mkdtemp(prefix=prefix, dir=self.path.parent))
-            self.directory = self._hidden / self.path.name
+            self.directory = hidden.enter_context(replace_directory(self.path))
             self._writer = new_writer(self.directory, self.storage)
-            try:
-                self._writer.open()
-            except BaseException:
-                shutil.rmtree(self._hidden, ignore_errors=True)
-                raise
+            self._writer.open()
+            self._hidden = hidden.pop_all()
         return self
 
-    def __exit__(self, kind: object, *_: object) -> None:
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         """Give the bag its name, or remove the incomplete bag after an error."""
-        try:
-            if kind is not None:
-                with suppress(OSError, sqlite3.Error):  # a full disk; the first error says more
-                    self._writer.abort()
-                return
-            with self._refusing():
-                self._writer.close()
-                self._check_free()
-                self._take_name()
-        finally:
-            shutil.rmtree(self._hidden, ignore_errors=True)
-            self.directory = self.path
-            if not self.path.exists():
-                self._remove_parents()
-
-    def _remove_parents(self) -> None:
-        """Remove the parents that were created for the bag and are empty."""
-        for directory in self._missing:
-            with suppress(OSError):
-                directory.rmdir()
+        if kind is not None:
+            with suppress(OSError, sqlite3.Error):  # a full disk; the first error says more
+                self._writer.abort()
+            self._hidden.__exit__(kind, error, trace)
+            return
+        with self._refusing(), self._hidden:
+            self._writer.close()
+            self._check_free()
+        self.directory = self.path
 
     def write(
         self,
@@ -178,100 +158,26 @@ class BagWriter:
         latched: bool = False,
     ) -> None:
         """Append a sensor_msgs/PointCloud2."""
-        fields = [
-            self._new('sensor_msgs/msg/PointField', f.name, f.offset, f.datatype, f.count)
-            for f in cloud.fields
-        ]
-        message = self._new(
-            'sensor_msgs/msg/PointCloud2',
-            self._header(stamp_ns, frame_id),
-            cloud.height,
-            cloud.width,
-            fields,
-            cloud.is_bigendian,
-            cloud.point_step,
-            cloud.row_step,
-            cloud.data,
-            cloud.is_dense,
-        )
-        self._write_message(topic, record_ns, message, latched=latched)
+        raw = cloud_bytes(cloud, stamp_ns=stamp_ns, frame_id=frame_id)
+        self.write(topic, CLOUD, record_ns, raw, latched=latched)
 
     def write_transform(
         self, topic: str, record_ns: int, pose: StampedPose, *, latched: bool = False
     ) -> None:
         """Append a tf2_msgs/TFMessage with one transform; latched for static ones."""
-        transform = self._new(
-            'geometry_msgs/msg/TransformStamped',
-            self._header(pose.stamp_ns, pose.parent),
-            pose.child,
-            self._new(
-                'geometry_msgs/msg/Transform',
-                self._vector(pose.xyz),
-                self._quaternion(pose.q_xyzw),
-            ),
-        )
-        message = self._new('tf2_msgs/msg/TFMessage', [transform])
-        self._write_message(topic, record_ns, message, latched=latched)
+        message = MessageWriter()
+        message.numbers('I', 1)
+        write_pose(message, pose)
+        self.write(topic, TF, record_ns, message.join(), latched=latched)
 
     def write_odometry(
         self, topic: str, record_ns: int, pose: StampedPose, twist: Iterable[float]
     ) -> None:
         """Append a nav_msgs/Odometry; the twist in the child's frame, m/s and then rad/s."""
-        unknown = np.zeros(36)
-        position = self._new('geometry_msgs/msg/Point', *map(float, pose.xyz))
-        pose_msg = self._new('geometry_msgs/msg/Pose', position, self._quaternion(pose.q_xyzw))
-        v = tuple(twist)
-        twist_msg = self._new('geometry_msgs/msg/Twist', self._vector(v[:3]), self._vector(v[3:]))
-        message = self._new(
-            'nav_msgs/msg/Odometry',
-            self._header(pose.stamp_ns, pose.parent),
-            pose.child,
-            self._new('geometry_msgs/msg/PoseWithCovariance', pose_msg, unknown),
-            self._new('geometry_msgs/msg/TwistWithCovariance', twist_msg, unknown),
-        )
-        self._write_message(topic, record_ns, message)
-
-    def _take_name(self) -> None:
-        """Rename the hidden directory to the path; restore the former content if that fails."""
-        for file in self.directory.iterdir():
-            with open(file, 'rb') as written:
-                os.fsync(written.fileno())
-        sync_directory(self.directory)
-        replaced = self._hidden / 'replaced'
-        try:
-            if self.path.exists():
-                self.path.rename(replaced)
-            self.directory.rename(self.path)
-        except BaseException:  # an interrupt too: the hidden directory is removed in any case
-            if replaced.exists() and not self.path.exists():
-                replaced.rename(self.path)
-            raise
-        sync_directory(self.path.parent)
-
-    def _write_message(
-        self, topic: str, record_ns: int, message: Any, *, latched: bool = False
-    ) -> None:
-        """Serialise a message and append it."""
-        type_ = message.__msgtype__
-        raw = self._store.serialize_cdr(message, type_)
-        self.write(topic, type_, record_ns, raw, latched=latched)
-
-    def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        """Return a std_msgs/Header."""
-        stamp = self._new('builtin_interfaces/msg/Time', *divmod(stamp_ns, 10**9))
-        return self._new('std_msgs/msg/Header', stamp, frame_id)
-
-    def _vector(self, xyz: Iterable[float]) -> Any:
-        """Return a geometry_msgs/Vector3."""
-        return self._new('geometry_msgs/msg/Vector3', *map(float, xyz))
-
-    def _quaternion(self, q_xyzw: Iterable[float]) -> Any:
-        """Return a geometry_msgs/Quaternion."""
-        return self._new('geometry_msgs/msg/Quaternion', *map(float, q_xyzw))
-
-    def _new(self, type_: str, *values: Any) -> Any:
-        """Return a message with its fields in the order of its definition."""
-        return self._store.types[type_](*values)
+        message, unknown = MessageWriter(), [0.0] * 36
+        write_pose(message, pose)
+        message.numbers('d', *unknown, *twist, *unknown)
+        self.write(topic, ODOMETRY, record_ns, message.join())
 
     def _check_free(self) -> None:
         """Raise BagError if the path exists and may not be replaced."""
@@ -299,6 +205,13 @@ class BagWriter:
         except (OSError, sqlite3.Error) as error:
             reason = getattr(error, 'strerror', None) or error
             raise BagError(f'{self.path}: cannot be written: {reason}') from error
+
+
+def write_pose(message: MessageWriter, pose: StampedPose) -> None:
+    """Write header, child frame, position and quaternion."""
+    write_header(message, pose.stamp_ns, pose.parent)
+    message.string(pose.child)
+    message.numbers('d', *pose.xyz, *pose.q_xyzw)
 
 
 def is_of_bag(path: Path) -> bool:

@@ -202,24 +202,6 @@ def test_bad_input_is_refused_in_a_line_and_leaves_nothing(
     assert list((tmp_path / 'here').iterdir()) == []
 
 
-def test_a_bag_with_a_damaged_chunk_is_read_without_it_and_the_damage_told(
-    tmp_path, capsys, caplog
-):
-    path = write_mcap(tmp_path / 'drive.mcap', drive(), compression=CompressionType.NONE)
-    content = bytearray(path.read_bytes())
-    content[100_000] ^= 1  # in the second of six chunks
-    path.write_bytes(content)
-
-    assert main(['info', str(path), '--json', '--strict']) == 3
-    survey = json.loads(capsys.readouterr().out)
-    assert main(['replay', str(path), '--output', str(tmp_path / 'out')]) == 0
-    printed = capsys.readouterr()
-
-    assert f'{path}: 1 damaged chunks are skipped, the first at byte ' in survey['cut'][0]
-    assert survey['cut'][0] in caplog.text
-    assert printed.out.splitlines()[1].startswith('scans 5 ')
-
-
 def test_a_cut_bag_is_mapped_as_far_as_it_goes_and_strict_says_so(tmp_path, capsys, caplog):
     path = write_mcap(tmp_path / 'drive.mcap', drive(), compression=CompressionType.NONE)
     cut(path, 0.7)
@@ -259,24 +241,3 @@ def test_a_full_disk_leaves_the_earlier_result_whole(bag, tmp_path):
     found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('[')]
     assert found == [[name, 1, True] for name in ALL.split(',')], done.stderr
     assert done.stderr.count('cannot be written: No space left on device') == len(found)
-
-
-@pytest.mark.parametrize(
-    ('options', 'says'),
-    [
-        (
-            ['--poses-out', 'out/map.ply'],
-            '--poses-out out/map.ply: this replay writes out/map.ply',
-        ),
-        (['--rrd', 'out/../out/map.npz'], 'this replay writes out/map.npz too'),
-        (['--poses-out', 'a', '--rrd', './a'], 'this replay writes a for --poses-out too'),
-    ],
-)
-def test_two_outputs_of_one_path_are_refused(bag, tmp_path, monkeypatch, capsys, options, says):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'out').mkdir()
-
-    assert main(['replay', str(bag), '--output', 'out', *options]) == 1
-
-    assert says in capsys.readouterr().err
-    assert list((tmp_path / 'out').iterdir()) == []
