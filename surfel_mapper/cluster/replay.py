@@ -3,30 +3,26 @@
 """
 Replay of several bags, or with several processes: one map of them all, in this process at the end.
 
-Each layer needs all scans in order, so layers are left out. All bags have to be in one fixed
-frame; those without poses are brought into that of the first (common_frame.py).
+Each layer needs all scans in order, so layers are left out. All bags need poses in one frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cluster.workers import never, open_workers
 from surfel_mapper.compilation import clock
 from surfel_mapper.config import AUTO
-from surfel_mapper.errors import BagError, ConfigError, MapError
+from surfel_mapper.errors import BagError, ConfigError
 from surfel_mapper.files.atomic import check_free, finite_or_none
 from surfel_mapper.offline.outputs import BAG, check_formats, MAP_FORMATS
 from surfel_mapper.offline.replay import pose_errors, ReplayOptions, ReplayResult
 from surfel_mapper.offline.request import Request
 
 if TYPE_CHECKING:
-    from surfel_mapper.cluster.common_frame import CommonFrame
-    from surfel_mapper.cluster.map_reduce import MappedBags, OnDone
-    from surfel_mapper.cluster.workers import Workers
+    from surfel_mapper.cluster.map_reduce import MappedBags
     from surfel_mapper.config import Config
 
 
@@ -60,8 +56,7 @@ def replay_bags(
     scheduler : str, optional
         Address of a Dask scheduler instead.
     options : ReplayOptions, optional
-        Formats of the map, poses_out, truth and overwrite; align for each recording that is
-        registered.
+        Formats of the map, poses_out, truth and overwrite.
     progress : callable
         Called with the seconds of recordings that are mapped, and all.
     stopped : callable
@@ -83,29 +78,26 @@ def replay_bags(
         If workers cannot be reached or are lost, or Dask is not installed.
 
     """
+    from surfel_mapper.cluster.map_reduce import map_bags
+    from surfel_mapper.cluster.shards import cut, shard_length_s
+
     began = clock()
     options = ReplayOptions() if options is None else options
     check(config, options, output)
-    surveys = surveyed(requests, config)
-    is_registered = check_one_kind(surveys)
-    # a recording that is registered is read twice
-    recorded_s, done_s = sum(survey.recorded_s for survey in surveys), 0.0
-    total_s = (1 + is_registered) * recorded_s
+    surveys = [surveyed(request, config) for request in requests]
+    recorded_s, done_s = sum(survey['recorded_s'] for survey in surveys), 0.0
 
     def on_done(seconds: float) -> None:
         nonlocal done_s
         done_s += seconds
-        progress(round(done_s), round(total_s))
+        progress(round(done_s), round(recorded_s))
 
     times = {'survey': clock()}
     with open_workers(workers, scheduler) as pool:
         times['start'] = clock()
-        jobs, frame = [(survey.request, config) for survey in surveys], None
-        if is_registered:
-            frame = registered(surveys, config, output, options.align, pool, on_done, stopped)
-            jobs = [(recording.request, recording.config) for recording in frame.placed]
-            times['register'] = clock()
-        mapped = mapped_together(jobs, recorded_s, pool, on_done, stopped)
+        shard_s = shard_length_s(recorded_s, pool.num_workers)
+        shards = [cut(request, config, shard_s) for request in requests]
+        mapped = map_bags(shards, pool, on_done, stopped)
         times['map'] = clock()
         num_workers = pool.num_workers
     times['stop'] = clock()
@@ -117,11 +109,10 @@ def replay_bags(
         'wall_s': durations(began, times),
         'window': False,
         'interrupted': mapped.interrupted,
-        'cut': [cut for survey in surveys for cut in survey.cuts],
-        'clock_offsets': [offset for survey in surveys for offset in survey.clock_offsets],
+        'cut': [cut for survey in surveys for cut in survey['cut']],
+        'clock_offsets': [offset for survey in surveys for offset in survey['clock_offsets']],
         **mapped.mapper.summary(),
         **mapped.counts,
-        **({} if frame is None else frame.summary(mapped.counts['scans'])),
         'workers': num_workers,
         'shards': mapped.num_shards,
         'shards_repeated': mapped.repeated,
@@ -156,23 +147,6 @@ def check(config: Config, options: ReplayOptions, output: Path) -> None:
     check_formats(options.formats, output)
 
 
-def mapped_together(
-    jobs: Sequence[tuple[Request, Config]],
-    recorded_s: float,
-    pool: Workers,
-    on_done: OnDone,
-    stopped: Callable[[], bool],
-) -> MappedBags:
-    """Map recordings in one frame, each cut into shards."""
-    from surfel_mapper.cluster.map_reduce import map_bags
-    from surfel_mapper.cluster.shards import cut, shard_length_s
-
-    shard_s = shard_length_s(recorded_s, pool.num_workers)
-    return map_bags(
-        [cut(request, config, shard_s) for request, config in jobs], pool, on_done, stopped
-    )
-
-
 def written(
     output: Path, options: ReplayOptions, mapped: MappedBags, summary: dict[str, Any]
 ) -> ReplayResult:
@@ -191,74 +165,23 @@ def written(
     return ReplayResult(mapper, trajectory, summary, files)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Surveyed:
-    """Source of poses, duration, cut files and clocks of a recording that is not mapped yet."""
-
-    request: Request
-    recorded_s: float
-    cuts: list[str]
-    poses_from: str
-    clock_offsets: list[dict[str, Any]]
-
-
-def surveyed(requests: Sequence[Request], config: Config) -> list[Surveyed]:
-    """Return duration, s, source of poses, and files that end too early, of each recording."""
+def surveyed(request: Request, config: Config) -> dict[str, Any]:
+    """Return duration, cut files and clocks of a recording; raise BagError if it has no poses."""
     from surfel_mapper.offline.recording import open_recording
 
-    surveys = []
-    for request in requests:
-        with open_recording(request, config) as recording:
-            found = recording.describe()
-            offsets = [
-                {**offset, 'text': f'{request.path}: {offset["text"]}'}
-                for offset in found.get('clock_offsets', [])
-            ]
-            surveys.append(
-                Surveyed(
-                    request=request,
-                    recorded_s=recording.recorded_s,
-                    cuts=list(recording.cuts),
-                    poses_from=str(found['poses_from']),
-                    clock_offsets=offsets,
-                )
+    with open_recording(request, config) as recording:
+        description = recording.describe()
+        if description['poses_from'] == 'registration':
+            raise BagError(
+                f'{request.path}: no poses; expected them in every one of several recordings, in '
+                'one frame, and with workers too; `surfel-mapper replay` maps it alone, with the '
+                'poses of its scans in trajectory.tum'
             )
-    return surveys
-
-
-def check_one_kind(surveys: Sequence[Surveyed]) -> bool:
-    """Return whether the recordings have to be registered; raise BagError if only some have."""
-    without = [survey for survey in surveys if survey.poses_from == 'registration']
-    posed = [survey for survey in surveys if survey.poses_from != 'registration']
-    if without and posed:
-        raise BagError(
-            f'{without[0].request.path} has no poses, but {posed[0].request.path} has, from '
-            f'{posed[0].poses_from}; expected all or none, or --poses-from registration for all'
-        )
-    return bool(without)
-
-
-def registered(
-    surveys: Sequence[Surveyed],
-    config: Config,
-    output: Path,
-    align: bool | None,
-    pool: Workers,
-    on_done: OnDone,
-    stopped: Callable[[], bool],
-) -> CommonFrame:
-    """Register each recording alone, and place them on each other."""
-    from surfel_mapper.cluster.common_frame import in_one_frame, register
-    from surfel_mapper.cluster.shards import absolute
-
-    tasks = [
-        (absolute(survey.request), config, output.absolute() / f'registered_{number}', align)
-        for number, survey in enumerate(surveys, start=1)
-    ]
-    done = {}
-    for number, result in pool.run(register, tasks, stopped):
-        done[number] = result
-        on_done(surveys[number].recorded_s)
-    if len(done) < len(tasks):
-        raise MapError('stopped before all recordings were registered')
-    return in_one_frame([done[number] for number in range(len(tasks))])
+        return {
+            'recorded_s': recording.recorded_s,
+            'cut': list(recording.cuts),
+            'clock_offsets': [
+                {**offset, 'text': f'{request.path}: {offset["text"]}'}
+                for offset in description.get('clock_offsets', [])
+            ],
+        }

@@ -15,7 +15,6 @@ import logging
 import multiprocessing
 from multiprocessing import forkserver
 import os
-import time
 from typing import Any, TypeVar
 
 from surfel_mapper.errors import ClusterError, DependencyError
@@ -25,9 +24,6 @@ Result = TypeVar('Result')
 
 CONNECT_S = 20
 """Time in which a scheduler has to answer, s."""
-
-POLL_S = 0.02
-"""Period of checking for finished tasks and for a stop, s."""
 
 LOOPBACK = '127.0.0.1'
 
@@ -82,7 +78,7 @@ class Workers:
         """
         Yield the number and the result of each item, as they get done.
 
-        After a stop, only the tasks that have begun get done.
+        After a stop, which is noticed at the end of a task, the others are given up.
 
         Raises
         ------
@@ -90,35 +86,21 @@ class Workers:
             If several workers died at a task, or the scheduler is gone.
 
         """
-        if self.client is not None:
-            yield from self._run_with_dask(function, items, stopped)
+        if self.client is None:
+            for number, item in enumerate(items):
+                if stopped():
+                    return
+                yield number, function(item)
             return
-        for number, item in enumerate(items):
-            if stopped():
-                return
-            yield number, function(item)
+        from distributed import as_completed, CancelledError, KilledWorker
 
-    def _run_with_dask(
-        self,
-        function: Callable[[Item], Result],
-        items: Sequence[Item],
-        stopped: Callable[[], bool],
-    ) -> Iterator[tuple[int, Result]]:
-        from distributed import CancelledError, KilledWorker
-
-        pending = {
-            self.client.submit(function, item, pure=False): number
-            for number, item in enumerate(items)
-        }
+        futures = self.client.map(function, items, pure=False)
+        numbers = {future: number for number, future in enumerate(futures)}
         try:
-            while pending:
-                if stopped():  # tasks begin in their order
-                    later = list(pending)[self.num_workers :]
-                    self.client.cancel(later)
-                    pending = {f: n for f, n in pending.items() if f not in later}
-                for future in [future for future in pending if future.done()]:
-                    yield pending.pop(future), future.result()
-                time.sleep(POLL_S)
+            for future in as_completed(futures):
+                yield numbers[future], future.result()
+                if stopped():
+                    return
         except KilledWorker as error:
             raise ClusterError(
                 f'several workers died at the same task; is their memory large enough? {error}'
@@ -126,7 +108,7 @@ class Workers:
         except (CancelledError, OSError) as error:
             raise ClusterError(f'the scheduler is gone: {error}') from error
         finally:
-            self.client.cancel(list(pending))
+            self.client.cancel(futures)
 
 
 @contextmanager

@@ -150,7 +150,7 @@ def apart_text(summary: Mapping[str, Any]) -> str:
     counted = summary['scans']['dropped'].get('apart', 0)
     num_scans = max(counted, sum(entry['scans'] for entry in maps))
     spans = ', '.join(
-        f'{entry.get("map", f"apart_{number}")} ({entry["scans"]} scans from '
+        f'apart_{number} ({entry["scans"]} scans from '
         f'{entry["first_s"]:.3f} to {entry["last_s"]:.3f} s: {entry["reason"]})'
         for number, entry in enumerate(maps, start=1)
     )

@@ -5,11 +5,13 @@
 import json
 import signal
 
+import numpy as np
 import pytest
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.cluster import map_reduce
 from surfel_mapper.cluster.shards import map_shard
+from surfel_mapper.files import pcd
 from surfel_mapper.files.parquet import read_map
 from surfel_mapper.files.parquet_tiles import read_tiles
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -150,3 +152,14 @@ def test_an_invalid_number_of_workers_is_refused(bags, number):
     with pytest.raises(SystemExit) as exit_info:
         main(['replay', bags[0], '--workers', number])
     assert exit_info.value.code == 2
+
+
+def test_a_recording_without_poses_is_refused_among_several(bags, tmp_path, capsys):
+    points = np.random.default_rng(1).uniform(-9.0, 9.0, (3, 500)).astype(np.float32)
+    scan = tmp_path / 'scan.pcd'
+    pcd.write_points(scan, dict(zip('xyz', points, strict=True)))
+
+    assert main(['replay', bags[0], str(scan), '--output', str(tmp_path / 'out')]) == 1
+
+    assert f'{scan}: no poses; expected them in every one' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
