@@ -32,7 +32,7 @@ from surfel_mapper.evaluation.map_files import Discs
 from surfel_mapper.evaluation.trajectory_errors import common_stamps
 from surfel_mapper.evaluation.truth import is_world, read_poses, true_poses
 from surfel_mapper.files.trajectory import trajectory_beside
-from surfel_mapper.geometry import compose, rotation_angle, se3_exp, Transform
+from surfel_mapper.geometry import compose, inverse, rotation_angle, se3_exp, Transform
 
 Floats = npt.NDArray[np.float64]
 
@@ -240,17 +240,11 @@ def known_starts(map_path: Path, truth_path: Path) -> dict[str, Transform]:
     except FileFormatError:  # a world without its drive
         return {}
     rows, other_rows = common_stamps(stamps_ns, other_ns, SAME_NS)
-    return {'trajectories': mean_motion(poses[rows], truth_poses[other_rows])} if len(rows) else {}
-
-
-def mean_motion(poses: Floats, truth: Floats) -> Transform:
-    """Return the mean T_other_mine of poses (S, 4, 4) at the same times, on a line too."""
-    u, _, vt = np.linalg.svd((truth[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    T_other_mine = np.eye(4)
-    T_other_mine[:3, :3] = rotation
-    T_other_mine[:3, 3] = (truth[:, :3, 3] - poses[:, :3, 3] @ rotation.T).mean(axis=0)
-    return T_other_mine
+    if not len(rows):
+        return {}
+    middle = len(rows) // 2
+    T_sensor_map = inverse(poses[rows[middle]])
+    return {'trajectories': compose(truth_poses[other_rows[middle]], T_sensor_map)}
 
 
 def refined(

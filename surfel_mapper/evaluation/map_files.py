@@ -18,11 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files import map_state, parquet
 from surfel_mapper.files.arrays import is_cloud
 from surfel_mapper.files.latest_map import DRAWABLE, map_in, TILES
-from surfel_mapper.files.parquet_tiles import read_tiles
-from surfel_mapper.files.point_columns import NORMAL_NAMES
+from surfel_mapper.files.maps import load_surfel_map
+from surfel_mapper.files.point_columns import normals_in
 from surfel_mapper.files.scan_files import scan_reader, SUFFIXES
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
@@ -82,13 +81,10 @@ def load_discs(path: str | Path, min_points: int, bin_columns: int | None = None
             f'{path}: no map in this directory; expected map/tile_i=*/tile_j=*/ or one of '
             f'{", ".join(form for form in DRAWABLE if form != TILES)}'
         )
-    if file.is_dir():
-        return of_map(read_tiles(file), min_points)
-    if file.suffix.lower() == '.parquet':
-        return of_map(parquet.read_map(file), min_points)
-    if file.suffix.lower() == '.npz' and not is_cloud(file):
-        return of_map(map_state.load_map(file)[0], min_points)
-    if file.suffix.lower() not in SUFFIXES:
+    suffix = file.suffix.lower()
+    if file.is_dir() or suffix == '.parquet' or (suffix == '.npz' and not is_cloud(file)):
+        return of_map(load_surfel_map(file), min_points)
+    if suffix not in SUFFIXES:
         raise FileFormatError(
             f'{path}: expected a directory, .parquet, .npz, or points: {", ".join(SUFFIXES)}'
         )
@@ -104,10 +100,8 @@ def of_map(surfel_map: SurfelMap, min_points: int) -> Discs:
 
 def of_columns(points: npt.NDArray[Any], columns: Mapping[str, npt.NDArray[Any]]) -> Discs:
     """Return the points of a cloud, with normals scaled to unit length; none if all are zero."""
-    names = next((names for names in NORMAL_NAMES if set(names) <= set(columns)), None)
-    normal = None
-    if names is not None:
-        normal = np.stack([columns[name].astype(np.float64) for name in names], axis=1)
+    normal = normals_in(columns)
+    if normal is not None:
         with np.errstate(invalid='ignore'):
             normal /= np.sqrt((normal * normal).sum(axis=1, keepdims=True))
         if not np.isfinite(normal).all(axis=1).any():  # PCL's PointNormal, never filled

@@ -18,7 +18,11 @@ from scipy.spatial import cKDTree
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.evaluation.comparison import Nearest
 from surfel_mapper.files import ply
-from surfel_mapper.files.triangles import import_trimesh, read_triangles, SUFFIXES
+from surfel_mapper.files.triangles import (
+    import_trimesh,
+    read_triangles,
+    SUFFIXES,
+)
 from surfel_mapper.tsdf.mesh import Mesh
 
 Floats = npt.NDArray[np.float64]

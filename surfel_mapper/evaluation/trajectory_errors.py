@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from surfel_mapper.geometry import Transform
 
@@ -144,7 +145,7 @@ def absolute_errors(
     estimated, true = _pairs(T_map_estimated, T_map_true, 1)
     if align:
         estimated = best_motion(estimated[:, :3, 3], true[:, :3, 3]) @ estimated
-    return _errors(_inverse(true) @ estimated)
+    return _errors(np.linalg.inv(true) @ estimated)
 
 
 def relative_errors(
@@ -265,25 +266,12 @@ def _motion_errors(
     estimated: Floats, true: Floats, first: npt.NDArray[np.int64], last: npt.NDArray[np.int64]
 ) -> PoseErrors:
     """Return the errors of the motions between rows."""
-    measured = _inverse(estimated[first]) @ estimated[last]
-    expected = _inverse(true[first]) @ true[last]
-    return _errors(_inverse(expected) @ measured)
+    measured = np.linalg.inv(estimated[first]) @ estimated[last]
+    expected = np.linalg.inv(true[first]) @ true[last]
+    return _errors(np.linalg.inv(expected) @ measured)
 
 
 def _errors(off: Floats) -> PoseErrors:
     """Return the magnitude of transforms (P, 4, 4)."""
-    skew = off[:, :3, :3] - off[:, :3, :3].transpose(0, 2, 1)
-    sine = np.sqrt((skew**2).sum(axis=(1, 2)) / 8.0)
-    cosine = 0.5 * (np.trace(off[:, :3, :3], axis1=1, axis2=2) - 1.0)
-    return PoseErrors(
-        np.sqrt((off[:, :3, 3] ** 2).sum(axis=1)), np.degrees(np.arctan2(sine, cosine))
-    )
-
-
-def _inverse(poses: Floats) -> Floats:
-    """Return the inverses of rigid transforms (P, 4, 4)."""
-    inverses = np.zeros_like(poses)
-    inverses[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
-    inverses[:, :3, 3] = -np.einsum('pji,pj->pi', poses[:, :3, :3], poses[:, :3, 3])
-    inverses[:, 3, 3] = 1.0
-    return inverses
+    turned_rad = Rotation.from_matrix(off[:, :3, :3]).magnitude()
+    return PoseErrors(np.linalg.norm(off[:, :3, 3], axis=1), np.degrees(turned_rad))

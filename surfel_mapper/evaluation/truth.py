@@ -18,7 +18,6 @@ import numpy.typing as npt
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.evaluation.comparison import Nearest
 from surfel_mapper.files.trajectory import read_trajectory
-from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.simulation.drive import Simulation
 from surfel_mapper.simulation.recording import load_simulation, SIMULATION_FILE, WORLD_FILE
 from surfel_mapper.simulation.world import World
@@ -113,11 +112,7 @@ def read_poses(path: Path, *, by_number: bool = False) -> tuple[npt.NDArray[np.i
         stamps_ns = 10**9 * (rows if trajectory.number is None else trajectory.number)
     if stamps_ns is None:
         raise FileFormatError(f'{path}: poses without times, expected a times.txt beside it')
-    poses = [
-        pose_matrix(xyz, q_xyzw)
-        for xyz, q_xyzw in zip(trajectory.xyz, trajectory.q_xyzw, strict=True)
-    ]
-    return stamps_ns, np.array(poses).reshape(-1, 4, 4)
+    return stamps_ns, trajectory.matrices
 
 
 def true_poses(

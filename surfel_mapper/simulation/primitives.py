@@ -9,15 +9,12 @@ file gives the same ray casts to the last bit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import FileFormatError
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.simulation.kernels.surfaces import BOX, CYLINDER, RECTANGLE, SPHERE, TUBE
 
@@ -99,26 +96,3 @@ class Primitive:
             return first, first, self.size_m[1] / 2.0
         depth = self.size_m[2] if self.kind == 'box' else 0.0
         return first / 2.0, self.size_m[1] / 2.0, depth / 2.0
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return all attributes as plain values, ready for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any]) -> Primitive:
-        """
-        Return the primitive that to_mapping returned.
-
-        Raises
-        ------
-        FileFormatError
-            If an attribute is unknown or missing, or a value is invalid.
-
-        """
-        unknown = set(mapping) - {field.name for field in fields(cls)}
-        if unknown:
-            raise FileFormatError(f'{", ".join(sorted(unknown))}: not an attribute of a primitive')
-        try:
-            return cls(**mapping)
-        except (TypeError, ValueError) as error:
-            raise FileFormatError(str(error)) from error

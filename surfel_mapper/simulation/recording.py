@@ -24,7 +24,7 @@ from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.budget import read_small_file
 from surfel_mapper.errors import ConfigError, FileFormatError, refusing
 from surfel_mapper.files.atomic import write_json
-from surfel_mapper.messages.pointcloud2 import CloudBytes, Field
+from surfel_mapper.messages.pointcloud2 import CloudBytes, field_of
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.scan import Scan
 from surfel_mapper.simulation.drive import Drive, Simulation
@@ -52,14 +52,7 @@ POINT = np.dtype(
 )
 """Layout of a point, with padding as drivers have it."""
 
-FIELDS = (
-    Field('x', 0, 7, 1),
-    Field('y', 4, 7, 1),
-    Field('z', 8, 7, 1),
-    Field('intensity', 16, 7, 1),
-    Field('ring', 20, 4, 1),
-    Field('time', 24, 7, 1),
-)
+FIELDS = tuple(field_of(name, POINT) for name in POINT.names or ())
 
 
 def record(
@@ -148,7 +141,7 @@ def load_simulation(path: str | Path) -> Simulation:
     """
     world = World.load(Path(path) / WORLD_FILE)
     file = Path(path) / SIMULATION_FILE
-    with refusing(file, FileFormatError):
+    with refusing(file):
         document = json.loads(read_small_file(file))
         try:
             course = _tuples(document['drive'])

@@ -13,17 +13,16 @@ median of the centres along the longest side, which keeps the tree balanced for 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import read_small_file
-from surfel_mapper.errors import FileFormatError, refusing
+from surfel_mapper.errors import refusing
 from surfel_mapper.files.atomic import write_json
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.simulation.kernels import raycast, surfaces
@@ -249,36 +248,11 @@ class World:
         """Return the reflectivity of each surface in [0, 1], nan for -1."""
         return np.append(self._reflectivity, np.nan)[self.primitive_of(surface)]
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the world as plain values, ready for JSON."""
-        primitives = [primitive.to_mapping() for primitive in self.primitives]
-        return {'format': FORMAT, 'start': list(self.start), 'primitives': primitives}
-
-    @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any]) -> World:
-        """
-        Return the world that to_mapping returned.
-
-        Raises
-        ------
-        FileFormatError
-            If the mapping does not describe a world, or a value is invalid.
-
-        """
-        format_ = mapping.get('format') if isinstance(mapping, Mapping) else type(mapping).__name__
-        if format_ != FORMAT:
-            raise FileFormatError(f'format: {format_!r}, expected {FORMAT!r}')
-        try:
-            primitives = [Primitive.from_mapping(entry) for entry in mapping['primitives']]
-            return cls(primitives, mapping['start'])
-        except (KeyError, TypeError, AttributeError) as error:
-            raise FileFormatError(f'not a world: {type(error).__name__} {error}') from error
-        except ValueError as error:
-            raise FileFormatError(f'not a world: {error}') from error
-
     def save(self, path: str | Path) -> None:
         """Write the world to a JSON file, atomically."""
-        write_json(path, self.to_mapping())
+        primitives = [asdict(primitive) for primitive in self.primitives]
+        content = {'format': FORMAT, 'start': list(self.start), 'primitives': primitives}
+        write_json(path, content)
 
     @classmethod
     def load(cls, path: str | Path) -> World:
@@ -291,12 +265,12 @@ class World:
             If the file cannot be read or does not hold a world.
 
         """
-        with refusing(path, FileFormatError):
+        with refusing(path):
             content = json.loads(read_small_file(path))
-            try:
-                return cls.from_mapping(content)
-            except FileFormatError as error:
-                raise FileFormatError(f'{path}: {error}') from error
+            if content['format'] != FORMAT:
+                raise ValueError(f'format: {content["format"]!r}, expected {FORMAT!r}')
+            primitives = [Primitive(**entry) for entry in content['primitives']]
+            return cls(primitives, content['start'])
 
     def _normals(self, positions: FloatArray, surface: IntArray) -> FloatArray:
         """Return the (N, 3) outward normals of surfaces at positions on or near them."""

@@ -12,7 +12,6 @@ from surfel_mapper.evaluation.frames import (
     find_motion,
     gauss_newton_step,
     looks_needed,
-    mean_motion,
     moved_discs,
 )
 from surfel_mapper.evaluation.map_files import Discs
@@ -139,9 +138,3 @@ def test_only_maps_in_different_frames_look_as_if_they_need_it():
     far = pose_matrix([60.0, 0.0, 0.0], se3_turn(0.0))
     assert '0%' in looks_needed(moved_discs(truth, far), CloudTruth(truth), WIDTH_M)
     assert looks_needed(Discs(np.empty((0, 3)), None), CloudTruth(truth), WIDTH_M) == ''
-
-
-def test_the_motion_between_trajectories_on_a_line_has_no_free_roll():
-    poses = np.array([pose_matrix([x, 0.0, 0.0], se3_turn(0.0)) for x in range(5)], float)
-    motion = pose_matrix([1.0, 2.0, 3.0], [0.5, 0.5, 0.5, 0.5])
-    np.testing.assert_allclose(mean_motion(poses, motion @ poses), motion, atol=1e-12)
