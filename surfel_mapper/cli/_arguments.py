@@ -28,20 +28,6 @@ class UsageError(Exception):
     """Options that do not go together; exit code 2."""
 
 
-def real(text: str) -> float:
-    """Return a number in ASCII; ValueError for others that Python reads, such as 1_0."""
-    if '_' in text or not text.isascii():
-        raise ValueError(f'{text!r} is no number')
-    return float(text)
-
-
-def whole(text: str) -> int:
-    """Return a whole number; ValueError as for ``real``."""
-    if '_' in text or not text.isascii():
-        raise ValueError(f'{text!r} is no number')
-    return int(text)
-
-
 def positive_int(text: str) -> int:
     """Return a whole number of one or more."""
     if not DIGITS.fullmatch(text) or int(text) < 1:
@@ -52,7 +38,7 @@ def positive_int(text: str) -> int:
 def checked(text: str, is_valid: Callable[[float], bool], expected: str) -> float:
     """Return a number that meets a condition."""
     try:
-        value = real(text)
+        value = float(text)
     except ValueError:
         value = math.nan
     if not is_valid(value):

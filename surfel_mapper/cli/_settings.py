@@ -16,8 +16,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from surfel_mapper.cli._arguments import real
-
 if TYPE_CHECKING:
     from surfel_mapper.config import Config
     from surfel_mapper.config.settings import Stage
@@ -89,7 +87,7 @@ def assignment(text: str) -> tuple[str, Any]:
 def number_of(name: str, text: str) -> tuple[str, float]:
     """Return name and value of a setting that is a number."""
     try:
-        return name, real(text)
+        return name, float(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f'{text!r}, expected a number') from error
 

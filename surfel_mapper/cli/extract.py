@@ -21,7 +21,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.cli._arguments import add_bin_columns, add_formats, add_overwrite, real
+from surfel_mapper.cli._arguments import add_bin_columns, add_formats, add_overwrite
 from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._recordings import recorded_map
@@ -87,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--viewpoint',
-        type=real,
+        type=float,
         nargs=3,
         metavar=('X', 'Y', 'Z'),
         help='position of the sensor; default: VIEWPOINT of a PCD, the origin, or above a map',
@@ -163,7 +163,7 @@ def map_of(args: argparse.Namespace) -> SurfelMap | None:
     """Return the map in a file or a directory, or that of a recording; None for a cloud."""
     from surfel_mapper.errors import FileFormatError
     from surfel_mapper.files.arrays import is_cloud
-    from surfel_mapper.files.latest_map import EXACT
+    from surfel_mapper.files.latest_map import EXACT, map_in
     from surfel_mapper.files.scan_files import SUFFIXES
     from surfel_mapper.mapping.surfel_map import SurfelMap
 
@@ -171,10 +171,15 @@ def map_of(args: argparse.Namespace) -> SurfelMap | None:
     surfel_map = recorded_map(args, args.cloud, EXACT, 2.0 * size_m if size_m else None)
     if surfel_map is not None:
         return surfel_map
-    path, suffix = exact_map(args.cloud), args.cloud.suffix.lower()
+    path, suffix = args.cloud, args.cloud.suffix.lower()
+    if path.is_dir() and map_in(path, EXACT) is None:
+        raise FileFormatError(
+            f'{path}: no map.npz, map.parquet or map/tile_i=*/tile_j=*/ in this directory, nor a '
+            'bag or scans'
+        )
     if not path.exists():
         raise FileFormatError(f'{path}: no such file')
-    if path.is_dir() or path != args.cloud or (suffix in MAPS and not is_cloud(path)):
+    if path.is_dir() or (suffix in MAPS and not is_cloud(path)):
         return SurfelMap.load(path)
     if suffix not in SUFFIXES:
         raise FileFormatError(
@@ -196,20 +201,6 @@ def cloud_of(args: argparse.Namespace) -> npt.NDArray[Any]:
             'the output directory of the replay'
         )
     return np.ascontiguousarray(points)
-
-
-def exact_map(path: Path) -> Path:
-    """Return the exact map in an output directory, a file or tiles; another path as it is."""
-    from surfel_mapper.errors import FileFormatError
-    from surfel_mapper.files.latest_map import EXACT, map_in
-
-    map_path = map_in(path, EXACT) if path.is_dir() else path
-    if map_path is None:
-        raise FileFormatError(
-            f'{path}: no map.npz, map.parquet or map/tile_i=*/tile_j=*/ in this directory, nor a '
-            'bag or scans'
-        )
-    return map_path
 
 
 def figures(model: MultiModel, evaluation: Any, num_points: int) -> dict[str, Any]:

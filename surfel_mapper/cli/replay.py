@@ -42,7 +42,6 @@ from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
 from surfel_mapper.errors import MapError
 from surfel_mapper.layers import formats as layer_formats
 from surfel_mapper.offline.outputs import (
-    check_distinct,
     known_formats,
     MAP_FORMATS,
     output_directory,
@@ -255,11 +254,8 @@ def run(args: argparse.Namespace) -> int:
 
 def replay_one(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     """Map a recording in this process."""
+    request, config = request_of(args, args.bags[0]), with_filters(args)
     chosen = replay_options(args)
-    request = request_of(args, args.bags[0])
-    config = with_filters(args)
-    outputs = {'--poses-out': args.poses_out, '--rrd': args.rrd}
-    check_distinct(request.path, args.output, chosen.formats, outputs)
     return replay(request, output=args.output, config=config, options=chosen, **options)
 
 

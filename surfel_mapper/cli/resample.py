@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surfel_mapper.cli._arguments import add_overwrite, positive_float, whole
+from surfel_mapper.cli._arguments import add_overwrite, positive_float
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._verbosity import add_verbosity
 
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='distance of the points on planes and surfaces, m (the voxel size of the models)',
     )
     parser.add_argument(
-        '--seed', type=whole, default=0, help='of the points of Gaussians (%(default)s)'
+        '--seed', type=int, default=0, help='of the points of Gaussians (%(default)s)'
     )
     parser.add_argument(
         '-o', '--output', type=Path, required=True, metavar='OUT', help='.ply or .pcd to write'

@@ -14,9 +14,7 @@ from surfel_mapper.cli._arguments import (
     add_overwrite,
     positive_float,
     positive_int,
-    real,
     UsageError,
-    whole,
 )
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._verbosity import add_verbosity
@@ -49,13 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     length.add_argument(
         '--duration', type=positive_float, metavar='S', help='s, instead of --scans'
     )
-    add('--speed', type=real, default=5.0, metavar='V', help='of the vehicle, m/s (%(default)s)')
-    add('--beams', type=whole, default=64, metavar='N', help='beams of the lidar (%(default)s)')
-    add('--columns', type=whole, default=2048, metavar='N', help='columns a turn (%(default)s)')
-    add('--rate', type=real, default=10.0, metavar='F', help='scan rate, Hz (%(default)s)')
-    add('--noise', type=real, default=0.0, metavar='M', help='sigma of range, m (%(default)s)')
-    add('--max-range', type=real, default=100.0, metavar='M', help='m (%(default)s)')
-    add('--seed', type=whole, default=0, metavar='N', help='of street and noise (%(default)s)')
+    add('--speed', type=float, default=5.0, metavar='V', help='of the vehicle, m/s (%(default)s)')
+    add('--beams', type=int, default=64, metavar='N', help='beams of the lidar (%(default)s)')
+    add('--columns', type=int, default=2048, metavar='N', help='columns a turn (%(default)s)')
+    add('--rate', type=float, default=10.0, metavar='F', help='scan rate, Hz (%(default)s)')
+    add('--noise', type=float, default=0.0, metavar='M', help='sigma of range, m (%(default)s)')
+    add('--max-range', type=float, default=100.0, metavar='M', help='m (%(default)s)')
+    add('--seed', type=int, default=0, metavar='N', help='of street and noise (%(default)s)')
     add('--rolling', action='store_true', help='the vehicle moves while the lidar turns')
     add('--json', action='store_true', help='report as JSON')
     add_verbosity(parser)

@@ -309,9 +309,14 @@ def feed(
     def add(message: BagMessage, number: int, decode: Decode = to_scan) -> None:
         add_cloud(reader, mapper, message, poses, number, decode)
 
-    images = depth_feed(clouds, add) if mapper.config.input.kind == 'depth' else None
+    images: DepthFeed | None = None
+    scenes: SceneFeed | None = None
+    if mapper.config.input.kind == 'depth' or mapper.config.image_topics:
+        from surfel_mapper.offline.image_feeds import DepthFeed, SceneFeed  # the compiler
+
+        images = DepthFeed(clouds, add) if mapper.config.input.kind == 'depth' else None
+        scenes = SceneFeed(mapper) if mapper.config.image_topics else None
     infos = images.info_topics if images else {}
-    scenes = scene_feed(mapper)
     scene_topics = scenes.topics if scenes else set()
     stream = messages(reader, {*clouds, *infos, *scene_topics}, poses, span)
     while not stopped():
@@ -337,24 +342,6 @@ def feed(
     mapper.end_scans()
     yield from mapper.insert_ready()
     mapper.finish()
-
-
-def depth_feed(
-    clouds: Collection[str], add: Callable[[BagMessage, int, Decode], None]
-) -> DepthFeed:
-    """Return the feed of depth images; imported here because it loads the compiler."""
-    from surfel_mapper.offline.image_feeds import DepthFeed
-
-    return DepthFeed(clouds, add)
-
-
-def scene_feed(mapper: Mapper) -> SceneFeed | None:
-    """Return the feed of colour and label images; None if none are configured."""
-    if not mapper.config.image_topics:
-        return None
-    from surfel_mapper.offline.image_feeds import SceneFeed
-
-    return SceneFeed(mapper)
 
 
 def messages(

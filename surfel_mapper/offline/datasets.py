@@ -26,18 +26,17 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import ConfigError, FileFormatError
+from surfel_mapper.errors import ConfigError, FileFormatError, refusing
 from surfel_mapper.files.atomic import by_number
-from surfel_mapper.files.foreign_points import e57_poses, read_e57, read_feather
+from surfel_mapper.files.foreign_points import read_feather
 from surfel_mapper.files.pose_rows import (
     matrix_rows,
     MAX_SKEW,
-    quaternion_rows,
     rigid_poses,
     warn_of_skew,
 )
 from surfel_mapper.files.raw import FLOATS
-from surfel_mapper.files.scan_files import read_scan, scan_of
+from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.stamps import column_ns, read_dates, read_times
 from surfel_mapper.files.text_table import finite, read_lines, table_rows
 from surfel_mapper.files.trajectory import read_trajectory, stamped_poses, Trajectory
@@ -235,24 +234,16 @@ def nuscenes_poses(tables: Path, files: Sequence[Path]) -> list[Floats]:
     return poses
 
 
-def argoverse2(path: Path) -> Dataset | None:
-    """Recognise sensors/lidar/NS.feather, whose points are in the vehicle, and its poses."""
-    files = scans_in(path / 'sensors' / 'lidar', '.feather')
-    if not files:
-        return None
-    stamps_ns = [stamp_in_name(file, 1) for file in files]
-    poses_path = path / 'city_SE3_egovehicle.feather'
-    if not poses_path.is_file():
-        return Dataset('Argoverse 2', files, stamps_ns, read=read_argoverse2)
-    table = read_feather(poses_path)
+def argoverse2_poses(path: Path) -> Trajectory:
+    """Return the poses of the vehicle in Argoverse 2."""
+    table = read_feather(path)
     names = ('tx_m', 'ty_m', 'tz_m', 'qx', 'qy', 'qz', 'qw')
     missing = [name for name in ('timestamp_ns', *names) if name not in table]
     if missing:
-        raise FileFormatError(f'{poses_path}: no {missing[0]} among {", ".join(table)}')
+        raise FileFormatError(f'{path}: no {missing[0]} among {", ".join(table)}')
     order = np.argsort(table['timestamp_ns'])
-    xyz, q_xyzw = (np.stack([table[n][order] for n in part], 1) for part in (names[:3], names[3:]))
-    trajectory = Trajectory(table['timestamp_ns'][order], xyz, q_xyzw)
-    return Dataset('Argoverse 2', files, stamps_ns, trajectory, poses_path, read_argoverse2)
+    numbers = np.stack([table[name][order] for name in names], axis=1)
+    return Trajectory(table['timestamp_ns'][order], numbers[:, :3], numbers[:, 3:])
 
 
 def read_argoverse2(path: Path) -> tuple[npt.NDArray[Any], Columns]:
@@ -261,132 +252,64 @@ def read_argoverse2(path: Path) -> tuple[npt.NDArray[Any], Columns]:
     return points, {name: values for name, values in columns.items() if name != 'offset_ns'}
 
 
-class E57Scans:
-    """
-    The scans of an E57 file, in the frames of the scanner, with their poses.
-
-    They have no times that are used: they follow each other 0.1 s apart.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    in_file_frame : bool
-        Whether scans are wanted in the frame of the file instead.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be read, or has no scans.
-    DependencyError
-        If pye57 is not installed.
-
-    """
-
-    format = 'E57'
-
-    def __init__(self, path: Path, *, in_file_frame: bool = False) -> None:
-        self._poses = e57_poses(path)
-        if in_file_frame:
-            self._poses[:] = np.eye(4)
-        if not len(self._poses):
-            raise FileFormatError(f'{path}: no scans in it')
-        self.files = [path] * len(self._poses)
-        self.stamps_ns = [10**8 * number for number in range(len(self.files))]
-        is_placed = (self._poses != np.eye(4)).any()
-        try:
-            self.trajectory = Trajectory.from_matrices(self._poses) if is_placed else None
-        except ValueError as error:
-            raise FileFormatError(f'{path}: poses of its scans: {error}') from error
-        self.poses_path = path
-
-    def scan(self, number: int) -> tuple[npt.NDArray[Any], Columns]:
-        """Return points (N, 3), m, and columns of a scan."""
-        columns = read_e57(self.files[number], number)
-        points, columns = scan_of(self.files[number], columns)
-        pose = self._poses[number]
-        return np.asfortranarray((points - pose[:3, 3]) @ pose[:3, :3]), columns
-
-
-def mulran(path: Path) -> Dataset | None:
-    """Recognise Ouster/ or sensor_data/Ouster/ with names in ns, and global_pose.csv."""
-    folders = (path / 'Ouster', path / 'sensor_data' / 'Ouster')
-    files = next(filter(None, (scans_in(folder, '.bin') for folder in folders)), [])
-    if not files:
-        return None
-    stamps_ns = [stamp_in_name(file, 1) for file in files]
-    poses_path = path / 'global_pose.csv'
-    if not poses_path.is_file():
-        return Dataset('MulRan', files, stamps_ns)
+def mulran_poses(path: Path) -> Trajectory:
+    """Return the poses of the lidar in MulRan, a time in ns and a matrix of the base a line."""
     T_base_lidar = euler_pose(MULRAN_MOUNT[:3], np.radians(MULRAN_MOUNT[3:]))
-    rows = table_rows(read_lines(poses_path), 13, separator=',')
+    rows = table_rows(read_lines(path), 13, separator=',')
     T_map_base, skew = matrix_rows(rows, slice(1, None))
     T_map_lidar = T_map_base @ T_base_lidar
     numbers = np.hstack([T_map_lidar[:, :3, 3], quaternions(T_map_lidar)])
-    warn_of_skew(poses_path, skew)
-    poses = stamped_poses(rows.lines, column_ns(rows, 0, 'ns'), numbers)
-    return Dataset('MulRan', files, stamps_ns, poses, poses_path)
+    warn_of_skew(path, skew)
+    return stamped_poses(rows.lines, column_ns(rows, 0, 'ns'), numbers)
 
 
-def helipr(path: Path) -> Dataset | None:
-    """Recognise LiDAR/Ouster/ with names in ns, and LiDAR_GT/Ouster_gt.txt."""
-    files = scans_in(path / 'LiDAR' / 'Ouster', '.bin')
-    if not files:
-        return None
-    stamps_ns, read = [stamp_in_name(file, 1) for file in files], structured(HELIPR_OUSTER)
-    poses_path = path / 'LiDAR_GT' / 'Ouster_gt.txt'
-    if not poses_path.is_file():
-        return Dataset('HeLiPR', files, stamps_ns, read=read)
-    rows = table_rows(read_lines(poses_path), 8)
-    numbers = quaternion_rows(rows, slice(1, None))
-    poses = stamped_poses(rows.lines, column_ns(rows, 0, 'ns'), numbers)
-    return Dataset('HeLiPR', files, stamps_ns, poses, poses_path, read)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamedByTime:
+    """
+    A layout of scans in a folder that are named by their times.
 
+    Attributes
+    ----------
+    name : str
+        Name of the data set.
+    folders : tuple of str
+        The first that has files of the ending has the scans.
+    suffix : str
+        The ending.
+    unit_ns : int
+        Unit of the times in the names, ns.
+    read : callable
+        Reads the points of a file.
+    poses : str
+        File of poses; empty: none.
+    read_poses : callable
+        Reads it.
+    beside : tuple of str
+        Directories, one of which tells the layout from others.
 
-def newer_college(path: Path) -> Dataset | None:
-    """Recognise raw_format/ouster_scan/cloud_SECONDS_NANOSECONDS.pcd."""
-    folders = (path / 'raw_format' / 'ouster_scan', path / 'ouster_scan')
-    files = next(filter(None, (scans_in(folder, '.pcd') for folder in folders)), [])
-    if not files or not all(file.name.startswith('cloud_') for file in files):
-        return None
-    stamps_ns = []
-    for file in files:
-        second, _, nano = file.stem.removeprefix('cloud_').partition('_')
-        if not (second.isdecimal() and nano.isdecimal() and len(second) < 11 and len(nano) < 10):
-            raise FileFormatError(f'{file}: expected a name cloud_SECONDS_NANOSECONDS.pcd')
-        stamps_ns.append(int(second) * 10**9 + int(nano))
-    return Dataset('Newer College', files, stamps_ns)
+    """
 
+    name: str
+    folders: tuple[str, ...]
+    suffix: str = '.bin'
+    unit_ns: int = 1
+    read: Read = read_kitti
+    poses: str = ''
+    read_poses: Callable[[Path], Trajectory] = read_trajectory
+    beside: tuple[str, ...] = ('',)
 
-def nclt(path: Path) -> Dataset | None:
-    """Recognise velodyne_sync/ with names in us."""
-    files = scans_in(path / 'velodyne_sync', '.bin')
-    if not files:
-        return None
-    stamps_ns = [stamp_in_name(file, 1000) for file in files]
-    return Dataset('NCLT', files, stamps_ns, read=read_nclt)
-
-
-def boreas(path: Path) -> Dataset | None:
-    """Recognise lidar/ with names in us, beside applanix/ or calib/."""
-    files = scans_in(path / 'lidar', '.bin')
-    if not files or not ((path / 'applanix').is_dir() or (path / 'calib').is_dir()):
-        return None
-    stamps_ns = [stamp_in_name(file, 1000) for file in files]
-    return Dataset('Boreas', files, stamps_ns, read=structured(BOREAS_POINT))
-
-
-LAYOUTS = (
-    kitti_odometry,
-    kitti_raw,
-    nuscenes,
-    argoverse2,
-    mulran,
-    helipr,
-    newer_college,
-    nclt,
-    boreas,
-)
+    def __call__(self, path: Path) -> Dataset | None:
+        """Return the data set in a directory; None if it has another layout."""
+        folders = (scans_in(path / folder, self.suffix) for folder in self.folders)
+        files = next(filter(None, folders), [])
+        if not files or not any((path / name).is_dir() for name in self.beside):
+            return None
+        stamps_ns = [stamp_in_name(file, self.unit_ns) for file in files]
+        poses_path = path / self.poses
+        if not self.poses or not poses_path.is_file():
+            return Dataset(self.name, files, stamps_ns, read=self.read)
+        poses = self.read_poses(poses_path)
+        return Dataset(self.name, files, stamps_ns, poses, poses_path, self.read)
 
 
 def scans_in(folder: Path, suffix: str) -> list[Path]:
@@ -429,19 +352,52 @@ def packed(path: Path, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
 
 def content_of(path: Path) -> bytes:
     """Return the content of a file; raise FileFormatError if it cannot be read."""
-    try:
-        with open_regular(path) as file:
-            return file.read()
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    with refusing(path), open_regular(path) as file:
+        return file.read()
+
+
+LAYOUTS: tuple[Callable[[Path], Dataset | None], ...] = (
+    kitti_odometry,
+    kitti_raw,
+    nuscenes,
+    NamedByTime(
+        name='Argoverse 2',
+        folders=('sensors/lidar',),
+        suffix='.feather',
+        read=read_argoverse2,
+        poses='city_SE3_egovehicle.feather',
+        read_poses=argoverse2_poses,
+    ),
+    NamedByTime(
+        name='MulRan',
+        folders=('Ouster', 'sensor_data/Ouster'),
+        poses='global_pose.csv',
+        read_poses=mulran_poses,
+    ),
+    NamedByTime(
+        name='HeLiPR',
+        folders=('LiDAR/Ouster',),
+        read=structured(HELIPR_OUSTER),
+        poses='LiDAR_GT/Ouster_gt.txt',
+    ),
+    NamedByTime(
+        name='Newer College', folders=('raw_format/ouster_scan', 'ouster_scan'), suffix='.pcd'
+    ),
+    NamedByTime(name='NCLT', folders=('velodyne_sync',), unit_ns=1000, read=read_nclt),
+    NamedByTime(
+        name='Boreas',
+        folders=('lidar',),
+        unit_ns=1000,
+        read=structured(BOREAS_POINT),
+        beside=('applanix', 'calib'),
+    ),
+)
 
 
 def json_of(path: Path) -> list[dict[str, Any]]:
     """Return the rows of a table in JSON."""
-    try:
+    with refusing(path):
         rows = json.loads(content_of(path))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f'{path}: no JSON: {error}') from error
     if not isinstance(rows, list):
         raise FileFormatError(f'{path}: expected a list of rows')
     return rows
@@ -493,24 +449,24 @@ def scan_rows(path: Path, rows: npt.NDArray[Any], files: Sequence[Path]) -> npt.
 
 def stamp_in_name(file: Path, unit_ns: int) -> int:
     """Return the time, ns, that ends the name of a file as a number of a unit."""
-    digits = file.name.partition('.')[0].rpartition('__')[2]
-    if not digits.isdecimal() or len(digits) > 19 or int(digits) * unit_ns >= 2**63:
+    name = file.name.partition('.')[0].rpartition('__')[2]
+    seconds, _, digits = name.removeprefix('cloud_').rpartition('_')  # both in Newer College
+    is_time = digits.isdecimal() and (seconds or '0').isdecimal() and len(name) <= 26
+    is_time &= bool(seconds) == name.startswith('cloud_')
+    stamp_ns = int(seconds or 0) * 10**9 + int(digits) * unit_ns if is_time else -1
+    if not 0 <= stamp_ns < 2**63:
         raise FileFormatError(
             f'{file}: expected a name that ends with its time, {unit_ns} ns a unit'
         )
-    return int(digits) * unit_ns
+    return stamp_ns
 
 
 def euler_pose(xyz: npt.ArrayLike, rpy: npt.ArrayLike) -> Floats:
     """Return the (4, 4) pose of a position and roll, pitch, yaw in rad, R = Rz Ry Rx."""
-    roll, pitch, yaw = np.asarray(rpy, np.float64)
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in (roll, pitch, yaw))
+    from scipy.spatial.transform import Rotation
+
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
+    pose[:3, :3] = Rotation.from_euler('xyz', rpy).as_matrix()
     pose[:3, 3] = xyz
     return pose
 

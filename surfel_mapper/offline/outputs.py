@@ -8,7 +8,7 @@ So if summary.json is new, all other files are too.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import csv
 import io
 import os
@@ -73,6 +73,15 @@ def known_formats() -> dict[str, str]:
     return {**MAP_FORMATS, **{name: layer.formats[name] for name, layer in formats().items()}}
 
 
+def file_names(formats: Sequence[str]) -> list[str]:
+    """Return the names of the files of a replay in the output directory, for some formats."""
+    from surfel_mapper.files.trajectory import TRAJECTORY
+
+    files = known_formats()
+    always = (TRAJECTORY, SCANS, 'map.png', 'report.html', 'summary.json')
+    return [*(files[name] for name in formats), *always]
+
+
 def check_layer_formats(names: Sequence[str], config: Config) -> None:
     """
     Raise unless the layers that write some formats are switched on, and can write them.
@@ -117,59 +126,10 @@ def output_directory(recording: Path, wanted: Path | None) -> Path:
     """
     full = recording.resolve()
     directory = wanted or Path(f'{full.stem if recording.is_file() else full.name}_surfels')
-    check_not_scans(recording, directory)
     nearest = nearest_directory(directory)
     if not os.access(nearest, os.W_OK):
         raise FileFormatError(f'{directory}: no permission to write in {nearest}')
     return directory
-
-
-def check_not_scans(recording: Path, directory: Path) -> None:
-    """Raise FileFormatError if a directory is the folder of scans: map.ply would be one more."""
-    from surfel_mapper.files.scan_files import scan_files
-    from surfel_mapper.offline.scan_folder import is_scans
-
-    is_same = recording.is_dir() and directory.is_dir() and directory.samefile(recording)
-    if is_same and scan_files(recording) and is_scans(recording):
-        raise FileFormatError(
-            f'{directory}: the folder of the scans, where map.ply would be one of them; expected '
-            'another directory'
-        )
-
-
-def check_distinct(
-    recording: Path, wanted: Path | None, formats: Sequence[str], extra: Mapping[str, Path | None]
-) -> None:
-    """
-    Raise FileFormatError if two outputs of a replay have the same path.
-
-    Parameters
-    ----------
-    recording : Path
-        The recording, which names the directory if none is asked for.
-    wanted : Path, optional
-        The output directory asked for.
-    formats : sequence of str
-        Formats of the map and of layers.
-    extra : mapping of str to Path
-        Files beside the directory, by their options.
-
-    """
-    from surfel_mapper.files.trajectory import TRAJECTORY
-
-    directory = output_directory(recording, wanted)
-    files = known_formats()
-    names = [*(files[name] for name in formats), TRAJECTORY, SCANS, 'map.png', 'report.html']
-    paths = {os.path.realpath(directory / n): str(directory / n) for n in (*names, 'summary.json')}
-    for option, path in extra.items():
-        if path is None:
-            continue
-        full = os.path.realpath(path)
-        if full in paths:
-            raise FileFormatError(
-                f'{option} {path}: this replay writes {paths[full]} too, expected another file'
-            )
-        paths[full] = f'{path} for {option}'
 
 
 def check_writable(path: Path) -> None:
@@ -199,19 +159,13 @@ def check_formats(formats: Sequence[str], output: Path) -> None:
         from surfel_mapper.files.parquet import import_pyarrow
 
         import_pyarrow()
-    from surfel_mapper.files.trajectory import TRAJECTORY
-
-    files = known_formats()
-    names = [files[name] for name in formats if name not in (BAG, TILES)]
-    for name in [*names, TRAJECTORY, SCANS, 'map.png', 'report.html', 'summary.json']:
-        if (output / name).exists():
+    for name in file_names(formats):
+        if (output / name).exists() and name not in (MAP_FORMATS[BAG], MAP_FORMATS[TILES]):
             check_writable(output / name)
     if TILES in formats:
         from surfel_mapper.files.parquet_tiles import check_dataset
 
-        check_dataset(output / files[TILES])
-    if BAG in formats and (output / files[BAG]).is_file():
-        raise FileFormatError(f'{output / files[BAG]}: a file, expected a bag or nothing')
+        check_dataset(output / MAP_FORMATS[TILES])
 
 
 class ScanTrajectory:
@@ -227,32 +181,19 @@ class ScanTrajectory:
     """
 
     def __init__(self, mapper: Mapper) -> None:
-        self._mapper, self._map = mapper, mapper.map
+        self._map = mapper.map
         self.stamps_ns: list[int] = []
         self.poses: list[npt.NDArray[np.float64]] = []
-        self._T_sensor_body: list[npt.NDArray[np.float64]] = []
         self._cleared_at = self._map.cleared_at
 
     def add(self, update: Update) -> None:
         """Append the pose of a mapped scan."""
         if self._map.cleared_at != self._cleared_at:
             self._cleared_at = self._map.cleared_at
-            for kept in (self.stamps_ns, self.poses, self._T_sensor_body):
-                kept.clear()
+            self.stamps_ns.clear()
+            self.poses.clear()
         self.stamps_ns.append(update.stamp_ns)
         self.poses.append(update.T_map_sensor)
-        if update.T_fixed_body is not None:
-            from surfel_mapper.geometry import compose, inverse
-
-            T_map_body = compose(self._mapper.T_map_fixed, update.T_fixed_body)
-            self._T_sensor_body.append(compose(inverse(update.T_map_sensor), T_map_body))
-
-    @property
-    def of_body(self) -> npt.NDArray[np.float64]:
-        """The poses of the frame that registration tracks, T_map_body, (S, 4, 4)."""
-        import numpy as np
-
-        return self.matrices @ np.array(self._T_sensor_body).reshape(-1, 4, 4)
 
     def follow_alignment(self, mapper: Mapper) -> None:
         """Replace the poses of scans that loops or the alignment of the window have moved."""
@@ -275,14 +216,9 @@ class ScanTrajectory:
         import numpy as np
 
         stamps_ns, rows = np.unique(np.array(self.stamps_ns, np.int64), return_index=True)
-        return stamps_ns, self.in_fixed[rows]
-
-    @property
-    def in_fixed(self) -> npt.NDArray[np.float64]:
-        """The poses with the origin of the map added: T_fixed_sensor, (S, 4, 4)."""
-        poses = self.matrices
+        poses = self.matrices[rows]
         poses[:, :3, 3] += self._map.origin_m
-        return poses
+        return stamps_ns, poses
 
     @property
     def matrices(self) -> npt.NDArray[np.float64]:
@@ -374,7 +310,6 @@ def write_files(
 
     """
     from surfel_mapper.files.atomic import write_json
-    from surfel_mapper.files.trajectory import TRAJECTORY
     from surfel_mapper.viz.detail import drawn_surfels
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
@@ -396,9 +331,7 @@ def write_files(
     write_report(page, title, summary, surfels, history, meshes, sections, in_view)
     write_outcomes(output / SCANS, mapper.outcomes or [])
     write_json(figures, summary)
-    files = known_formats()
-    maps = [output / files[name] for name in formats]
-    return [*maps, output / TRAJECTORY, output / SCANS, picture, page, figures]
+    return [output / name for name in file_names(formats)]
 
 
 def write_outcomes(path: Path, outcomes: Sequence[ScanOutcome]) -> None:

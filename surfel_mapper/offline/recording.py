@@ -1,16 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Recordings that can be replayed, bags and folders of scans, behind one protocol.
+Recordings that can be replayed: bags and folders of scans, with the same members.
 
 ``open_recording`` opens the path of a ``Request`` and finds its topics and poses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol, TYPE_CHECKING
 
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.config import Config
@@ -20,42 +19,12 @@ from surfel_mapper.offline.pose_sources import PosePath
 from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.scan_folder import is_scans, ScanFolder
 
-if TYPE_CHECKING:
-    from surfel_mapper.pipeline import Mapper, Update
-
-
-class Recording(Protocol):
-    """
-    Scans with their poses.
-
-    Attributes
-    ----------
-    config : Config
-        Configuration for the mapper: the one given, with the source of the poses.
-    cuts : sequence of str
-        Files that end too early, with the place.
-
-    """
-
-    config: Config
-
-    @property
-    def cuts(self) -> list[str] | tuple[str, ...]:
-        """Files that end too early, with the place."""
-
-    @property
-    def num_scans(self) -> int:
-        """Estimated number of scans in the part that is mapped."""
-
-    @property
-    def recorded_s(self) -> float:
-        """Duration of the part that is mapped, s."""
-
-    def describe(self) -> dict[str, Any]:
-        """Return the sources of scans and poses, for the summary."""
-
-    def replay(self, mapper: Mapper, stopped: Callable[[], bool] = ...) -> Iterator[Update]:
-        """Feed the scans to a mapper; yield the update of each."""
+Recording = BagRecording | ScanFolder
+"""
+Scans with their poses: ``config`` for the mapper, with the source of the poses, ``cuts`` (files
+that end too early), ``num_scans`` and ``recorded_s`` of the part that is mapped, ``describe`` for
+the summary, and ``replay``, which feeds the scans to a mapper and yields the update of each.
+"""
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError, FileFormatError
 from surfel_mapper.files.scan_files import scan_files, scan_reader, SUFFIXES
 from surfel_mapper.offline import ouster_pcap
-from surfel_mapper.offline.datasets import Dataset, E57Scans, find_dataset
+from surfel_mapper.offline.datasets import Dataset, find_dataset
 from surfel_mapper.offline.depth_folders import DepthFolder, find_depth_folder, layout_of
 from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.offline.pose_choice import (
@@ -100,13 +100,9 @@ class ScanFolder:
 
     def __init__(self, request: Request, config: Config, poses: PosePath | None) -> None:
         self.path = request.path
-        suffix = self.path.suffix.lower()
-        self.dataset: Dataset | DepthFolder | OusterPcap | E57Scans | None
-        if suffix == ouster_pcap.SUFFIX:
+        self.dataset: Dataset | DepthFolder | OusterPcap | None
+        if self.path.suffix.lower() == ouster_pcap.SUFFIX:
             self.dataset = OusterPcap(self.path)
-        elif suffix == '.e57':
-            is_fixed = 'identity' in (request.poses_from, config.pose.source)
-            self.dataset = E57Scans(self.path, in_file_frame=is_fixed)
         else:
             self.dataset = find_dataset(self.path) or find_depth_folder(self.path)
         if isinstance(self.dataset, DepthFolder):
@@ -130,6 +126,8 @@ class ScanFolder:
         self._rows, rows_reason = self._pose_rows()
         missing = self.dataset.missing if isinstance(self.dataset, Dataset) else reason
         first = self.first_scan()
+        if first is None and len(self.files) == 1:
+            raise FileFormatError(self.first_error)
         choice = choose_for_folder(request, config, poses is not None, first, missing)
         self.config, self.pose_reason = choice.config, choice.reason or rows_reason or reason
         is_alone = self.config.pose.source == 'identity' or (len(self.files) == 1 and is_free)

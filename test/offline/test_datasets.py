@@ -12,9 +12,6 @@ from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.offline.datasets import find_dataset
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.request import Request
-from test import extras
-from test.files.test_point_formats import POINTS as PLACES_OF_E57
-from test.files.test_point_formats import poses_of_e57, write_e57
 from test.offline import dataset_folders as folders
 from test.offline.dataset_folders import ALL, lidar_poses, POINTS
 
@@ -176,24 +173,3 @@ def test_damage_is_refused_with_the_name_of_the_file(tmp_path, make, damage, cap
 
     assert main(['info', str(path)]) == 1
     assert 'Traceback' not in capsys.readouterr().err
-
-
-def test_scans_of_an_e57_file_are_in_the_frame_of_the_scanner_with_their_poses(tmp_path, capsys):
-    extras.load('pye57')
-    write_e57(tmp_path / 'a.e57', poses_of_e57())
-
-    with open_recording(Request(path=tmp_path / 'a.e57'), Config()) as recording:
-        scan = recording.first_scan()
-        found = recording.poses.trajectory
-    np.testing.assert_allclose(scan.points, PLACES_OF_E57, atol=1e-6)
-    with open_recording(
-        Request(path=tmp_path / 'a.e57', poses_from='identity'), Config()
-    ) as fixed:
-        x, y, z = PLACES_OF_E57.T
-        places = np.column_stack([1 - y, 2 + x, 3 + z])
-        np.testing.assert_allclose(fixed.first_scan().points, places, atol=1e-6)
-    half = np.sqrt(0.5)
-    np.testing.assert_allclose(found.q_xyzw, [(0, 0, half, half), (half, 0, 0, half)], atol=1e-9)
-    np.testing.assert_allclose(found.xyz, [(1, 2, 3), (-1, 0, 0.5)])
-    assert main(['info', str(tmp_path / 'a.e57')]) == 0
-    assert 'E57, 2 scans' in capsys.readouterr().out

@@ -258,13 +258,3 @@ def test_las_and_laz_files_are_scans(tmp_path, capsys):
     (tmp_path / 'bad.laz').write_bytes(b'LASF' + bytes(500))
     assert main(['replay', str(tmp_path / 'bad.laz'), '--output', str(tmp_path / 'out')]) == 1
     assert not Path(tmp_path / 'out').exists()
-
-
-def test_the_folder_of_the_scans_is_refused_as_output(tmp_path, capsys):
-    folder = write_scans(tmp_path / 'scans')
-    before = sorted(folder.iterdir())
-
-    assert main(['replay', str(folder), '--output', str(folder)]) == 1
-
-    assert f'{folder}: the folder of the scans' in capsys.readouterr().err
-    assert sorted(folder.iterdir()) == before
