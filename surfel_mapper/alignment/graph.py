@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.kernels.edges import (
+    fit_residual,
     NUM_MOMENTS,
     NUM_WEIGHTED,
     pair_moments,
@@ -150,18 +151,8 @@ class Graph:
         """Return the squared residual gaps after motions (E, 6) about centers, (E,) m^2."""
         result = np.zeros(len(self._edges))
         for row, ((s, t), edge) in enumerate(self._edges.items()):
-            a, b = (
-                points[rows].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-                for points, rows, T in zip(
-                    (self._points[s], self._points[t]),
-                    edge.pairs.T,
-                    (T_source[row], T_target[row]),
-                    strict=True,
-                )
-            )
-            arm = 0.5 * (a + b) - center[row]
-            gap = a - b - motion[row, :3] - np.cross(motion[row, 3:], arm)
-            result[row] = np.nansum(gap * gap)
+            about = (T_source[row], T_target[row], center[row], motion[row])
+            result[row] = fit_residual(self._points[s], self._points[t], edge.pairs, *about)
         return result
 
     def _sum(self, ends: tuple[int, int], edge: Edge) -> Floats:
@@ -230,10 +221,17 @@ def _check_definite(ends: tuple[int, int], weights: Floats) -> None:
     if (apart > ROUNDING * scale).any():
         row = int(apart.argmax())
         raise AlignmentError(f'{name} {row} is not symmetric: {weights[row].tolist()}')
-    smallest = np.linalg.eigvalsh(weights)[:, 0]
-    if (smallest < -ROUNDING * scale).any():
-        row = int(smallest.argmin())
-        raise AlignmentError(f'{name} {row} has a negative eigenvalue: {weights[row].tolist()}')
+    xx, yy, zz = weights[:, 0, 0], weights[:, 1, 1], weights[:, 2, 2]
+    xy, xz, yz = weights[:, 0, 1], weights[:, 0, 2], weights[:, 1, 2]
+    minors = (yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy)
+    determinant = xx * minors[0] - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    for size, values in ((1, (xx, yy, zz)), (2, minors), (3, (determinant,))):
+        for minor in values:
+            if (minor < -ROUNDING * scale**size).any():
+                row = int(minor.argmin())
+                raise AlignmentError(
+                    f'{name} {row} has a negative eigenvalue: {weights[row].tolist()}'
+                )
 
 
 def _check_rows(

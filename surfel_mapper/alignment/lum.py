@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from functools import partial
 import logging
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,7 +32,8 @@ from surfel_mapper.alignment.edge_terms import (
     weighted_terms,
 )
 from surfel_mapper.alignment.graph import Graph, Points
-from surfel_mapper.alignment.solver import components, exact_step, pcl_step
+from surfel_mapper.alignment.kernels.edges import COUNT
+from surfel_mapper.alignment.solver import components, exact_step, pcl_step, pose_covariances
 from surfel_mapper.errors import AlignmentError
 
 _log = logging.getLogger(__name__)
@@ -42,6 +42,28 @@ Floats = npt.NDArray[np.float64]
 Ends = tuple[int, int]
 
 JACOBIANS = ('exact', 'pcl')
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class EdgeEstimate:
+    """
+    Estimate of an edge from its pairs at the final poses, in the frame of vertex 0.
+
+    Attributes
+    ----------
+    center : (3,) float64, m
+        Mean of the middles of the pairs; motion and information are about it.
+    motion : (6,) float64
+        Motion of the source against the target that its pairs alone would still correct:
+        translation, m, then rotation vector, rad.
+    information : (6, 6) float64
+        Weight of the motion in the solution, translation first.
+
+    """
+
+    center: Floats
+    motion: Floats
+    information: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -62,6 +84,8 @@ class LumResult:
         Edges that were ignored in the last step, and the reason.
     unconnected : tuple of int
         Vertices that no used edge connects to vertex 0: their poses are unchanged.
+    edges : mapping of (source, target) to EdgeEstimate
+        Estimates of all edges that were not ignored.
     open_motions : mapping of (source, target) to (K, 6) float64
         Edges whose pairs do not determine all motions, and the undetermined motions, translation
         first, about the center of the pairs. Pairs on a line leave the rotation about it open,
@@ -74,6 +98,7 @@ class LumResult:
     residuals: Mapping[Ends, float]
     dropped: Mapping[Ends, str]
     unconnected: tuple[int, ...]
+    edges: Mapping[Ends, EdgeEstimate] = field(default_factory=dict)
     open_motions: Mapping[Ends, Floats] = field(default_factory=dict)
 
 
@@ -118,18 +143,40 @@ class LUM:
         """Number of clouds in the graph."""
         return self.graph.num_vertices
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; refuse a setting out of bounds."""
-        if name == 'jacobian' and value not in JACOBIANS:
+    @property
+    def jacobian(self) -> str:
+        """``exact``, or ``pcl`` for the steps that PCL takes."""
+        return self._jacobian
+
+    @jacobian.setter
+    def jacobian(self, value: str) -> None:
+        if value not in JACOBIANS:
             raise AlignmentError(f'jacobian {value!r}, expected one of {", ".join(JACOBIANS)}')
-        if name == 'max_iterations':
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-                raise AlignmentError(f'max_iterations {value!r}, expected an integer')
-            if value < 1:
-                raise AlignmentError(f'max_iterations {value}, expected one or more')
-        if name == 'convergence_threshold' and not 0.0 <= value < math.inf:
+        self._jacobian = value
+
+    @property
+    def max_iterations(self) -> int:
+        """Maximum number of steps."""
+        return self._max_iterations
+
+    @max_iterations.setter
+    def max_iterations(self, value: int) -> None:
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+            raise AlignmentError(f'max_iterations {value!r}, expected an integer')
+        if value < 1:
+            raise AlignmentError(f'max_iterations {value}, expected one or more')
+        self._max_iterations = int(value)
+
+    @property
+    def convergence_threshold(self) -> float:
+        """Mean change of a pose at which iteration ends."""
+        return self._convergence_threshold
+
+    @convergence_threshold.setter
+    def convergence_threshold(self, value: float) -> None:
+        if not 0.0 <= value < math.inf:
             raise AlignmentError(f'convergence_threshold {value}, expected zero or more, finite')
-        super().__setattr__(name, value)
+        self._convergence_threshold = float(value)
 
     def add_point_cloud(self, points: npt.ArrayLike, pose: npt.ArrayLike | None = None) -> int:
         """
@@ -234,6 +281,36 @@ class LUM:
         self.graph.set_poses(poses)
         return self._result(converged, iterations, ends, terms)
 
+    def pose_covariances(self) -> Floats:
+        """
+        Return the covariance of every pose at the present poses, (V, 6, 6).
+
+        Of a small motion of the vertex in the frame of vertex 0: translation of its origin, m,
+        then rotation vector, rad. It follows from the noise of the pairs, which is estimated from
+        their residuals (pairs without weights) or stated by the weights, and from the weights that
+        edges have in the solution. Pairs are taken as independent, and weights as of one direction
+        each, as those of surfels; weights of rank 3 give three times the covariance. 0 for vertex
+        0, nan for vertices that no edge connects to it.
+
+        Raises
+        ------
+        AlignmentError
+            If there are fewer than two vertices, the edges do not determine the poses, or
+            ``jacobian`` is ``pcl``.
+
+        """
+        if self.num_vertices < 2:
+            raise AlignmentError(f'{self.num_vertices} vertices, expected two or more')
+        if self.jacobian == 'pcl':
+            raise AlignmentError("covariances need jacobian='exact'")
+        ends, poses = self.graph.ends, self.graph.poses
+        terms, _ = self._terms(ends, poses)
+        freedom = np.ones(len(ends))
+        plain = ~self.graph.is_weighted
+        num_pairs = self.graph.moments(False)[:, COUNT]
+        freedom[plain] = np.maximum(3.0 * num_pairs - 6.0, 1.0)
+        return pose_covariances(poses, ends, terms, freedom)
+
     def _terms(self, ends: npt.NDArray[np.int64], poses: Floats) -> tuple[EdgeTerms, Floats]:
         """Return the terms of all edges at given poses, and the root mean square gaps."""
         weighted = self.graph.is_weighted
@@ -262,7 +339,7 @@ class LUM:
         terms: EdgeTerms,
     ) -> LumResult:
         names: list[Ends] = [(s, t) for s, t in ends.tolist()]
-        _, rms = self._terms(ends, self.graph.poses)
+        final, rms = self._terms(ends, self.graph.poses)
         counts = np.ones(len(ends), bool)
         counts[list(terms.dropped)] = False
         component = components(self.num_vertices, ends[counts])
@@ -272,5 +349,14 @@ class LUM:
             residuals=dict(zip(names, rms.tolist(), strict=True)),
             dropped={names[e]: terms.dropped[e] for e in sorted(terms.dropped)},
             unconnected=tuple(np.flatnonzero(component != component[0]).tolist()),
+            edges={
+                name: EdgeEstimate(
+                    center=final.center[e],
+                    motion=final.motion[e],
+                    information=final.information[e],
+                )
+                for e, name in enumerate(names)
+                if e not in final.dropped
+            },
             open_motions={names[e]: axes for e, axes in terms.weak.items()},
         )

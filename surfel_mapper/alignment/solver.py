@@ -144,6 +144,58 @@ def pcl_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
     return moved
 
 
+def pose_covariances(poses: Floats, ends: Ints, terms: EdgeTerms, freedom: Floats) -> Floats:
+    """
+    Return the covariances of the poses, (V, 6, 6); see LUM.pose_covariances.
+
+    Parameters
+    ----------
+    poses : (V, 6) float64
+        The solution.
+    ends : (E, 2) int64
+        Source and target of every edge.
+    terms : EdgeTerms
+        Terms at these poses.
+    freedom : (E,) float64
+        Inverse covariance of an edge over its information.
+
+    Notes
+    -----
+    With the system G x = sum A^T W m of the edges, where A = (A_source, -A_target) takes motions
+    of the vertices to that of an edge, and m has the covariance (freedom W)^-1, the covariance of
+    x is G^-1 (sum A^T W A / freedom) G^-1.
+
+    """
+    used = _used(ends, terms)
+    component = components(len(poses), ends[used])
+    free = component == component[0]
+    result = np.where(free[:, None, None], 0.0, np.full((6, 6), np.nan))
+    free[0] = False
+    used = used[np.isin(ends[used][:, 0], np.flatnonzero(component == component[0]))]
+    row_of = np.cumsum(free) - 1
+    size = 6 * int(free.sum())
+    origins = transforms(poses)[:, :3, 3]
+    system, noise = np.zeros((2, size, size))
+    for edge in used:
+        rows = np.zeros((6, size))
+        for end, sign in zip(ends[edge], (1.0, -1.0), strict=True):
+            if free[end]:
+                arm = _arms((terms.center[edge] - origins[end])[None])[0]
+                rows[:, 6 * row_of[end] : 6 * row_of[end] + 6] += sign * arm
+        share = rows.T @ terms.information[edge] @ rows
+        system += share
+        noise += share / freedom[edge]
+    try:
+        half = np.linalg.solve(system, noise)
+        covariance = np.linalg.solve(system, half.T)
+    except np.linalg.LinAlgError as error:
+        raise AlignmentError(f'the edges do not determine the poses: {error}') from error
+    blocks = covariance.reshape(size // 6, 6, size // 6, 6)
+    at = np.arange(size // 6)
+    result[free] = blocks[at, :, at]
+    return result
+
+
 def _used(ends: Ints, terms: EdgeTerms) -> Ints:
     """Return the rows of the edges that are not dropped."""
     counts = np.ones(len(ends), bool)
