@@ -12,11 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+import fcntl
 import json
 import math
 import os
 from pathlib import Path
 import re
+import secrets
 import shutil
 import tempfile
 from typing import Any, BinaryIO
@@ -24,7 +26,7 @@ from typing import Any, BinaryIO
 from surfel_mapper.errors import FileFormatError
 
 PART = '.surfel_mapper-'
-"""Start of the name of a temporary file: one that a killed process leaves is written again."""
+"""Start of the names of temporary files, which end with ``.part``."""
 
 
 @contextmanager
@@ -48,21 +50,44 @@ def replace_file(path: str | Path) -> Iterator[BinaryIO]:
     target = Path(os.path.realpath(path))
     if os.path.exists(target) and not os.path.isfile(target):
         raise FileFormatError(f'{path}: not a regular file, expected one, or a new name')
-    temporary = target.with_name(f'{PART}{target.name}.part')
+    temporary = target.with_name(f'{PART}{secrets.token_hex(8)}.part')
     try:
-        temporary.unlink(missing_ok=True)  # of a killed process, or a link that is a trap
-        with open(temporary, 'x+b') as file:
+        file = open(temporary, 'x+b')  # noqa: SIM115 - closed before it is renamed
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    except BaseException:  # without memory for the object: the file has been made
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+    try:
+        with file:
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             yield file
             file.flush()
             os.fsync(file.fileno())
             os.replace(temporary, target)
         sync(target.parent)
     except BaseException as error:
-        with suppress(OSError):  # there is none, or no such directory
-            temporary.unlink()
+        temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
             raise cannot_write(path, error) from error
         raise
+
+
+def remove_abandoned(directory: Path) -> list[Path]:
+    """Remove the temporary files of processes that have died, which hold no lock; return them."""
+    removed = []
+    for path in directory.glob(f'{PART}*.part'):
+        with suppress(OSError):  # locked, gone, or a link
+            file = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink()
+                removed.append(path)
+            finally:
+                os.close(file)
+    return removed
 
 
 @contextmanager

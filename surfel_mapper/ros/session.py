@@ -14,6 +14,7 @@ import time
 from surfel_mapper.compilation import CompileStage, run_stages
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError, SurfelMapperError
+from surfel_mapper.files.atomic import remove_abandoned
 from surfel_mapper.memory import lasting_objects
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
@@ -23,7 +24,7 @@ from surfel_mapper.ros.base_node import BaseNode
 from surfel_mapper.ros.filter_files import fault_of
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.main_thread import TaskQueue
-from surfel_mapper.ros.map_files import MapWriter, save_map
+from surfel_mapper.ros.map_files import directory_of, MapWriter, save_map
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.outputs import Outputs
 from surfel_mapper.ros.pose_outputs import registration_outputs
@@ -74,6 +75,8 @@ class Session:
         self.mapper.knows_source = config.pose.source != AUTO
         load_start(self.mapper)
         self.checkpoints = Checkpoints(self.mapper)
+        for path in remove_abandoned(directory_of(config.output)):
+            node.get_logger().info(f'{path} removed: its process died while it wrote a file')
         self.thread = MappingThread(self.mapper, tasks.fail)
         self._writer = MapWriter(self.mapper, self.thread)
         self.inputs = Inputs(node, config, self.thread, tasks.fail, self._on_choice)

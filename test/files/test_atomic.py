@@ -16,6 +16,7 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import (
     finite_or_none,
     make_directory,
+    remove_abandoned,
     replace_directory,
     replace_file,
     write_json,
@@ -152,15 +153,21 @@ def test_json_with_nan_is_refused_and_leaves_the_old_file(tmp_path):
     assert path.read_text() == 'old'
 
 
-def test_a_file_or_link_that_a_killed_process_left_is_replaced(tmp_path):
-    (tmp_path / 'other').write_bytes(b'other')
-    part = tmp_path / '.surfel_mapper-map.npz.part'
-    for leave in (lambda: part.write_bytes(b'half'), lambda: part.symlink_to(tmp_path / 'other')):
-        leave()
-        write(tmp_path / 'map.npz', b'a map')
-        assert (tmp_path / 'map.npz').read_bytes() == b'a map'
-        assert sorted(os.listdir(tmp_path)) == ['map.npz', 'other']
-    assert (tmp_path / 'other').read_bytes() == b'other'
+def test_files_of_dead_processes_are_removed_and_those_in_use_stay(tmp_path):
+    names = ['.surfel_mapper-dead.part', 'other.part', '.surfel_mapper-dead.npz']
+    for name in names:
+        (tmp_path / name).write_bytes(b'')
+    (tmp_path / '.surfel_mapper-link.part').symlink_to(tmp_path / 'other.part')
+
+    with replace_file(tmp_path / 'map.npz') as file:
+        file.write(b'a map')
+        assert remove_abandoned(tmp_path) == [tmp_path / names[0]]
+
+    assert (tmp_path / 'map.npz').read_bytes() == b'a map'
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        [*names[1:], '.surfel_mapper-link.part', 'map.npz']
+    )
+    assert remove_abandoned(tmp_path / 'nowhere') == []
 
 
 @pytest.mark.parametrize('error', [None, KeyboardInterrupt])

@@ -18,6 +18,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 
 from surfel_mapper.config import Config
+from surfel_mapper.files.atomic import remove_abandoned
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.ply import read_points
 from surfel_mapper.pipeline import Mapper
@@ -83,7 +84,7 @@ def leftovers(folder):
     'SIGKILL or SIGTERM at any step of `~/save_map`',
     happens='each file is complete, either the old or the new one',
     counted='nothing',
-    lost='at most the map being saved; a `.part` file remains until the next save',
+    lost='at most the map being saved; a `.part` file remains until the next start',
 )
 @pytest.mark.parametrize('how', SIGNALS)
 def test_killing_the_process_while_saving_leaves_complete_maps(tmp_path, how):
@@ -101,6 +102,7 @@ def test_killing_the_process_while_saving_leaves_complete_maps(tmp_path, how):
         number += 1
     assert number == STEPS_OF_SAVING
     assert load_map(tmp_path / 'map.npz')[0].digest() == new.map.digest()
+    assert len(leftovers(tmp_path)) == len(remove_abandoned(tmp_path)) <= 8
     assert not leftovers(tmp_path)
 
 

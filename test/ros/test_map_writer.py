@@ -15,6 +15,7 @@ from surfel_mapper.ros import map_files
 from surfel_mapper.ros.map_files import MapWriter
 from surfel_mapper.ros.mapping_thread import MappingThread
 from test.pipeline.made_scans import insert, mapper_with, scan_at
+from test.ros.driving import ARGUMENTS
 from test.ros.live import TIMEOUT_S
 
 
@@ -75,3 +76,14 @@ def test_saves_that_wait_are_one(mapper, thread):
     assert others[0].result(TIMEOUT_S).endswith(f'digest {mapper.map.digest()}')
     assert writer.save() is not others[0]
     writer.close()
+
+
+def test_files_of_a_killed_node_are_removed_at_the_next_start(start, peer, tmp_path):
+    folder = tmp_path / 'kept'
+    folder.mkdir()
+    part = folder / '.surfel_mapper-0011223344556677.part'
+    part.write_bytes(b'half a map')
+    node = start('node', *ARGUMENTS, '-p', f'output.directory:={folder}')
+    peer.diagnosis({'state': 'active'})
+    assert not part.exists()
+    assert f'{part} removed: its process died' in node.output
