@@ -111,6 +111,6 @@ class Street:
 
     def _hash(self) -> str:
         """Return a short hash of the parameters of the points."""
-        world = self.simulation.world.to_mapping()
-        state = [world, asdict(self.simulation.lidar), asdict(self.simulation.drive)]
+        primitives = [asdict(primitive) for primitive in self.simulation.world.primitives]
+        state = [primitives, asdict(self.simulation.lidar), asdict(self.simulation.drive)]
         return hashlib.sha256(json.dumps(state).encode()).hexdigest()[:12]
