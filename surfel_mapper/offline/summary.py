@@ -20,8 +20,13 @@ STATES = {
 }
 """Statements about the scans in a state of tracking."""
 
-MOST_SURROUNDED = 5
-"""Scans that may seem to be surrounded by what moves along, before a replay says so."""
+DOUBTFUL = {
+    'surrounded': 'much of what is seen seems to move along with the sensor',
+    'ambiguous': 'two places fit about equally well',
+}
+MOST_DOUBTFUL = 5
+"""Scans in one of these states before a replay says so: right maps of halls and streets have up to
+one ambiguous scan."""
 
 
 def as_text(summary: Mapping[str, Any], written: Sequence[str]) -> str:
@@ -96,7 +101,7 @@ def in_order(values: Mapping[str, Any], names: Sequence[str]) -> list[tuple[str,
 
 def uncertain_text(summary: Mapping[str, Any]) -> str:
     """Return why a map is in doubt, or lacks more scans than usual; empty if neither is so."""
-    texts = apart_text(summary), surrounded_text(summary), missing_text(summary)
+    texts = apart_text(summary), tracking_doubt(summary), missing_text(summary)
     clocks = [offset['text'] for offset in summary.get('clock_offsets', [])]
     return '\n'.join(filter(None, [*texts, *clocks]))
 
@@ -129,15 +134,15 @@ def tracking_text(summary: Mapping[str, Any]) -> str:
     )
 
 
-def surrounded_text(summary: Mapping[str, Any]) -> str:
-    """Return a sentence about surroundings that moved along; empty if they hardly did."""
-    spent = summary.get('registration', {}).get('tracking', {}).get('surrounded')
-    if spent is None or spent['scans'] < MOST_SURROUNDED:
-        return ''
-    return (
-        f'in {spent["scans"]} of {summary["scans"]["received"]} scans '
-        f'({spent["first_s"]:.3f} to {spent["last_s"]:.3f} s) '
-        'much of what is seen seems to move along with the sensor: their poses may be wrong'
+def tracking_doubt(summary: Mapping[str, Any]) -> str:
+    """Return a sentence for each state of tracking that puts the poses of scans in doubt."""
+    states = summary.get('registration', {}).get('tracking', {})
+    received = summary['scans']['received']
+    return '\n'.join(
+        f'in {spent["scans"]} of {received} scans ({spent["first_s"]:.3f} to '
+        f'{spent["last_s"]:.3f} s) {statement}: their poses may be wrong'
+        for state, statement in DOUBTFUL.items()
+        if (spent := states.get(state)) and spent['scans'] >= MOST_DOUBTFUL
     )
 
 

@@ -13,7 +13,7 @@ import pytest
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw, se3_exp
-from surfel_mapper.offline.summary import tracking_text
+from surfel_mapper.offline.summary import tracking_doubt, tracking_text
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.pipeline.registered_poses import StateTimes
@@ -396,4 +396,22 @@ def test_the_text_names_scans_by_their_state_of_tracking():
     assert tracking_text(summary) == (
         'registration: 2 of 6 scans did not determine all directions of motion '
         '(0.200 to 0.400 s)\n'
+    )
+
+
+@pytest.mark.parametrize('num_ambiguous', [4, 5])
+def test_a_map_of_many_ambiguous_scans_is_in_doubt(num_ambiguous):
+    states = StateTimes()
+    for number in range(20):
+        states.add(number * STEP_NS, ['ambiguous'] if number < num_ambiguous else [])
+
+    doubt = tracking_doubt(
+        {'registration': {'tracking': states.summary()}, 'scans': {'received': 20}}
+    )
+
+    assert doubt == (
+        ''
+        if num_ambiguous == 4
+        else 'in 5 of 20 scans (0.000 to 0.400 s) two places fit about equally well: '
+        'their poses may be wrong'
     )
