@@ -10,7 +10,6 @@ recording holds each surfel about five times instead of once a scan.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -36,38 +35,6 @@ MAX_POINTS = 20_000
 POINT_RADIUS_M = 0.02
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Snapshot:
-    """
-    Copies of what is shown of a scan, in the frame of the map.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    T_map_sensor : (4, 4) float64
-    points : (N, 3) float
-        Of the scan, in the frame of the sensor.
-    way, window : (S, 3), (W, 3) float64, m
-        Positions of the sensor so far, and of the scans in the window.
-    changed, surfels : DrawnDiscs
-        Surfels that the scan changed; all surfels, or None.
-    drawings : list of Drawing
-        Those of the layers, with all surfels.
-    origin_m : (3,) float64, m
-
-    """
-
-    stamp_ns: int
-    T_map_sensor: npt.NDArray[np.float64]
-    points: npt.NDArray[Any]
-    way: npt.NDArray[np.float64]
-    window: npt.NDArray[np.float64]
-    changed: DrawnDiscs
-    surfels: DrawnDiscs | None
-    drawings: list[Drawing]
-    origin_m: npt.NDArray[np.float64]
-
-
 class Viewer:
     """
     Shows a mapper at work; a context manager.
@@ -75,7 +42,7 @@ class Viewer:
     Parameters
     ----------
     mapper : Mapper
-        The mapper of the replay or node.
+        The mapper of the replay.
     scene : Scene, str or Path, optional
         Where it is shown; a path is an .rrd file to write; by default a window opens.
     colouring : str
@@ -122,64 +89,48 @@ class Viewer:
     def finish(self) -> None:
         """Show the whole map once more."""
         if self._last is not None:
-            self.show(self.snapshot(self._last, whole=True))
+            self._show(self._last, whole=True)
         self._scene.flush()
 
     def add(self, update: Update) -> None:
-        """Show a scan and its changes of the map."""
-        self.note(update)
-        self.show(self.snapshot(update))
-
-    def note(self, update: Update) -> None:
-        """Count a scan that may not be shown."""
+        """Show a scan and its changes of the map; all surfels if a quarter has changed."""
         self._positions.append(update.T_map_sensor[:3, 3])
-        self._removed += len(update.removed_voxel_index)
         self._last = update
-
-    def snapshot(self, update: Update, *, whole: bool = False) -> Snapshot:
-        """Copy what is shown of a scan, in the thread of the mapper; all surfels if due."""
-        mapper = self._mapper
-        num_voxels = mapper.map.num_voxels
+        num_voxels = self._mapper.map.num_voxels
+        self._removed += len(update.removed_voxel_index)
         change = abs(num_voxels - self._shown_voxels) + self._removed
-        surfels, drawings = None, []
-        if whole or change > NEW * num_voxels:
-            self._shown_voxels, self._removed = num_voxels, 0
-            surfels = self._discs(self._surfels())
-            drawings = [drawn for layer in mapper.layers.values() for drawn in layer.drawings()]
-        window = np.array([scan.T_map_sensor[:3, 3] for scan in mapper.window])
-        return Snapshot(
-            stamp_ns=update.stamp_ns,
-            T_map_sensor=update.T_map_sensor,
-            points=picked(update.scan.points),
-            way=self._way(),
-            window=window.reshape(-1, 3),
-            changed=self._discs(update.changed),
-            surfels=surfels,
-            drawings=drawings,
-            origin_m=mapper.map.origin_m,
-        )
+        self._show(update, whole=change > NEW * num_voxels)
 
-    def show(self, shot: Snapshot) -> None:
-        """Show a snapshot; any one thread may."""
+    def _show(self, update: Update, *, whole: bool) -> None:
+        """Show a scan, its changes of the map, and the whole map if it is due."""
         scene = self._scene
+        place = update.T_map_sensor[:3, 3]
         if not self._is_placed:
             self._is_placed = True
-            scene.set_origin(shot.origin_m)
-            place = shot.T_map_sensor[:3, 3]
+            scene.set_origin(self._mapper.map.origin_m)
             scene.look(place - AROUND_M, place + AROUND_M, place)
-        scene.set_stamp(shot.stamp_ns)
-        scene.pose('map/sensor', shot.T_map_sensor)
-        scene.points('map/sensor/scan', shot.points, POINT_RADIUS_M)
-        scene.lines('map/trajectory', [shot.way], [RED])
-        scene.points('map/window', shot.window, 0.15, ORANGE)
-        if shot.surfels is not None:
-            scene.colouring = Colouring.over(self._colouring, [shot.surfels])
-            scene.discs('map/surfels', shot.surfels)
-            for group in {drawing.name.partition('/')[0] for drawing in shot.drawings}:
-                scene.clear(f'map/{group}')
-            for drawing in shot.drawings:
-                self._log_drawing(f'map/{drawing.name}', drawing)
-        scene.discs('map/changed', shot.changed)
+        scene.set_stamp(update.stamp_ns)
+        scene.pose('map/sensor', update.T_map_sensor)
+        scene.points('map/sensor/scan', picked(update.scan.points), POINT_RADIUS_M)
+        scene.lines('map/trajectory', [self._way()], [RED])
+        window = np.array([scan.T_map_sensor[:3, 3] for scan in self._mapper.window])
+        scene.points('map/window', window.reshape(-1, 3), 0.15, ORANGE)
+        if whole:
+            self._show_map()
+        scene.discs('map/changed', self._discs(update.changed))
+
+    def _show_map(self) -> None:
+        """Show all surfels, and the shapes of the layers."""
+        self._shown_voxels, self._removed = self._mapper.map.num_voxels, 0
+        surfels = self._discs(self._surfels())
+        self._scene.colouring = Colouring.over(self._colouring, [surfels])
+        self._scene.discs('map/surfels', surfels)
+        layers = self._mapper.layers.values()
+        drawings = [drawing for layer in layers for drawing in layer.drawings()]
+        for group in {drawing.name.partition('/')[0] for drawing in drawings}:
+            self._scene.clear(f'map/{group}')
+        for drawing in drawings:
+            self._log_drawing(f'map/{drawing.name}', drawing)
 
     def _way(self) -> npt.NDArray[np.float64]:
         """Return the trajectory of the sensor, at most a thousand positions and the last."""
