@@ -138,7 +138,7 @@ class SurfelPlanes:
         """
         Return the distance of cells (K, 3) from their planes at a pose, its variance, the normals.
 
-        The variance is inf where there is no usable plane.
+        The variance of a cell without a usable plane is inf.
         """
         rows = self.rows_at(cells, T_map_sensor)
         none = np.full((1, PLANE), 0.0)

@@ -21,7 +21,7 @@ STATES = {
 """Statements about the scans in a state of tracking."""
 
 DOUBTFUL = {
-    'surrounded': 'much of what is seen seems to move along with the sensor',
+    'surrounded': 'much of the scene seems to move along with the sensor',
     'ambiguous': 'two places fit about equally well',
 }
 MOST_DOUBTFUL = 5

@@ -454,7 +454,7 @@ class RegisteredPoses:
         if moves:
             self._drops.warn(
                 'surrounded',
-                f'scan at {sighting.stamp_ns / 1e9:.6f} s: much of what it sees seems to move '
+                f'scan at {sighting.stamp_ns / 1e9:.6f} s: much of the scene seems to move '
                 'along, and its pose may be wrong',
             )
         return moves
