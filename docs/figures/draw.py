@@ -19,6 +19,7 @@ COLUMNS = {
     'lum': {'compute_ms': 'ms', 'x_pcl': 'times as fast as PCL'},
     'registration': {'cpu_ms': 'ms a scan', 'drift_m_100m': 'drift in 100 m, m'},
     'tsdf': {'cpu_ms': 'ms a scan'},
+    'robot': {'p50_ms': 'median latency, ms', 'p99_ms': '99th percentile of the latency, ms'},
     'live': {'p50_ms': 'median latency, ms', 'p99_ms': '99th percentile of the latency, ms'},
 }
 """Drawn columns of each bench, with their titles."""
@@ -51,7 +52,8 @@ def points(runs, column):
     for run in runs:
         for row in run['rows']:
             if row.get(column) is not None:
-                names = [value for value in row.values() if isinstance(value, str)]
+                texts = {name: value for name, value in row.items() if name != 'causes'}
+                names = [value for value in texts.values() if isinstance(value, str)]
                 names += [f'{row["voxel_m"]:g} m'] if 'voxel_m' in row else []
                 values[', '.join(names)].append((row[column], run['cpu']))
     return values

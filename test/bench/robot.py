@@ -108,7 +108,7 @@ def run(options: Options) -> Iterator[Row]:
     with street_over_dds(options) as street:
         if not street:
             return
-        permitted = {'real_time': 'yes' if may_run_in_real_time() else 'no'}
+        permitted = {'priority': 'real time' if may_run_in_real_time() else 'ordinary'}
         for case in FLOORS:
             yield {**permitted, **floor(options, case)}
         mount = [float(value) for value in street.simulation.drive.base_to_sensor]
