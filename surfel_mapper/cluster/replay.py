@@ -173,8 +173,8 @@ def surveyed(request: Request, config: Config) -> dict[str, Any]:
         description = recording.describe()
         if description['poses_from'] == 'registration':
             raise BagError(
-                f'{request.path}: no poses; expected them in every one of several recordings, in '
-                'one frame, and with workers too; `surfel-mapper replay` maps it alone, with the '
+                f'{request.path}: no poses; several recordings, or workers, need poses in one '
+                'frame; `surfel-mapper replay` maps it alone, with the '
                 'poses of its scans in trajectory.tum'
             )
         return {

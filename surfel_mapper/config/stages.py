@@ -216,9 +216,9 @@ class FramesConfig(Stage):
     )
     base_to_sensor: tuple[float, ...] = setting(
         (),
-        'Pose of the sensor in the base frame, x y z in m, qx qy qz qw, followed by those of '
-        'further sensors; empty: from /tf_static. With pose.source identity: the place of a '
-        'sensor that does not move, in the fixed frame; normals are oriented towards it.',
+        'Pose of the sensor in the base frame, x y z in m, qx qy qz qw; of several sensors one '
+        'after the other. Empty: from /tf_static. With pose.source identity: position of a sensor '
+        'that does not move, in the fixed frame, towards which normals point.',
     )
 
     def check(self, stage: str) -> None:

@@ -121,7 +121,7 @@ class Trajectory:
             object.__setattr__(self, 'stamp_ns', stamps.astype(np.int64, copy=False))
             lengths.append(len(stamps))
         if len(set(lengths)) > 1:
-            raise ValueError(f'positions, rotations, stamps: {lengths}, expected as many of each')
+            raise ValueError(f'positions, rotations, stamps: {lengths}, expected equal numbers')
 
     def __len__(self) -> int:
         """Return the number of poses."""

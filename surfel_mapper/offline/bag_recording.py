@@ -141,7 +141,9 @@ class BagRecording:
         if path is None:
             chosen = pose_topics(topics, config, name, self.topics, request.static_topics)
         elif request.pose_topic is not None:
-            raise BagError(f'{request.path}: poses of {request.pose_topic} or of {path.path}?')
+            raise BagError(
+                f'{request.path}: poses of {request.pose_topic} and of {path.path}, expected one'
+            )
         elif not path.has_stamps and len(self.topics) > 1:
             raise BagError(f'{path.path}: poses without times, for several topics of clouds')
         else:
@@ -254,14 +256,14 @@ def check_mounts(request: Request, topics: list[str], config: Config) -> None:
     unknown = [topic for topic in request.mounts if topic not in topics]
     if request.mounts and (missing or unknown):
         raise BagError(
-            f'{request.path}: places of sensors for {", ".join(request.mounts)}, expected one '
+            f'{request.path}: mounts of {", ".join(request.mounts)}, expected one '
             f'for each of {", ".join(topics)}'
         )
     frames = config.frames
     if len(topics) > 1 and not (request.mounts or frames.sensors) and frames.base_to_sensor:
         raise BagError(
-            f'{request.path}: frames.base_to_sensor is the place of one sensor, not of '
-            f'{len(topics)}; name one for each topic with --mount, or their frames in '
+            f'{request.path}: frames.base_to_sensor is the pose of one sensor, not of '
+            f'{len(topics)}; state one for each topic with --mount, or their frames in '
             'frames.sensors'
         )
 

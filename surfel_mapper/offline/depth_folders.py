@@ -282,7 +282,7 @@ def camera_of(
     if file is None:
         assert nominal is not None
         logger.warning(
-            '%s: no file of intrinsics, those of the data set are taken: fx, fy, cx, cy %s',
+            '%s: no file of intrinsics, uses those of the data set: fx, fy, cx, cy %s',
             *(path, nominal),
         )
         return nominal, units_per_m

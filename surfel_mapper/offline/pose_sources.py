@@ -288,8 +288,8 @@ def static_transforms(
         ):
             raise BagError(
                 f'{reader.path}: {first_topic} and {topic} disagree about the frame {child}: '
-                f'{placed(agreed)}, {placed(pose)}; --static-topic chooses one, --mount gives the '
-                'place of a sensor'
+                f'{placed(agreed)}, {placed(pose)}; --static-topic selects one, --mount states '
+                'the pose of a sensor'
             )
     return first
 

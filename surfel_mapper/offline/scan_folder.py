@@ -221,7 +221,7 @@ class ScanFolder:
             if columns.keys() >= SURFEL_COLUMNS:
                 raise BagError(
                     f'{self.files[number]}: surfels of a map, expected scans; extract, evaluate '
-                    'and view read them; set map.load to a map.npz to go on from a map'
+                    'and view read them; to continue a map, set map.load to its map.npz'
                 )
         else:
             points, columns = self.dataset.scan(number)

@@ -13,15 +13,15 @@ LEAST_MAPPED = 0.95
 """Share of the scans that came which a map needs; with fewer, something is wrong."""
 
 STATES = {
-    'lost': 'had no certain place when they came',
-    'unconfirmed': 'waited for the next ones to agree with their place',
-    'ambiguous': 'fitted two places about equally well',
+    'lost': 'had no certain place on the map',
+    'unconfirmed': 'waited to be confirmed by the next scans',
+    'ambiguous': 'fit two places about equally well',
     'degenerate': 'did not determine all directions of motion',
 }
 """Statements about the scans in a state of tracking."""
 
 DOUBTFUL = {
-    'surrounded': 'much of the scene seems to move along with the sensor',
+    'surrounded': 'most surfaces seem to move with the sensor',
     'ambiguous': 'two places fit about equally well',
 }
 MOST_DOUBTFUL = 5

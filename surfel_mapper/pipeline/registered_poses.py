@@ -454,8 +454,8 @@ class RegisteredPoses:
         if moves:
             self._drops.warn(
                 'surrounded',
-                f'scan at {sighting.stamp_ns / 1e9:.6f} s: much of the scene seems to move '
-                'along, and its pose may be wrong',
+                f'scan at {sighting.stamp_ns / 1e9:.6f} s: most surfaces seem to move with '
+                'the sensor: the pose may be wrong',
             )
         return moves
 

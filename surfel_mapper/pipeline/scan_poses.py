@@ -126,7 +126,7 @@ class ScanPoses:
         if move is not None:
             self._note_move(move)
         if number := self.transforms.num_forgotten - forgotten:
-            reason = f'{number} old transforms dropped: over {MAX_TRANSFORMS} are held'
+            reason = f'{number} old transforms dropped: the buffer holds {MAX_TRANSFORMS}'
             self._drops.message('too_many_transforms', reason, number)
 
     def _note_move(self, move: FrameMove) -> None:

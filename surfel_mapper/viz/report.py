@@ -41,9 +41,9 @@ POLICY = (
 STATES = {
     'lost': 'not placed on the map',
     'unconfirmed': 'placed again, not yet confirmed by the next scans',
-    'ambiguous': 'of which another pose fits as well',
+    'ambiguous': 'with another pose that fits as well',
     'degenerate': 'without surfaces that fix every direction',
-    'surrounded': 'of which most points move along with the sensor',
+    'surrounded': 'with most surfaces moving with the sensor',
 }
 """States of tracking in words."""
 

@@ -117,7 +117,7 @@ def test_scans_without_a_certain_place_become_a_map_of_their_own(tmp_path, capsy
     said = capsys.readouterr()
     assert '4 of 8 scans have no certain place on the map' in said.err
     assert '4 of 8 scans have no certain place on the map' in said.out
-    assert re.search(r'registration: \d of 8 scans had no certain place when they came', said.out)
+    assert re.search(r'registration: \d of 8 scans had no certain place on the map', said.out)
     assert 'apart_1: 4 scans' in (output / 'report.html').read_text()
     summary = json.loads((output / 'summary.json').read_text())
     assert summary['scans']['dropped'] == {'apart': 4}

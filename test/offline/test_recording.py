@@ -147,7 +147,7 @@ def test_several_topics_are_mapped_each_from_its_place_in_the_tree(tmp_path):
     [
         ({}, {'topics': BOTH, 'mounts': {'/points': (*MOUNT_M, *NO_TURN)}}, 'one for each of'),
         ({}, {'topics': ('/points',), 'mounts': {'/rear': (*MOUNT_M, *NO_TURN)}}, 'for each of'),
-        (MOUNTED, {'topics': BOTH}, 'is the place of one sensor, not of 2'),
+        (MOUNTED, {'topics': BOTH}, 'is the pose of one sensor, not of 2'),
         ({}, {'topics': ('/points', '/front')}, 'no topic /front'),
     ],
 )
@@ -251,7 +251,7 @@ def test_a_bag_that_is_cut_off_takes_the_first_of_more_poses(tmp_path):
 
 
 def test_two_sources_of_poses_are_refused(tmp_path, bag):
-    with pytest.raises(BagError, match='poses of /odom or of'):
+    with pytest.raises(BagError, match='poses of /odom and of'):
         mapped(bag, poses=pose_file(tmp_path, 'tum'), pose_topic='/odom')
 
 

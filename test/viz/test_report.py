@@ -214,6 +214,6 @@ def test_doubtful_poses_are_stated_in_words(tmp_path):
     tracking = {'surrounded': spent, 'lost': {'scans': 0, 'seconds': 0.0}}
     parsed = report(tmp_path, registration={'tracking': tracking, 'apart': []})
     cells = [text for tag, _, text in parsed.text if tag == 'td']
-    assert 'of which most points move along with the sensor' in cells
+    assert 'with most surfaces moving with the sensor' in cells
     assert 'surrounded' not in cells
     assert 'not placed on the map' not in cells
