@@ -177,8 +177,8 @@ def measured_channels(
     labels = scan.columns.get('label') if has_label else None
     if colors is not None:
         colors = np.pad(colors, ((0, num_free), (0, 0)))
-    if labels is not None:
-        labels = np.pad(labels, (0, num_free), constant_values=-1)
+    if labels is not None and num_free:
+        labels = np.concatenate([labels, np.full(num_free, -1, np.int32)])  # wider if unsigned
     return points, {'colors': colors, 'labels': labels}
 
 

@@ -171,6 +171,14 @@ def test_colours_and_labels_of_points_enter():
     assert set(np.unique(labels)) == {-1, 7}
 
 
+@pytest.mark.parametrize('dtype', [np.uint8, np.uint32, np.int32])
+def test_labels_of_any_whole_type_enter_with_rays_without_a_return(dtype):
+    layer = mapper_with(**{'layers.tsdf.semantics': 'single'}).tsdf
+    scan = sphere(label=np.full(len(RING), 7, dtype))
+    layer.insert(replace(scan, free=np.array([[0.0, 0.0, 1.0]])), np.eye(4))
+    assert set(layer.field.labels_at(scan.points)[0]) == {7}
+
+
 def test_a_cloud_of_two_points_is_fused():
     mapper = mapper_with()
     mapper.add_pose('odom', 'lidar', S, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))

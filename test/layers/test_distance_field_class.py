@@ -22,7 +22,7 @@ def test_field_of_a_sphere_has_its_distances_gradients_colours_and_labels():
         SPHERE,
         np.eye(4),
         colors=np.tile(np.array([10, 20, 30], np.uint8), (len(SPHERE), 1)),
-        labels=np.full(len(SPHERE), 3),
+        labels=np.full(len(SPHERE), 3, np.uint8),
     )
     assert done.num_updated == len(field) > 0
 
@@ -38,6 +38,15 @@ def test_field_of_a_sphere_has_its_distances_gradients_colours_and_labels():
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 2.0).max() < 0.05
     assert set(map(tuple, mesh.colors.tolist())) == {(10, 20, 30)}
     assert field.esdf(max_m=3.0).sample([(1.0, 0.0, 0.0)]) == pytest.approx(1.0, abs=0.2)
+
+
+def test_labels_beyond_the_largest_are_refused_and_the_field_unchanged():
+    field = DistanceField(CONFIG)
+    with pytest.raises(CloudFormatError, match=r'labels: .* to 16777216, expected .* to 16777215'):
+        field.add(SPHERE, np.eye(4), labels=np.full(len(SPHERE), 1 << 24))
+    assert len(field) == 0
+    field.add(SPHERE, np.eye(4), labels=np.full(len(SPHERE), (1 << 24) - 1))
+    assert set(field.labels_at(SPHERE)[0]) == {(1 << 24) - 1}
 
 
 def test_depth_image_is_fused_with_its_colours():
@@ -71,6 +80,7 @@ def test_a_depth_that_means_unknown_frees_nothing():
     field = DistanceField(CONFIG)
     depth = np.full((60, 80), 9.0, np.float32)
     field.add_depth(depth, CAMERA, np.eye(4), unknown=9.0)
+    field.add_depth(np.full((60, 80), 65535, np.uint16), CAMERA, np.eye(4))
     assert len(field) == 0
     field.add_depth(depth, CAMERA, np.eye(4))
     assert set(field.states([(0.0, 0.0, 2.0)])) == {FREE}

@@ -117,7 +117,7 @@ class DistanceField:
         points = checked_points(points)
         num = len(points)
         colors = checked_column('colors', colors, np.uint8, ((num, 3), (num, 4)))
-        labels = checked_column('labels', labels, np.signedinteger, ((num,),))
+        labels = checked_column('labels', labels, np.integer, ((num,),))
         if sensor is None:
             stamp_ns = as_whole('stamp_ns', stamp_ns)
             return self._points.integrate(
