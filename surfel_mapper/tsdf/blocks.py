@@ -63,7 +63,7 @@ Float32 = npt.NDArray[np.float32]
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
     """
-    Content of blocks outside of a map: copied, removed, or to be inserted.
+    Content of blocks outside of a map: copied, or to be inserted.
 
     Attributes
     ----------
@@ -388,8 +388,7 @@ class BlockMap(BlockArrays):
                 *(self.num_blocks, self.max_bytes),
             )
         self.num_evicted += len(leaving) + int((~fit).sum())
-        for first in range(0, len(leaving), PART):
-            self.remove(leaving[first : first + PART])
+        self.remove(leaving)
         return fit
 
     @property
@@ -466,34 +465,19 @@ class BlockMap(BlockArrays):
         remove_blocks(rows, self.head, self._hash.arrays, self._state)
         return len(rows)
 
-    def evict(self, position: npt.ArrayLike) -> Blocks:
-        """
-        Remove the blocks outside of the window and return their content.
-
-        Parameters
-        ----------
-        position : (3,) float
-            Centre of the window in the map frame, m.
-
-        Returns
-        -------
-        Blocks
-            Blocks whose centre is farther than max_radius_m.
-
-        """
-        config, rows = self.config, self.rows()
-        leaves = np.zeros(len(rows), bool)
+    def evict(self, position: npt.ArrayLike) -> None:
+        """Remove the blocks whose centres are farther than max_radius_m from a position, m."""
+        config = self.config
         if config.max_radius_m > 0.0:
+            rows = self.rows()
             centres = (self.index(rows) + 0.5) * config.block_size_m
-            leaves |= np.linalg.norm(centres - np.asarray(position), axis=1) > config.max_radius_m
-        return self.remove(rows[leaves])
+            apart_m = np.linalg.norm(centres - np.asarray(position), axis=1)
+            self.remove(rows[apart_m > config.max_radius_m])
 
-    def remove(self, rows: Int64) -> Blocks:
-        """Remove blocks and return their content."""
-        removed = self.copied(rows)
+    def remove(self, rows: Int64) -> None:
+        """Remove blocks."""
         self._wipe(rows)
         remove_blocks(rows, self.head, self._hash.arrays, self._state)
-        return removed
 
     def copied(self, rows: Int64) -> Blocks:
         """Return a copy of the content of blocks."""

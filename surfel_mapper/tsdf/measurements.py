@@ -85,7 +85,6 @@ def settings(config: TsdfConfig) -> Float32:
     values[kernels.MIN_WEIGHT] = LEAST_WEIGHT
     values[kernels.MAX_WEIGHT] = MAX_WEIGHT
     values[kernels.CONTRADICTS] = 0.5 * config.voxel_size_m
-    values[kernels.LEAST] = LEAST_WEIGHT
     return values
 
 

@@ -46,7 +46,7 @@ class Sampled:
     gradient: npt.NDArray[np.float32]
 
 
-def sample(blocks: BlockMap, points: npt.ArrayLike, *, min_weight: float = 0.0) -> Sampled:
+def sample(blocks: BlockMap, points: npt.ArrayLike) -> Sampled:
     """
     Return distance and gradient at points, interpolated between voxel centres.
 
@@ -56,8 +56,6 @@ def sample(blocks: BlockMap, points: npt.ArrayLike, *, min_weight: float = 0.0) 
         The map.
     points : (P, 3) float
         In the map frame, m.
-    min_weight : float
-        Voxels of smaller weight count as not observed.
 
     Raises
     ------
@@ -73,7 +71,6 @@ def sample(blocks: BlockMap, points: npt.ArrayLike, *, min_weight: float = 0.0) 
         scaled,
         1.0 / blocks.config.voxel_size_m,
         bits,
-        np.float32(min_weight),
         blocks.field,
         head,
         table,
@@ -84,15 +81,11 @@ def sample(blocks: BlockMap, points: npt.ArrayLike, *, min_weight: float = 0.0) 
     return Sampled(distance=distance, gradient=gradient)
 
 
-def states(
-    blocks: BlockMap,
-    points: npt.ArrayLike,
-    *,
-    min_weight: float = 0.0,
-    occupied_up_to_m: float | None = None,
-) -> npt.NDArray[np.uint8]:
+def states(blocks: BlockMap, points: npt.ArrayLike) -> npt.NDArray[np.uint8]:
     """
     Return the state of the voxel at each point: UNKNOWN, FREE or OCCUPIED.
+
+    Voxels up to half a voxel in front of a surface, and those behind it, are occupied.
 
     Parameters
     ----------
@@ -100,11 +93,6 @@ def states(
         The map.
     points : (P, 3) float
         In the map frame, m.
-    min_weight : float
-        Voxels of smaller weight count as not observed.
-    occupied_up_to_m : float, optional
-        Voxels of this signed distance or less are occupied, including those behind a surface;
-        half a voxel by default.
 
     Raises
     ------
@@ -113,15 +101,12 @@ def states(
 
     """
     scaled, bits = in_voxels(blocks, points)
-    if occupied_up_to_m is None:
-        occupied_up_to_m = 0.5 * blocks.config.voxel_size_m
     head, table, state = blocks.lookup
     states = np.empty(len(scaled), np.uint8)
     kernels.classify(
         scaled,
         bits,
-        np.float32(min_weight),
-        np.float32(occupied_up_to_m),
+        np.float32(0.5 * blocks.config.voxel_size_m),
         blocks.field,
         head,
         table,

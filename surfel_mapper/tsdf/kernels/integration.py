@@ -32,7 +32,6 @@ from surfel_mapper.tsdf.kernels.lookup import (
     CONTRADICTS,
     DROPOFF,
     gather,
-    LEAST,
     locate,
     MAX_RANGE,
     MAX_WEIGHT,
@@ -131,7 +130,7 @@ def integrate_blocks(blocks, offsets, field, sensor, images, settings, channels,
             fuse_color(color_image, bounds, u, v, mixed, signed, weight, color[row])
         mean, total = field[row, 0], field[row, 1]
         fuse(signed, weight, settings[CONTRADICTS], rate, mean, total, fused)
-        figures[b, MOVED] = largest_step(mean, fused, total, weight, settings[LEAST])
+        figures[b, MOVED] = largest_step(mean, fused, total, weight, settings[MIN_WEIGHT])
         replace(fused, weight, most, mean, total)
         figures[b, SOLID], figures[b, INSIDE] = count_solid(mean, total, tau)
 

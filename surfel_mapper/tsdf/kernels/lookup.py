@@ -22,12 +22,11 @@ MAX_DIFFERENCE = 4
 DROPOFF = 5
 """Distance behind the surface at which weights begin to fall, m; less than TAU."""
 MIN_WEIGHT = 6
+"""Least weight of a measurement, and of a voxel in the mesh; positive."""
 MAX_WEIGHT = 7
-LEAST = 8
-"""Least weight of a voxel in the mesh; positive."""
-CONTRADICTS = 9
+CONTRADICTS = 8
 """Difference from which a measurement contradicts a voxel, m."""
-NUM_SETTINGS = 10
+NUM_SETTINGS = 9
 
 BORDER = ((2, 2), (1, 2))
 """Rows above and below the image, and columns left and right of it, that hold 0."""

@@ -40,7 +40,7 @@ from surfel_mapper.tsdf.kernels.integration import (
     prefetch_block,
     SOLID,
 )
-from surfel_mapper.tsdf.kernels.lookup import CONTRADICTS, LEAST, MAX_WEIGHT, MIN_WEIGHT, TAU
+from surfel_mapper.tsdf.kernels.lookup import CONTRADICTS, MAX_WEIGHT, MIN_WEIGHT, TAU
 from surfel_mapper.tsdf.kernels.point_cells import (
     COSINE,
     entry_of,
@@ -307,7 +307,7 @@ def fuse_blocks(blocks, cells, origin, settings, voxel_m, bits, field, figures):
                     continue
             moved = mean[voxel] + (value - mean[voxel]) * (weight / (total[voxel] + weight))
             weight = min(total[voxel] + weight, most)
-            replace(voxel, moved, weight, settings[LEAST], mean, total, figures[b])
+            replace(voxel, moved, weight, settings[MIN_WEIGHT], mean, total, figures[b])
         content = mean, total, figures[b]
         free_voxels(freed[b], corners[b], origin, settings, voxel_m, bits, rates[b], content)
 
@@ -332,7 +332,7 @@ def free_voxels(freed, corner, origin, settings, voxel_m, bits, rate, content):
             figures[OBSERVED] += 1
             weight = total[voxel]
             if weight == 0.0:
-                replace(voxel, tau_m, least, settings[LEAST], mean, total, figures)
+                replace(voxel, tau_m, least, least, mean, total, figures)
             elif mean[voxel] < tau_m:
                 x = corner[0] + (voxel & mask) + 0.5 - origin[0]
                 y = corner[1] + (voxel >> bits & mask) + 0.5 - origin[1]
@@ -343,7 +343,7 @@ def free_voxels(freed, corner, origin, settings, voxel_m, bits, rate, content):
                     moved += (tau_m - moved) * max(new / (weight + new), rate)
                 elif faded == least and rate > 0.0:
                     moved = tau_m
-                replace(voxel, moved, faded, settings[LEAST], mean, total, figures)
+                replace(voxel, moved, faded, least, mean, total, figures)
 
 
 @njit(cache=True, nogil=True, inline='always')

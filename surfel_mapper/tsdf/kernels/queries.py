@@ -45,13 +45,12 @@ def find_voxel(i, j, k, bits, recent, head, table, depth):
 
 
 @njit(cache=True, nogil=True)
-def sample(points, scale, bits, least, field, head, table, state, distance, gradient):
+def sample(points, scale, bits, field, head, table, state, distance, gradient):
     """
     Interpolate the distance at points and its gradient.
 
     points    (P, 3) float64, in voxels; non-finite points are unknown
     scale     float64, voxels a metre
-    least     float32, smallest weight of each of the eight voxels
     field     (R, 2, N) float32
     distance  (P,) float32 m, out; nan if a voxel is missing
     gradient  (P, 3) float32, out; nan if a voxel is missing
@@ -80,7 +79,7 @@ def sample(points, scale, bits, least, field, head, table, state, distance, grad
                 table,
                 depth,
             )
-            if row < 0 or not field[row, 1, voxel] >= least or field[row, 1, voxel] <= 0.0:
+            if row < 0 or not field[row, 1, voxel] > 0.0:
                 complete = False
                 break
             corner[n] = field[row, 0, voxel]
@@ -99,7 +98,7 @@ def sample(points, scale, bits, least, field, head, table, state, distance, grad
 
 
 @njit(cache=True, nogil=True)
-def classify(points, bits, least, occupied, field, head, table, state, states):
+def classify(points, bits, occupied, field, head, table, state, states):
     """
     Classify the voxel of each point as unknown, free or occupied.
 
@@ -117,6 +116,6 @@ def classify(points, bits, least, occupied, field, head, table, state, states):
         row, voxel = find_voxel(
             np.int64(x), np.int64(y), np.int64(z), bits, recent, head, table, depth
         )
-        if row < 0 or not field[row, 1, voxel] >= least or field[row, 1, voxel] <= 0.0:
+        if row < 0 or not field[row, 1, voxel] > 0.0:
             continue
         states[p] = OCCUPIED if field[row, 0, voxel] <= occupied else FREE

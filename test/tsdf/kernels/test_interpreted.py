@@ -42,7 +42,8 @@ for carve_m in (20.0, 0.0):
             print(by_points.integrate(points, pose, number))
         else:
             print(one.integrate(image, pose, number))
-        print(len(one.blocks.evict(pose[:3, 3])))
+        one.blocks.evict(pose[:3, 3])
+        print(one.blocks.num_blocks)
     blocks = one.blocks
     places = rng.normal(size=(50, 3)) + [0.0, -2.0, 1.0]
     sampled = sample(blocks, places)
