@@ -77,7 +77,7 @@ class TsdfConfig(Stage):
         10.0,
         'A surface that is gone becomes free within this time of being seen through, and one that '
         'comes appears, however often the voxels were observed before, s; colours and labels '
-        'follow as fast; 0: only as max_weight says. Needs stamps.',
+        'follow as fast; 0: after as many scans as have seen the opposite. Needs stamps.',
         low=0.0,
         high=1e9,
     )
