@@ -119,7 +119,7 @@ def checked_column(
 
 def checked_labels(name: str, labels: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
     """Return labels as int32; raise CloudFormatError if they are not whole or out of range."""
-    ends = labels.min(initial=-1), labels.max(initial=-1)
+    ends = (labels.min(), labels.max()) if labels.size else (0, 0)
     if labels.dtype.kind not in 'iu' or not -1 <= ends[0] <= ends[1] <= MAX_LABEL:
         raise CloudFormatError(
             f'{name}: {labels.dtype} from {ends[0]} to {ends[1]}, expected whole numbers from -1 '
