@@ -145,8 +145,8 @@ def test_noise_of_a_plane_is_averaged():
     vertices = mesh_of(fused(points, np.eye(4), carve_m=0.0)).vertices
     vertices = vertices[np.abs(vertices[:, 1:]).max(axis=1) < 1.5]
     error = (vertices - [4.0, 0.0, 0.0]) @ normal
-    # a cell merges at least ten points: 0.02 / 10^(1/2) is 6.3 mm
-    assert np.sqrt(np.mean(error**2)) < 0.0065
+    # a voxel has 32 points on average: 0.02 / 32^(1/2) is 3.5 mm; more where noise divides them
+    assert np.sqrt(np.mean(error**2)) < 0.0051
 
 
 def test_ground_between_the_rings_of_a_lidar_is_smooth():
