@@ -12,19 +12,20 @@ the cube of the inverse range, so each counts by the cube of its range.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.grid import Grid
-from surfel_mapper.models.kernels.coverage import count_points
+from surfel_mapper.models.grid import Grid, rim_of
+from surfel_mapper.models.kernels.coverage import count_points, cover_cells
 from surfel_mapper.models.multi_model import MultiModel
 from surfel_mapper.models.primitives import Surface
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
 
 LEAST_POINTS = 6
 """Points in the cells of a dense patch, at least; each cell counts by its points."""
@@ -41,8 +42,7 @@ MOST_GAPS = 0.25
 CLOSED_BY = 5
 """A cell with as many covered ones among its 8 neighbours is covered too."""
 
-SIDES = ((-1, 0), (1, 0), (0, -1), (0, 1))
-CORNERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
+RULES = float(LEAST_POINTS), LEAST_SHARE, CLOSED_BY
 
 
 def covered(model: MultiModel, points: npt.NDArray[Any], view: Array) -> MultiModel:
@@ -59,33 +59,27 @@ def covered(model: MultiModel, points: npt.NDArray[Any], view: Array) -> MultiMo
         Position of the sensor.
 
     """
-    every, pitch_m = model.patches, model.voxel_size_m
-    number = np.bincount(model.labels[model.labels >= 0], minlength=len(every))
-    cells = [np.count_nonzero(p.grid.filled) * (p.grid.pitch_m / pitch_m) ** 2 for p in every]
-    chosen = np.flatnonzero(number[: len(every)] >= LEAST_MEAN * np.array(cells))
+    finer, pitch_m = model.patches, model.voxel_size_m
+    number = np.bincount(model.labels[model.labels >= 0], minlength=len(finer))
+    cells = [np.count_nonzero(p.grid.filled) * (p.grid.pitch_m / pitch_m) ** 2 for p in finer]
+    chosen = np.flatnonzero(number[: len(finer)] >= LEAST_MEAN * np.array(cells))
     if not len(chosen):
         return model
-    patches = [every[k] for k in chosen]
+    patches = [finer[k] for k in chosen]
     index = np.full(len(number) + 1, -1, np.int32)
     index[chosen] = np.arange(len(chosen))
-    labels = model.labels if len(chosen) == len(every) else index[model.labels]
+    labels = model.labels if len(chosen) == len(finer) else index[model.labels]
     frames = np.array([[*patch.R_patch_map, patch.mean] for patch in patches])
-    table = VoxelCells.around([patch.grid for patch in patches], pitch_m)
-    counts, weights = np.zeros(len(table.of), np.int64), np.zeros(len(table.of))
-    grids = table.first, table.corners, table.sizes
+    grids = cells_over([patch.grid for patch in patches], pitch_m)
+    first, corners, sizes = grids
+    total = first[-1] + sizes[-1].prod()
+    counts, weights, filled = np.zeros(total, np.int64), np.zeros(total), np.zeros(total, np.uint8)
     count_points(points, labels, frames, view, grids, pitch_m, counts, weights)
-    counts[table.is_margin] = 0
-    total = np.maximum(np.add.reduceat(counts, table.first), 1)
-    usual_count = np.add.reduceat(counts * counts, table.first) / total
-    usual_weight = np.add.reduceat(weights * counts, table.first) / total
-    filled = (counts > 0) & (weights >= LEAST_SHARE * usual_weight[table.of])
-    filled |= (table.around_each(filled, SIDES + CORNERS) >= CLOSED_BY) & ~table.is_margin
-    rim = filled & (table.around_each(filled, SIDES) < len(SIDES))
-    dense = usual_count >= LEAST_POINTS
-    dense &= table.share_of_gaps([patch.grid for patch in patches], filled) <= MOST_GAPS
-    finer = list(every)
-    for k in np.flatnonzero(dense).tolist():
-        finer[chosen[k]] = replace(patches[k], grid=table.grid(k, filled, rim))
+    gaps, coarse = np.empty(len(patches)), inner_cells([patch.grid for patch in patches])
+    cover_cells(counts, weights, grids, pitch_m, coarse, RULES, filled, gaps)
+    for k in np.flatnonzero(gaps <= MOST_GAPS).tolist():
+        own = filled[first[k] : first[k] + sizes[k].prod()].reshape(sizes[k]) > 0
+        finer[chosen[k]] = replace(patches[k], grid=trimmed(own, corners[k], pitch_m))
     return replace(
         model,
         planes=finer[: len(model.planes)],
@@ -93,93 +87,36 @@ def covered(model: MultiModel, points: npt.NDArray[Any], view: Array) -> MultiMo
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class VoxelCells:
-    """
-    Cells of one voxel of all patches, patch after patch, y within x, with a margin around each.
+def cells_over(grids: list[Grid], pitch_m: float) -> tuple[Indices, Array, Indices]:
+    """Return first index (K,), lowest corner (K, 2), m, and size (K, 2) of cells over grids."""
+    low = np.array([grid.origin for grid in grids])
+    high = low + np.array([np.multiply(grid.filled.shape, grid.pitch_m) for grid in grids])
+    corners: Array = (np.floor(low / pitch_m) - 2.0) * pitch_m
+    sizes = np.ceil((high - corners) / pitch_m).astype(np.int64) + 2
+    return np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1), corners, sizes
 
-    Attributes
-    ----------
-    pitch_m : float
-        Edge of a cell.
-    corners : (K, 2) float64, m
-        Lowest corner of the cells of each patch, in its frame.
-    sizes : (K, 2) int64
-        Cells along x and y.
-    first : (K,) int64
-        First cell of each patch.
-    of, x, y : (C,) int64
-        Patch of each cell, and its place.
 
-    """
+def inner_cells(grids: list[Grid]) -> tuple[Array, Array, Indices, Indices, Mask]:
+    """Return pitches, origins, first indices, sizes, and which cells of grids are not cut."""
+    sizes = np.array([grid.filled.shape for grid in grids])
+    return (
+        np.array([grid.pitch_m for grid in grids]),
+        np.array([grid.origin for grid in grids]),
+        np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1),
+        sizes,
+        np.concatenate([(grid.filled & ~grid.rim).ravel() for grid in grids]),
+    )
 
-    pitch_m: float
-    corners: Array
-    sizes: Indices
-    first: Indices
-    of: Indices
-    x: Indices
-    y: Indices
 
-    @classmethod
-    def around(cls, grids: list[Grid], pitch_m: float) -> VoxelCells:
-        """Return the cells that lie over grids, and two more on each side."""
-        low = np.array([grid.origin for grid in grids])
-        high = low + np.array([np.multiply(grid.filled.shape, grid.pitch_m) for grid in grids])
-        corners = (np.floor(low / pitch_m) - 2.0) * pitch_m
-        sizes = np.ceil((high - corners) / pitch_m).astype(np.int64) + 2
-        number = sizes.prod(axis=1)
-        first = np.cumsum(number) - number
-        of = np.repeat(np.arange(len(grids)), number)
-        x, y = np.divmod(np.arange(len(of)) - first[of], sizes[of, 1])
-        return cls(pitch_m, corners, sizes, first, of, x, y)
-
-    @property
-    def is_margin(self) -> npt.NDArray[np.bool_]:
-        """Whether cells are the first or the last of their row or column, (C,)."""
-        ends = self.sizes[self.of] - 1
-        at = np.stack([self.x, self.y], axis=1)
-        return np.asarray(((at == 0) | (at == ends)).any(axis=1), np.bool_)
-
-    def around_each(
-        self, filled: npt.NDArray[np.bool_], steps: tuple[tuple[int, int], ...]
-    ) -> Indices:
-        """Return the number of filled cells among those at some steps from each, (C,)."""
-        row, width = np.arange(len(filled)), self.sizes[self.of, 1]
-        number = np.zeros(len(filled), np.int64)
-        for x, y in steps:  # beyond the margin of a patch is that of another, which is empty
-            number += filled[np.clip(row + x * width + y, 0, len(filled) - 1)]
-        return number
-
-    def share_of_gaps(self, grids: list[Grid], filled: npt.NDArray[np.bool_]) -> Array:
-        """Return the share of empty cells inside of each grid, where no cell is cut, (K,)."""
-        inside = np.concatenate([(grid.filled & ~grid.rim).ravel() for grid in grids])
-        shapes = np.array([grid.filled.shape for grid in grids])
-        start = np.cumsum(shapes.prod(axis=1)) - shapes.prod(axis=1)
-        shift = self.corners - np.array([grid.origin for grid in grids])
-        pitch_m = np.array([grid.pitch_m for grid in grids])[self.of]
-        middle = self.pitch_m * (np.stack([self.x, self.y], axis=1) + 0.5) + shift[self.of]
-        cell = np.floor(middle / pitch_m[:, None]).astype(np.int64)
-        is_over = ((cell >= 0) & (cell < shapes[self.of])).all(axis=1)
-        at = start[self.of] + cell[:, 0] * shapes[self.of, 1] + cell[:, 1]
-        inner = is_over & inside[np.where(is_over, at, 0)]
-        number = np.bincount(self.of[inner], minlength=len(grids))
-        gaps = np.bincount(self.of[inner & ~filled], minlength=len(grids))
-        return np.asarray(gaps / np.maximum(number, 1), np.float64)
-
-    def grid(self, patch: int, filled: npt.NDArray[np.bool_], rim: npt.NDArray[np.bool_]) -> Grid:
-        """Return the filled cells of a patch, without empty rows at its ends."""
-        shape = tuple(self.sizes[patch].tolist())
-        own = slice(self.first[patch], self.first[patch] + shape[0] * shape[1])
-        cells = filled[own].reshape(shape)
-        rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
-        part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        kept = cells[part].copy()
-        return Grid(
-            pitch_m=self.pitch_m,
-            origin=self.corners[patch] + self.pitch_m * np.array([rows[0], columns[0]]),
-            filled=kept,
-            rim=rim[own].reshape(shape)[part].copy(),
-            corner=np.zeros(kept.shape, np.uint8),
-            cuts=np.zeros((*kept.shape, 3), np.uint8),
-        )
+def trimmed(filled: Mask, corner: Array, pitch_m: float) -> Grid:
+    """Return the grid of covered cells, without empty rows at its ends."""
+    rows, columns = (np.flatnonzero(filled.any(axis=axis)) for axis in (1, 0))
+    kept = filled[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].copy()
+    return Grid(
+        pitch_m=pitch_m,
+        origin=corner + pitch_m * np.array([rows[0], columns[0]]),
+        filled=kept,
+        rim=rim_of(kept),
+        corner=np.zeros(kept.shape, np.uint8),
+        cuts=np.zeros((*kept.shape, 3), np.uint8),
+    )

@@ -101,7 +101,8 @@ class Grid:
 
 def rim_of(filled: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """Return the filled cells (Nx, Ny) with an empty 4-neighbour."""
-    wide = np.pad(filled, 1)
+    wide = np.zeros(np.add(filled.shape, 2), np.bool_)
+    wide[1:-1, 1:-1] = filled
     inner = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
     rim: npt.NDArray[np.bool_] = filled & ~inner
     return rim

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.models.joining import LEAST_COSINE
+from surfel_mapper.models.kernels.voxel_points import sample_cubes
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -186,23 +187,13 @@ def sampled_rows(samples: NoiseSamples, seeds: Indices, halves: Array, most: int
         Points of a cube.
 
     """
-    x, y, z = np.ascontiguousarray(samples.means.T)
+    z = samples.means[:, 2]
     # voxels of one layer follow each other, and so do the layers
     first = np.searchsorted(np.maximum.accumulate(z), z[seeds] - halves)
     last = np.searchsorted(np.minimum.accumulate(z[::-1])[::-1], z[seeds] + halves, 'right')
     rows: Indices = np.full((len(seeds), most), -1)
-    for b, (seed, half) in enumerate(zip(seeds.tolist(), halves.tolist(), strict=True)):
-        layers = slice(first[b], last[b])
-        inside = np.abs(x[layers] - x[seed]) <= half
-        inside &= np.abs(y[layers] - y[seed]) <= half
-        inside &= np.abs(z[layers] - z[seed]) <= half
-        voxels = first[b] + np.flatnonzero(inside)
-        starts, ends = samples.starts[voxels], samples.starts[voxels + 1]
-        total = np.cumsum(ends - starts)
-        number = min(int(total[-1]), most)
-        sample = np.arange(number) * total[-1] // max(number, 1)
-        voxel = np.searchsorted(total, sample, 'right')
-        rows[b, :number] = ends[voxel] - total[voxel] + sample
+    voxels = np.empty(np.max(last - first, initial=0), np.int64)
+    sample_cubes(samples.means, samples.starts, (seeds, halves, first, last), voxels, rows)
     return rows
 
 
@@ -258,7 +249,7 @@ def step_noise(samples: NoiseSamples) -> float:
         return 0.0
     points = samples.points[:: 1 + len(samples.points) // STEP_SAMPLES]
     sample = np.abs(points - samples.view)
-    for values in sample.T:
+    for values in sample.T[::-1]:  # the axis of a camera is z
         levels = np.unique(values[values > 0.0])
         if 2 < len(levels) < len(values) / STEP_POINTS:
             low, step, high = np.quantile(np.diff(1.0 / levels[::-1]), [0.1, 0.5, 0.9])

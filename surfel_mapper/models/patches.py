@@ -10,6 +10,7 @@ the work.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -208,7 +209,9 @@ def cells_of(
     """
     origins, axes, pitches = frames
     patch = np.repeat(np.arange(len(origins)), np.diff(groups.starts))
-    local = np.einsum('nij,nj->ni', axes[patch], groups.points - origins[patch])
+    local = np.empty((len(patch), 3))
+    for k, (start, end) in enumerate(pairwise(groups.starts.tolist())):
+        local[start:end] = np.einsum('ij,nj->ni', axes[k], groups.points[start:end] - origins[k])
     return Cells.around(local, patch, pitches, margin_m, snapped=snapped), local
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
-from surfel_mapper.models.kernels.coverage import count_points
+from surfel_mapper.models.kernels.coverage import count_points, cover_cells
 from test.models.scenes import sheet
 
 SIZE_M = 0.04
@@ -46,6 +46,36 @@ def test_counts_and_weights_are_those_of_a_loop_over_points():
     assert (counts == expected).all()
     assert counts.sum() < np.isin(label, (0, 1)).sum()  # some lie beyond the grids
     np.testing.assert_allclose(weights, sums)
+
+
+def test_cells_are_covered_by_their_points_or_by_their_neighbours():
+    rng = np.random.default_rng(1)
+    counts, near = rng.integers(0, 12, (9, 12)), rng.uniform(0.5, 1.5, (9, 12))
+    counts[3:5, 4:9] = 0
+    weights, inner = counts * near, rng.random((4, 5)) < 0.8
+    grids = np.array([0]), np.array([[0.0, 0.0]]), np.array([[9, 12]])
+    coarse = np.array([0.2]), np.array([[0.1, 0.1]]), np.array([0]), np.array([[4, 5]]), inner
+    filled, gaps = np.zeros(108, np.uint8), np.empty(1)
+    cover_cells(
+        *(counts.ravel(), weights.ravel(), grids, 0.1),
+        *((*coarse[:4], inner.ravel()), (6.0, 0.25, 5), filled, gaps),
+    )
+
+    counts[[0, -1]] = counts[:, [0, -1]] = 0
+    usual = (weights * counts).sum() / counts.sum()
+    by_points = (counts > 0) & (weights >= 0.25 * usual)
+    expected, num_inner, num_empty = by_points.copy(), 0, 0
+    for i, j in np.ndindex(7, 10):
+        around = by_points[i : i + 3, j : j + 3].sum() - by_points[i + 1, j + 1]
+        expected[i + 1, j + 1] |= around >= 5
+        row, column = i // 2, j // 2  # grids differ by one cell of 0.1
+        if row < 4 and inner[row, column]:
+            num_inner += 1
+            num_empty += not expected[i + 1, j + 1]
+    assert ((filled.reshape(9, 12) > 0) == expected).all()
+    assert (expected & ~by_points).any()
+    assert num_empty > 0
+    assert gaps[0] == num_empty / num_inner
 
 
 def test_a_dense_plane_covers_its_points_and_not_its_hole():

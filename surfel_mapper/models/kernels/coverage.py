@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The points of a cloud in cells of the planes of the patches that they belong to."""
+"""The points of a cloud in cells of the planes of their patches, and the cells that they cover."""
 
 import numpy as np
 
@@ -36,3 +36,58 @@ def count_points(points, label, frames, view, grids, pitch, counts, weights):
                 cell = first[k] + column * sizes[k, 1] + row
                 counts[cell] += 1
                 weights[cell] += range_sq * np.sqrt(range_sq)
+
+
+@kernel(error_model='numpy')
+def cover_cells(counts, weights, grids, pitch, coarse, rules, filled, gaps):
+    """
+    Find the covered cells of each dense patch; the first and last of a row or column are none.
+
+    counts   (C,) int64 and weights (C,) float64: of count_points
+    grids    first (K,) int64, corners (K, 2) float64, m, and sizes (K, 2) int64; y within x
+    pitch    edge of a cell, m
+    coarse   the grids of the patches: pitches (K,) float64, m, origins (K, 2) float64, m,
+             first (K,) int64, sizes (K, 2) int64, and inner (D,) bool, cells that nothing cuts
+    rules    least number of points of the usual cell, least share of its weight, least number
+             of covered cells around one that is closed
+    filled   (C,) uint8, zeros, changed in place: 1 for covered cells
+    gaps     (K,) float64, out: share of the inner cells that are not covered; 2 if not dense
+    """
+    first, corners, sizes = grids
+    pitches, origins, starts, shapes, inner = coarse
+    for k in range(len(first)):
+        rows, columns = sizes[k, 0], sizes[k, 1]
+        total, square, weighted = 0.0, 0.0, 0.0
+        for i in range(1, rows - 1):
+            for j in range(1, columns - 1):
+                cell = first[k] + i * columns + j
+                total += counts[cell]
+                square += counts[cell] * counts[cell]
+                weighted += weights[cell] * counts[cell]
+        gaps[k] = 2.0
+        if total == 0.0 or square < rules[0] * total:
+            continue
+        least = rules[1] * weighted / total
+        for i in range(1, rows - 1):
+            for j in range(1, columns - 1):
+                cell = first[k] + i * columns + j
+                filled[cell] = counts[cell] > 0 and weights[cell] >= least
+        number, empty = 0, 0
+        for i in range(1, rows - 1):
+            row = np.int64(
+                np.floor((corners[k, 0] + pitch * (i + 0.5) - origins[k, 0]) / pitches[k])
+            )
+            for j in range(1, columns - 1):
+                cell = first[k] + i * columns + j
+                around = 0
+                for near in range(cell - columns, cell + columns + 1, columns):
+                    around += (filled[near - 1] & 1) + (filled[near] & 1) + (filled[near + 1] & 1)
+                if filled[cell] == 0 and around >= rules[2]:
+                    filled[cell] = 2
+                y = corners[k, 1] + pitch * (j + 0.5) - origins[k, 1]
+                column = np.int64(np.floor(y / pitches[k]))
+                is_over = 0 <= row < shapes[k, 0] and 0 <= column < shapes[k, 1]
+                if is_over and inner[starts[k] + row * shapes[k, 1] + column]:
+                    number += 1
+                    empty += filled[cell] == 0
+        gaps[k] = empty / max(number, 1)

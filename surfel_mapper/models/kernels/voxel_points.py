@@ -76,3 +76,36 @@ def owner_means(points, starts, owner, owners, means, counts, first):
                 means[k, j] /= counts[k]
     first[len(starts) - 1] = num
     return num
+
+
+@kernel()
+def sample_cubes(means, starts, cubes, voxels, rows):
+    """
+    Take points evenly from the voxels with means in a cube.
+
+    means   (V, 3) float64
+    starts  (V + 1,) int64, first point of each voxel
+    cubes   voxels in the middle (B,) int64, half edges (B,) float64, and the first voxel (B,) that
+            may be in it and the one after the last, int64
+    voxels  int64, spare, for those of one cube
+    rows    (B, n) int64, changed in place: the points
+    """
+    seeds, halves, first, last = cubes
+    for b in range(len(seeds)):
+        middle, half = means[seeds[b]], halves[b]
+        number, total = 0, 0
+        for v in range(first[b], last[b]):
+            inside = True
+            for j in range(3):
+                inside &= abs(means[v, j] - middle[j]) <= half
+            if inside:
+                voxels[number] = v
+                number += 1
+                total += starts[v + 1] - starts[v]
+        count, at, passed = min(total, rows.shape[1]), 0, 0
+        for i in range(count):
+            sample = i * total // count
+            while sample >= passed + starts[voxels[at] + 1] - starts[voxels[at]]:
+                passed += starts[voxels[at] + 1] - starts[voxels[at]]
+                at += 1
+            rows[b, i] = starts[voxels[at]] + sample - passed
