@@ -196,6 +196,7 @@ def replay(
             replay_s = clock() - start_s
             _log.info('mapped %d scans in %.1f s', mapper.counters.mapped, replay_s)
             trajectory.follow_alignment(mapper)
+            history.move(trajectory.positions)
             write_maps(directory, options.formats, mapper, trajectory, window=options.window)
             mapper.finish_layers()
         figures = {

@@ -17,6 +17,9 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
 
+FIGURES = 6
+"""Figures of a scan: time after the first (s), voxels, drops, position of the sensor (m)."""
+
 
 class History:
     """
@@ -31,45 +34,53 @@ class History:
 
     def __init__(self) -> None:
         self.milliseconds: dict[str, array[float]] = {}
-        self._stamps_ns: array[int] = array('q')
-        self._voxels: array[int] = array('q')
-        self._dropped: array[int] = array('q')
-        self._positions: array[float] = array('d')
+        self._first_ns = 0
+        self._figures: array[float] = array('d')
 
     def __len__(self) -> int:
         """Return the number of scans."""
-        return len(self._stamps_ns)
+        return len(self._figures) // FIGURES
 
     def add(self, mapper: Mapper, update: Update) -> None:
         """Record the figures of a scan that was just mapped."""
-        for stage, milliseconds in update.milliseconds.items():
-            if stage not in self.milliseconds:
-                self.milliseconds[stage] = array('d', [np.nan] * len(self))
-            self.milliseconds[stage].append(milliseconds)
-        self._stamps_ns.append(update.stamp_ns)
-        for times in self.milliseconds.values():
-            times.extend([np.nan] * (len(self) - len(times)))
-        self._voxels.append(mapper.map.num_voxels)
-        self._dropped.append(mapper.counters.dropped.total())
-        self._positions.extend(update.T_map_sensor[:3, 3])
+        for stage in update.milliseconds.keys() - self.milliseconds.keys():
+            self.milliseconds[stage] = array('d', [np.nan] * len(self))
+        for stage, times in self.milliseconds.items():
+            times.append(update.milliseconds.get(stage, np.nan))
+        if not self._figures:
+            self._first_ns = update.stamp_ns
+        self._figures.append((update.stamp_ns - self._first_ns) / 1e9)
+        self._figures.append(mapper.map.num_voxels)
+        self._figures.append(mapper.counters.dropped.total())
+        self._figures.extend(update.T_map_sensor[:3, 3])
+
+    def move(self, positions: npt.NDArray[np.float64]) -> None:
+        """Take the positions (S, 3) after an alignment; after a restart they are fewer."""
+        if len(positions) == len(self):
+            figures = np.column_stack([self.figures[:, :3], positions])
+            self._figures = array('d', figures.ravel())
+
+    @property
+    def figures(self) -> npt.NDArray[np.float64]:
+        """FIGURES of each scan, (S, 6)."""
+        return np.array(self._figures, np.float64).reshape(-1, FIGURES)
 
     @property
     def seconds(self) -> npt.NDArray[np.float64]:
         """Time of each scan after the first, (S,) s."""
-        stamps = np.array(self._stamps_ns, np.int64)
-        return np.asarray((stamps - stamps[:1].sum()) / 1e9)
+        return self.figures[:, 0]
 
     @property
-    def voxels(self) -> npt.NDArray[np.int64]:
+    def voxels(self) -> npt.NDArray[np.float64]:
         """Number of voxels in the map after each scan, (S,)."""
-        return np.array(self._voxels, np.int64)
+        return self.figures[:, 1]
 
     @property
-    def dropped(self) -> npt.NDArray[np.int64]:
+    def dropped(self) -> npt.NDArray[np.float64]:
         """Number of scans dropped before each scan, (S,)."""
-        return np.array(self._dropped, np.int64)
+        return self.figures[:, 2]
 
     @property
     def trajectory(self) -> npt.NDArray[np.float64]:
         """Position of the sensor at each scan, map frame, (S, 3) m."""
-        return np.array(self._positions, np.float64).reshape(-1, 3)
+        return self.figures[:, 3:]

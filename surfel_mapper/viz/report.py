@@ -205,8 +205,8 @@ def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str
         for stage in sorted(history.milliseconds, key=stage_order)
     }
     slope = np.degrees(np.arccos(np.clip(np.abs(surfels.normal[:, 2]), 0.0, 1.0)))
-    growth = {'voxels': history.voxels.astype(np.float64)}
-    dropped = {'dropped': history.dropped.astype(np.float64)}
+    growth = {'voxels': history.voxels}
+    dropped = {'dropped': history.dropped}
     charts = {
         'Voxels over time': lines(seconds, growth, 'time (s)', 'voxels'),
         'Time by stage': lines(seconds, times, 'time (s)', 'ms a scan'),

@@ -52,3 +52,14 @@ def test_no_scan_at_all_is_an_empty_history():
     history = History()
     assert len(history) == len(history.seconds) == len(history.voxels) == 0
     assert history.trajectory.shape == (0, 3)
+
+
+def test_an_alignment_moves_the_positions():
+    _, history = mapped(3)
+    positions = np.arange(9.0).reshape(3, 3)
+    history.move(positions[:2])  # of a map that was begun again
+    np.testing.assert_array_equal(history.trajectory, np.zeros((3, 3)))
+    seconds = history.seconds
+    history.move(positions)
+    np.testing.assert_array_equal(history.trajectory, positions)
+    np.testing.assert_array_equal(history.seconds, seconds)

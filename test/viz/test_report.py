@@ -17,7 +17,10 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.viz.discs import RGB
 from surfel_mapper.viz.report import write_report
 from surfel_mapper.viz.turning_view import column_data, MAX_SHOWN, nearest_pose, SURFEL
+from test.cli.test_replay_align import bag, replayed, settings
 from test.viz.test_history import mapped
+
+__all__ = ['bag', 'settings']  # fixtures
 
 NASTY = '</title></script><script>alert("x")</script><img src=x onerror=alert(1)>'
 
@@ -217,3 +220,12 @@ def test_doubtful_poses_are_stated_in_words(tmp_path):
     assert 'with most surfaces moving with the sensor' in cells
     assert 'surrounded' not in cells
     assert 'not placed on the map' not in cells
+
+
+def test_the_page_draws_the_poses_after_the_alignment(bag, settings, tmp_path):
+    """It drew those of the odometry."""
+    _, poses = replayed(bag, settings, tmp_path, '--align')
+    data, _ = shown(Parsed((tmp_path / 'out' / 'report.html').read_text(encoding='utf-8')))
+    way = np.frombuffer(base64.b64decode(data['trajectory']), '<f4').reshape(-1, 3)
+    steps = np.diff(poses[:, :3, 3], axis=0)
+    np.testing.assert_allclose(np.diff(way, axis=0), steps, atol=1e-4)
