@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 COLUMNS = ('planarity', 'curvature', 'num_points', *QUALITY)
 """Columns of Surfels that discs have as values."""
 
-COLOURINGS = ('normal', 'height', *COLUMNS, 'intensity', 'rgb', 'age', 'label')
+COLOURINGS = ('normal', 'height', *COLUMNS, 'intensity', 'rgb', 'age')
 """Colours of discs: shaded by normal and light, or of a value."""
 
 RGB = ('red', 'green', 'blue')
@@ -55,26 +55,17 @@ voxels full of points leave no gaps.
 BEYOND = 1.0
 """Values left out at either end of a colour map, per cent."""
 
-CORNERS = 6
+CORNERS = 8
 """Corners of a disc; more are not seen at the size of a surfel."""
+
+OUTER = 1.0 / np.cos(np.pi / CORNERS)
+"""Radius of the corners of an octagon about a circle of radius 1."""
+
+BEYOND_CELL = 1.0
+"""Part of a disc that is drawn beyond its cell, relative to the smallest cell."""
 
 GREY = 0.6
 """Colour of a disc whose value is not known."""
-
-PALETTE = np.array(
-    [
-        [31, 119, 180],
-        [255, 127, 14],
-        [44, 160, 44],
-        [214, 39, 40],
-        [148, 103, 189],
-        [140, 86, 75],
-        [227, 119, 194],
-        [188, 189, 34],
-        [23, 190, 207],
-    ],
-)
-"""Colours of labels, by the label modulo their number."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +81,8 @@ class DrawnDiscs:
     radius_m : (K,) float64
     values : mapping of str to (K,) array
         Further values, shown for a disc that is picked: planarity, num_points, intensity, ...
+    grid_m : (3,) float64, m
+        A corner of the voxel grid.
 
     """
 
@@ -97,6 +90,7 @@ class DrawnDiscs:
     normal: Array
     radius_m: Array
     values: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    grid_m: Array = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def of(
@@ -120,27 +114,53 @@ class DrawnDiscs:
         """Return the number of discs."""
         return len(self.position)
 
+    def value(self, name: str) -> Array | None:
+        """Return a value or the height of each disc, (K,); None without it."""
+        values = self.position[:, 2] if name == 'height' else self.values.get(name)
+        return None if values is None else np.asarray(values, np.float64)
+
     def select(self, rows: Any) -> DrawnDiscs:
         """Return selected discs: by a slice, a mask (K,) bool or row indices."""
+        columns = (self.position[rows], self.normal[rows], self.radius_m[rows])
         values = {name: value[rows] for name, value in self.values.items()}
-        return DrawnDiscs(self.position[rows], self.normal[rows], self.radius_m[rows], values)
+        return DrawnDiscs(*columns, values, self.grid_m)
+
+    def cells(self) -> tuple[Array, Array]:
+        """
+        Return the corners of the cells, from the positions, (K, 3) m each, at which discs end.
+
+        They are farther by BEYOND_CELL, and infinitely far if a size is unknown.
+        """
+        size_m = self.values.get('size')
+        if size_m is None or not len(size_m) or not np.isfinite(size_m).all():
+            unlimited = np.full_like(self.position, np.inf)
+            return -unlimited, unlimited
+        size_m = np.asarray(size_m, np.float64)[:, None]
+        from_grid = self.position - self.grid_m
+        beyond_m = BEYOND_CELL * size_m.min()
+        low = np.floor(from_grid / size_m) * size_m - from_grid
+        return low - beyond_m, low + size_m + beyond_m
 
     def triangles(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
         """
-        Return the hexagons about the discs, which leave no gaps between neighbours.
+        Return octagons about the discs, which leave no gaps between neighbours.
 
-        Their corners are (6 K, 3), m, the numbers of those of each triangle (4 K, 3).
+        Their corners are (8 K, 3), m, pulled in to the cells; the numbers of those of each
+        triangle (6 K, 3).
         """
-        normal = self.normal
-        beside = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-        along = np.cross(normal, beside)
-        along *= (2.0 / np.sqrt(3.0) * self.radius_m / np.sqrt((along * along).sum(axis=1)))[
-            :, None
-        ]
-        across = np.cross(normal, along)
-        corners = np.empty((len(self), CORNERS, 3), np.float32)
-        for corner, turn in enumerate(np.arange(CORNERS) * (2.0 * np.pi / CORNERS)):
-            corners[:, corner] = self.position + np.cos(turn) * along + np.sin(turn) * across
+        rows, axis = np.arange(len(self)), np.abs(self.normal).argmax(axis=1)
+        facing = self.normal[rows, axis, None]
+        turn = np.arange(CORNERS) * (2.0 * np.pi / CORNERS)
+        away = np.zeros((len(self), CORNERS, 3))
+        away[rows, :, (axis + 1) % 3] = np.cos(turn)
+        away[rows, :, (axis + 2) % 3] = np.sin(turn) * np.sign(facing)
+        away[rows, :, axis] = -np.einsum('kci,ki->kc', away, self.normal) / facing
+        away *= (OUTER * self.radius_m)[:, None, None] / np.linalg.norm(away, axis=2)[..., None]
+        low, high = self.cells()
+        limit = np.where(away > 0.0, high[:, None], low[:, None])
+        shares = np.abs(limit) / np.maximum(np.abs(away), 1e-9)
+        away *= np.minimum(shares.min(axis=2), 1.0)[..., None]
+        corners = (self.position[:, None] + away).astype(np.float32)
         first = CORNERS * np.arange(len(self), dtype=np.uint32)
         fan = np.array([[0, step, step + 1] for step in range(1, CORNERS - 1)], np.uint32)
         return corners.reshape(-1, 3), (first[:, None, None] + fan).reshape(-1, 3)
@@ -179,17 +199,16 @@ class Colouring:
             raise ConfigError(f'colouring {kind!r}, expected one of {", ".join(COLOURINGS)}')
         if kind in ('normal', 'planarity'):
             return cls(kind)
-        valued = [discs for discs in drawn if has_value(discs, kind)]
-        if not valued and any(map(len, drawn)):
+        name = RGB[0] if kind == 'rgb' else kind
+        columns = [values for discs in drawn if (values := discs.value(name)) is not None]
+        if not columns and any(map(len, drawn)):
             names = sorted({name for discs in drawn for name in discs.values})
             raise ConfigError(
                 f'colouring {kind!r}: nothing shown has it; its values: {", ".join(names)}'
             )
-        if kind in ('rgb', 'label') or not valued:
-            return cls(kind)
-        values = np.concatenate([value_of(discs, kind) for discs in valued])
+        values = np.concatenate([np.empty(0), *columns])
         values = values[np.isfinite(values)]
-        if not len(values):
+        if kind == 'rgb' or not len(values):
             return cls(kind)
         low, high = np.percentile(values, [BEYOND, 100.0 - BEYOND])
         return cls(kind, float(low), float(max(high, low + 1e-9)))
@@ -198,25 +217,12 @@ class Colouring:
         """Return the colours of discs, (K, 3)."""
         if self.kind == 'normal':
             return as_bytes(shaded(discs.normal))
-        if not has_value(discs, self.kind):
-            return np.full((len(discs), 3), round(255.0 * GREY), np.uint8)
-        if self.kind == 'rgb':
+        if self.kind == 'rgb' and RGB[0] in discs.values:
             return as_bytes(np.stack([discs.values[name] for name in RGB], axis=1) / 255.0)
-        if self.kind == 'label':
-            label = discs.values['label'].astype(np.int64)
-            return np.asarray(PALETTE[label % len(PALETTE)], np.uint8)
-        values = (value_of(discs, self.kind) - self.low) / (self.high - self.low)
-        return as_bytes(ramp(values))
-
-
-def has_value(discs: DrawnDiscs, kind: str) -> bool:
-    """Return whether discs have the value of a colouring."""
-    return kind in ('normal', 'height') or (RGB[0] if kind == 'rgb' else kind) in discs.values
-
-
-def value_of(discs: DrawnDiscs, kind: str) -> Array:
-    """Return the values of a colouring, (K,)."""
-    return np.asarray(discs.position[:, 2] if kind == 'height' else discs.values[kind], np.float64)
+        values = discs.value(self.kind)
+        if values is None:
+            return np.full((len(discs), 3), round(255.0 * GREY), np.uint8)
+        return as_bytes(ramp((values - self.low) / (self.high - self.low)))
 
 
 def shaded(normal: Array) -> Array:

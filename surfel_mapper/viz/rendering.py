@@ -40,9 +40,6 @@ SPARE = 0.04
 STRENGTH = 1.5
 """Darkness of hollows, see ``hollow_shade``."""
 
-BEYOND_CELL = 1.0
-"""Part of a disc that is drawn beyond its cell, relative to the smallest cell."""
-
 HOLLOW_STEPS = (1, 2, 4)
 """Distances at which a pixel is compared with its neighbours, px."""
 
@@ -220,7 +217,7 @@ def facing_discs(camera: Camera, discs: DrawnDiscs) -> tuple[npt.NDArray[np.int6
         -seen[:, 2:],
         steps_m,
         0.5 * radius_m,
-        *(values / radius_m for values in (*across, *cell_corners(discs, rows))),
+        *(values / radius_m for values in (*across, *discs.select(rows).cells())),
     ]
     return rows, np.concatenate(columns, axis=1).astype(np.float32)
 
@@ -231,17 +228,6 @@ def pixel_box(centre: Array, reach: Array, camera: Camera) -> Array:
     first = np.clip(np.ceil(centre - reach), 0.0, size)
     end = np.clip(np.floor(centre + reach) + 1.0, 0.0, size)
     return np.stack([first[:, 1], end[:, 1], first[:, 0], end[:, 0]], axis=1)
-
-
-def cell_corners(discs: DrawnDiscs, rows: npt.NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return the lower and upper corners of the cells, a little larger, from the centres, m."""
-    position, size_m = discs.position[rows], discs.values.get('size', np.full(len(discs), np.inf))
-    size_m = size_m[rows, None]
-    if not np.isfinite(size_m).all() or not len(rows):
-        return np.full_like(position, -np.inf), np.full_like(position, np.inf)
-    low = np.floor(position / size_m) * size_m - position
-    beyond_m = BEYOND_CELL * size_m.min()
-    return low - beyond_m, low + size_m + beyond_m
 
 
 def round_length(most: float) -> float:

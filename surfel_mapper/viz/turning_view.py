@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.discs import COLUMNS, SPREAD, UNITS
+from surfel_mapper.viz.discs import as_bytes, COLUMNS, ramp, SPREAD, UNITS
 from surfel_mapper.viz.mesh import MAX_TRIANGLES, mesh_data
 
 Array = npt.NDArray[np.float64]
@@ -31,12 +31,15 @@ MAX_SHOWN, BESIDE_MESHES = 50_000, 28_000
 """Limits of the surfels shown, alone and if there are meshes; see ``detail.drawn_surfels``."""
 
 SURFEL = np.dtype(
-    [('place', '<u2', 3), ('radius', 'u1'), ('time', 'u1'), ('normal', 'i1', 3), ('', 'u1')]
+    [('place', '<u2', 3), ('radius', 'u1'), ('time', 'u1'), ('normal', 'i1', 3), ('level', 'u1')]
 )
-"""Surfel format of page/view.js."""
+"""Surfel format of page/view.js; ``level`` is 8 times that of the cell."""
 
 MOST_POSES = 2000
 """Limit of the positions of the trajectory."""
+
+UNLIMITED_M = 1e9
+"""Edge of cells at which no disc ends."""
 
 LOGARITHMIC = 20.0
 """Values are coded by their logarithm if the largest is more than this times the median."""
@@ -66,8 +69,8 @@ def turning_view(
         note += f' {len(shown):,} of {summary["surfels"]:,} surfels are shown.'
     elif len(surfels) < summary['surfels']:
         note += (
-            f' The {summary["surfels"]:,} surfels are shown by {len(shown):,} of larger cells of '
-            'the same points: planes, and of a large map parts far from the end of the trajectory.'
+            f' The {summary["surfels"]:,} surfels are drawn as {len(shown):,}. Flat regions are '
+            'merged, and in a large map all that is far from the end of the trajectory.'
         )
     options = ''.join(f'<option>{name}</option>' for name in ('surfels', *layers))
     choice = f'<label>show <select id="shown">{options}</select></label>' if layers else ''
@@ -109,8 +112,6 @@ def view_data(
 
     Heights and the middle are stated with the map's origin added.
     """
-    from matplotlib import colormaps
-
     low, high = np.zeros(3), np.ones(3)
     positions = [surfels.position] if len(surfels) else [mesh.vertices for mesh in layers.values()]
     if positions:
@@ -123,25 +124,44 @@ def view_data(
     way = trajectory[rows[: len(trajectory)]]
     passed = nearest_pose(surfels.position, way[:: max(len(way) // 256, 1)])
     packed = np.zeros(len(surfels), SURFEL)
-    packed['place'] = np.rint((surfels.position - low) / size * 65535.0)
+    cell_m, side_m = cells_of(surfels)
+    packed['level'] = 8 * np.rint(np.log2(side_m / cell_m))
+    packed['place'] = place_codes(surfels.position, side_m[:, None], low, size / 65535.0)
     packed['radius'] = np.ceil(radius / largest * 255.0)
     packed['time'] = np.rint(255.0 * passed)
     packed['normal'] = np.rint(surfels.normal * 127.0)
-    ramp = np.rint(colormaps['viridis'](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0)
     columns = {name: getattr(surfels, name) for name in COLUMNS} | dict(surfels.channels)
     return {
         'surfels': encoded(packed),
         'columns': [column_data(name, values) for name, values in columns.items()],
         'trajectory': encoded((way - (low + 0.5 * size)).astype('<f4')),
         'seconds': seconds[rows[: len(way)]].round(2).tolist() if len(seconds) else [],
-        'ramp': encoded(ramp.astype(np.uint8)),
+        'ramp': encoded(as_bytes(ramp(np.arange(256) / 255.0))),
         'size': size.tolist(),
         'largest': largest,
+        'cell': cell_m,
+        'grid': (low + 0.5 * size).tolist(),
         'layers': [
             mesh_data(mesh, low, size, MAX_TRIANGLES // len(layers)) for mesh in layers.values()
         ],
         'middle': (low + 0.5 * size + origin_m).tolist(),
     }
+
+
+def cells_of(surfels: Surfels) -> tuple[float, Array]:
+    """Return the smallest edge of the cells, and all, (K,) m; UNLIMITED if one is unknown."""
+    side_m = surfels.size.astype(np.float64)
+    if not len(side_m) or not np.isfinite(side_m).all():
+        return UNLIMITED_M, np.full(len(side_m), UNLIMITED_M)
+    return float(side_m.min()), side_m
+
+
+def place_codes(position: Array, side_m: Array, low: Array, step_m: Array) -> Array:
+    """Return positions (K, 3) in steps from a corner, rounded to the inside of their cells."""
+    cell = np.floor(position / side_m) * side_m - low
+    least, most = np.ceil(cell / step_m + 0.01), np.floor((cell + side_m) / step_m - 0.01)
+    codes = np.clip(np.rint((position - low) / step_m), least, most)
+    return np.asarray(np.clip(codes, 0.0, 65535.0))
 
 
 def nearest_pose(position: Array, way: Array) -> Array:

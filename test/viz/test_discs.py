@@ -9,7 +9,14 @@ import pytest
 
 from surfel_mapper import SurfelMap
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.viz.discs import Colouring, COLOURINGS, COLUMNS, CORNERS, DrawnDiscs, PALETTE
+from surfel_mapper.viz.discs import (
+    BEYOND_CELL,
+    Colouring,
+    COLOURINGS,
+    COLUMNS,
+    CORNERS,
+    DrawnDiscs,
+)
 
 VIRIDIS_ENDS = [[68, 1, 84], [253, 231, 37]]
 """First and last colour of the map, as matplotlib documents them (#440154, #fde725)."""
@@ -28,15 +35,39 @@ def test_corners_lie_on_a_circle_about_the_disc_across_the_normal():
 
     np.testing.assert_allclose(
         np.linalg.norm(away, axis=2),
-        2.0 / np.sqrt(3.0) * np.array([[0.5] * 6, [1.0] * 6, [2.0] * 6]),
+        np.tile([[0.5], [1.0], [2.0]], CORNERS) / np.cos(np.pi / 8.0),
         atol=1e-6,
     )
     np.testing.assert_allclose(np.einsum('kci,ki->kc', away, shown.normal), 0.0, atol=1e-6)
     a, b, c = (corners[triangles[:, n]] for n in range(3))
     across = np.cross(b - a, c - a).reshape(3, CORNERS - 2, 3)
     area = 0.5 * np.einsum('kti,ki->k', across, shown.normal)
-    # a hexagon about a circle of radius r, turning to the left as seen from its normal
-    np.testing.assert_allclose(area, 2.0 * np.sqrt(3.0) * shown.radius_m**2, rtol=1e-5)
+    # an octagon about a circle of radius r, turning to the left as seen from its normal
+    expected = 8.0 * (np.sqrt(2.0) - 1.0) * shown.radius_m**2
+    np.testing.assert_allclose(area[:2], expected[:2], rtol=1e-5)
+    assert np.pi * shown.radius_m[2] ** 2 < area[2] < expected[2]  # a tilted one is less regular
+
+
+@pytest.mark.parametrize('grid_m', [0.0, 0.3])
+def test_corners_end_one_voxel_beyond_the_cell(grid_m):
+    size = np.array([4.0, 4.0, 0.5])
+    shown = discs(size=size)
+    shown = DrawnDiscs(
+        shown.position, shown.normal, 5.0 * np.ones(3), shown.values, np.full(3, grid_m)
+    )
+
+    corners = shown.triangles()[0].reshape(3, CORNERS, 3)
+
+    low = np.floor((shown.position - grid_m) / size[:, None]) * size[:, None] + grid_m
+    beyond_m = 0.5 * BEYOND_CELL
+    least, most = low - beyond_m, low + size[:, None] + beyond_m
+    assert (corners >= least[:, None] - 1e-5).all()
+    assert (corners <= most[:, None] + 1e-5).all()
+    for disc, axes in enumerate(([0, 1], [1, 2])):  # those along the axes reach the cell
+        np.testing.assert_allclose(corners[disc].min(axis=0)[axes], least[disc, axes], atol=1e-5)
+        np.testing.assert_allclose(corners[disc].max(axis=0)[axes], most[disc, axes], atol=1e-5)
+    away = corners - shown.position[:, None]
+    np.testing.assert_allclose(np.einsum('kci,ki->kc', away, shown.normal), 0.0, atol=1e-5)
 
 
 def test_surfels_without_a_normal_have_no_disc():
@@ -88,17 +119,15 @@ def test_unknown_values_are_grey():
     np.testing.assert_array_equal(colours[[0, 2]], VIRIDIS_ENDS)
 
 
-def test_colours_and_labels_are_taken_as_they_are():
+def test_colours_are_taken_as_they_are():
     shown = discs(
         red=np.array([10, 20, 30]),
         green=np.array([0.0, 127.5, 255.0]),
         blue=np.zeros(3),
-        label=np.array([0, 1, len(PALETTE)]),
     )
     np.testing.assert_array_equal(
         Colouring.over('rgb', [shown]).of(shown), [[10, 0, 0], [20, 128, 0], [30, 255, 0]]
     )
-    np.testing.assert_array_equal(Colouring.over('label', [shown]).of(shown), PALETTE[[0, 1, 0]])
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.viz.discs import DrawnDiscs
+from surfel_mapper.viz.discs import BEYOND_CELL, DrawnDiscs
 from surfel_mapper.viz.rendering import (
-    BEYOND_CELL,
     Camera,
     CLOSING,
     direction,

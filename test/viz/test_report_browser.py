@@ -16,7 +16,7 @@ from PIL import Image
 import pytest
 
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.viz.discs import COLUMNS
+from surfel_mapper.viz.discs import COLUMNS, OUTER, SPREAD
 from surfel_mapper.viz.report import write_report
 from test import extras
 from test.viz.test_history import mapped
@@ -218,7 +218,8 @@ def room(browser, tmp_path_factory):
     folder = tmp_path_factory.mktemp('room')
     surfels = box_surfels()
     mapper, history = mapped(3)
-    history._positions[:] = array('d', [0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 3.5, 2.0, 2.0])
+    for number, x in enumerate((0.5, 2.0, 3.5)):
+        history._figures[6 * number + 3 : 6 * number + 6] = array('d', [x, 2.0, 2.0])
     write_report(folder / 'report.html', 'room', mapper.summary(), surfels, history)
     page = new_page(browser)
     page.goto((folder / 'report.html').as_uri())
@@ -295,6 +296,33 @@ def test_buttons_look_along_the_axes(room):
     np.testing.assert_allclose(seen['front'], [0.0, -1.0, 0.0], atol=0.1)
     np.testing.assert_allclose(seen['side'], [1.0, 0.0, 0.0], atol=0.1)
     page.locator('#reset').click()
+
+
+def half_floor():
+    """Return a floor that fills half of a cell of 4 m, and a small surfel below it."""
+    steps = np.arange(0.0, 4.0, 0.05) + 0.025
+    x, y = (axis.ravel() for axis in np.meshgrid(steps[:40], steps))
+    floor = np.column_stack([x, y, np.full(len(x), 0.1)])
+    surfel_map = SurfelMap(0.25)
+    surfel_map.add(floor, origin=[2.0, 2.0, 5.0])
+    surfel_map.add(floor[:50] * [0.1, 0.05, 1.0] + [1.05, 2.05, -0.2], origin=[2.0, 2.0, 5.0])
+    return surfel_map.adaptive(5)
+
+
+def test_a_disc_ends_one_voxel_beyond_its_cell(browser, tmp_path):
+    surfels = half_floor()
+    assert sorted(surfels.size.tolist()) == [0.25, 4.0]
+    radius_m = SPREAD * surfels.radius.max()
+    assert radius_m > 2.25  # the whole disc is wider than the cell
+    report(tmp_path, surfels)
+    page = new_page(browser)
+    page.goto((tmp_path / 'report.html').as_uri())
+    page.locator('button', has_text='top').click()
+    rows, columns = np.nonzero(np.ptp(picture_when(page, is_drawn), axis=2) > 0.1)
+    # from x = -0.25 to a corner of the octagon, from y = -0.25 to 4.25
+    expected = (1.0 + OUTER * radius_m + 0.25) / 4.5
+    assert np.ptp(columns) / np.ptp(rows) == pytest.approx(expected, rel=0.03)
+    page.close()
 
 
 @pytest.mark.parametrize('column', ['height', 'slope', 'num points', 'thickness', 'size'])

@@ -4,11 +4,11 @@
 // The 3D view of report.html: surfels as discs, drawn in one call, and the trajectory.
 //
 // A surfel is 12 bytes: place in the box of the map (3 uint16), radius and time (2 uint8), normal
-// (3 int8) and a spare byte. Its values are columns of codes, of which one at a time becomes the
-// paint of the discs. Discs are hexagons about circles, so that no fragment is discarded and
-// hidden ones cost next to nothing. Every surfel is copied for each of its six corners, 7 MB for
-// 100,000: drawn as instances, of which each has so few corners, they take 30 times as long
-// where there is no graphics card. The picture is drawn only when something has changed, and
+// (3 int8) and the level of its cell times 8. Its values are columns of codes, of which one at a time becomes the
+// paint of the discs. Discs are octagons about circles, with corners pulled in to the cell of the
+// surfel: no fragment is discarded, and hidden ones cost next to nothing. Every surfel is copied for
+// each of its eight corners, 10 MB for 100,000: drawn as instances, they take 30 times as long
+// without a graphics card. The picture is drawn only when something has changed, and
 // while it moves with so few surfels, larger ones, that a frame takes no longer than SLOW_MS;
 // they come in random order, so the first are as good as any.
 // In the place of the surfels the mesh of a TSDF or the models can be shown, where there are any: 16
@@ -24,15 +24,25 @@
     in vec3 normal;
     in vec3 paint;
     uniform mat4 camera;
-    uniform vec3 low, size, eye;
-    uniform float largest, hide, until, lamp;
+    uniform vec3 low, size, eye, grid;
+    uniform float largest, hide, until, lamp, cell, margin;
     out vec3 colour;
     void main() {
       vec3 centre = low + place * size;
       vec3 n = normalize(normal);
-      vec3 u = normalize(abs(n.z) < 0.9 ? cross(n, vec3(0, 0, 1)) : cross(n, vec3(1, 0, 0)));
-      float turn = corner * 1.0471975512;
-      vec3 at = centre + look.x * largest * (cos(turn) * u + sin(turn) * cross(n, u));
+      int code = int(corner + 0.5);
+      int a = abs(n.x) >= max(abs(n.y), abs(n.z)) ? 0 : abs(n.y) >= abs(n.z) ? 1 : 2;
+      float turn = float(code % 8) * 0.7853981634;
+      vec3 away = vec3(0);
+      away[(a + 1) % 3] = cos(turn);
+      away[(a + 2) % 3] = sin(turn) * sign(n[a]);
+      away[a] = -dot(away, n) / n[a];
+      away = look.x * largest * normalize(away);
+      float side = cell * float(1 << code / 8);
+      vec3 first = floor((centre + grid) / side) * side - grid - centre - margin;
+      vec3 limit = mix(first, first + side + 2.0 * margin, vec3(greaterThan(away, vec3(0))));
+      vec3 shares = abs(limit) / max(abs(away), vec3(1e-9));
+      vec3 at = centre + away * min(1.0, min(shares.x, min(shares.y, shares.z)));
       float facing = dot(n, normalize(eye - centre));
       bool gone = look.y > until || facing < -hide;
       gl_Position = gone ? vec4(2, 2, 2, 1) : camera * vec4(at, 1);
@@ -71,10 +81,12 @@
   const SLOW_MS = 40;
   const REST_MS = 200;
   const LEAST = 4000;
-  const OUTER = 2 / Math.sqrt(3); // of a hexagon about a circle of radius 1
+  const CORNERS = 8;
+  const OUTER = 1 / Math.cos(Math.PI / CORNERS); // of an octagon about a circle of radius 1
+  const FREE = 1e9; // margin of discs that no cell limits, m
   const FACING = 0.05; // discs are hidden that face away by more than this
   const RED = [0.86, 0.16, 0.13], MARK = [1, 0.55, 0];
-  const HEXAGON = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5];
+  const FAN = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5, 0, 5, 6, 0, 6, 7];
   const canvas = document.getElementById('surfels');
   const data = JSON.parse(document.getElementById('map').textContent);
   const gl = canvas.getContext('webgl2', { antialias: true });
@@ -118,22 +130,24 @@
   gl.bindVertexArray(discArrays);
   const surfels = bytes(data.surfels);
   const count = surfels.length / BYTES;
-  const corners = new Uint8Array(6 * surfels.length);
-  const triangles = new Uint32Array(12 * count);
+  const corners = new Uint8Array(CORNERS * surfels.length);
+  const triangles = new Uint32Array(FAN.length * count);
   for (let row = 0; row < count; row++) {
-    for (let corner = 0; corner < 6; corner++) {
-      const from = row * BYTES, to = (6 * row + corner) * BYTES;
+    for (let corner = 0; corner < CORNERS; corner++) {
+      const from = row * BYTES, to = (CORNERS * row + corner) * BYTES;
       for (let byte = 0; byte < BYTES; byte++) corners[to + byte] = surfels[from + byte];
-      corners[to + BYTES - 1] = corner;
+      corners[to + BYTES - 1] += corner;
     }
-    HEXAGON.forEach((corner, place) => { triangles[12 * row + place] = 6 * row + corner; });
+    FAN.forEach((corner, place) => {
+      triangles[FAN.length * row + place] = CORNERS * row + corner;
+    });
   }
   buffer(corners);
   attribute(discs, 'place', 3, gl.UNSIGNED_SHORT, true, BYTES, 0);
   attribute(discs, 'look', 2, gl.UNSIGNED_BYTE, true, BYTES, 6);
   attribute(discs, 'normal', 3, gl.BYTE, true, BYTES, 8);
   attribute(discs, 'corner', 1, gl.UNSIGNED_BYTE, false, BYTES, 11);
-  const paints = new Uint8Array(24 * count);
+  const paints = new Uint8Array(4 * CORNERS * count);
   const paintBuffer = gl.createBuffer();
   gl.bindBuffer(gl.ARRAY_BUFFER, paintBuffer);
   attribute(discs, 'paint', 3, gl.UNSIGNED_BYTE, true, 4, 0);
@@ -335,12 +349,11 @@
     gl.uniform3f(gl.getUniformLocation(line, 'ink'), ...MARK);
     gl.disable(gl.DEPTH_TEST);
     for (const { row } of picks) {
-      const [u, w] = planeOf(row), ring = [];
-      for (let step = 0; step <= 24; step++) {
-        for (const far of [1, 1.25]) {
-          const size = far * Math.max(radiusOf(row) * OUTER, 0.006 * view.distance);
-          const [cos, sin] = [Math.cos(step * Math.PI / 12), Math.sin(step * Math.PI / 12)];
-          for (let i = 0; i < 3; i++) ring.push(placeOf(row, i) + size * (cos * u[i] + sin * w[i]));
+      const around = cornersOf(row), ring = [];
+      const grown = Math.max(1, 0.006 * view.distance / Math.hypot(...around[0]));
+      for (let step = 0; step <= CORNERS; step++) {
+        for (const far of [grown, 1.25 * grown]) {
+          ring.push(...around[step % CORNERS].map((value, i) => placeOf(row, i) + far * value));
         }
       }
       gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(ring), gl.DYNAMIC_DRAW);
@@ -373,11 +386,30 @@
   const growth = () => Number(document.getElementById('discs').value);
   const radiusOf = (row) => surfels[row * BYTES + 6] / 255 * data.largest * growth();
 
-  // Two axes in the plane of a disc, the first to a corner, as in the shader.
-  function planeOf(row) {
-    const n = normalOf(row);
-    const u = unit(cross(n, Math.abs(n[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0]));
-    return [u, cross(n, u)];
+  const margin = () => data.cell * growth();
+  const cellOf = (row) => data.cell * 2 ** (surfels[row * BYTES + 11] >> 3);
+
+  // The corners of a disc from its middle, pulled in to its cell, as in the shader.
+  function cornersOf(row) {
+    const n = normalOf(row), sizes = n.map(Math.abs);
+    const a = sizes.indexOf(Math.max(...sizes));
+    const cell = cellOf(row);
+    const low = data.grid.map((value, i) => {
+      const at = placeOf(row, i) + value;
+      return Math.floor(at / cell) * cell - at - margin();
+    });
+    return Array.from({ length: CORNERS }, (_, corner) => {
+      const away = [0, 0, 0], turn = 2 * Math.PI * corner / CORNERS;
+      away[(a + 1) % 3] = Math.cos(turn);
+      away[(a + 2) % 3] = Math.sin(turn) * Math.sign(n[a]);
+      away[a] = -dot(away, n) / n[a];
+      const scale = radiusOf(row) * OUTER / Math.hypot(...away);
+      const shares = away.map((value, i) => (
+        Math.abs(value > 0 ? low[i] + cell + 2 * margin() : low[i])
+          / Math.max(Math.abs(scale * value), 1e-9)
+      ));
+      return away.map((value) => scale * Math.min(1, ...shares) * value);
+    });
   }
 
   // The disc that is drawn at a place of the canvas: the first that the line of sight meets.
@@ -399,10 +431,11 @@
       const ahead = dot(n, from) / dot(n, ray);
       if (!(ahead > 0 && ahead < nearest)) continue;
       const at = from.map((value, i) => ahead * ray[i] - value);
-      const [u, w] = planeOf(row);
-      const [a, b] = [dot(at, u), dot(at, w)];
-      const sides = [30, 90, 150].map((deg) => deg * Math.PI / 180);
-      if (sides.some((t) => Math.abs(a * Math.cos(t) + b * Math.sin(t)) > radiusOf(row))) continue;
+      const minus = (point, corner) => point.map((value, i) => value - corner[i]);
+      const isOutside = cornersOf(row).some((corner, k, all) => (
+        dot(n, cross(minus(all[(k + 1) % CORNERS], corner), minus(at, corner))) < 0
+      ));
+      if (isOutside) continue;
       nearest = ahead;
       picked = { row, at: eye.map((value, i) => value + ahead * ray[i]) };
     }
@@ -444,6 +477,7 @@
   });
 
   function valueOf(column, row) {
+    if (column.name === 'size' && data.cell < FREE) return cellOf(row); // exactly
     if (!column.codes[row]) return NaN;
     const part = (column.codes[row] - 1) / (column.steps - 1);
     const value = column.log ? column.low * (column.high / column.low) ** part
@@ -516,12 +550,15 @@
     gl.uniform3f(at('low'), -half[0], -half[1], -half[2]);
     gl.uniform3f(at('size'), ...data.size);
     gl.uniform3f(at('eye'), ...eye);
+    gl.uniform3f(at('grid'), ...data.grid);
+    gl.uniform1f(at('cell'), data.cell);
+    gl.uniform1f(at('margin'), drawn < count ? FREE : margin());
     const larger = OUTER * growth() * Math.min(Math.sqrt(count / drawn), 2.5);
     gl.uniform1f(at('largest'), data.largest * larger);
     gl.uniform1f(at('hide'), hides() ? FACING : 2);
     gl.uniform1f(at('until'), until() + 1e-4);
     gl.uniform1f(at('lamp'), colouring.selectedIndex ? 0 : 1);
-    gl.drawElements(gl.TRIANGLES, 12 * drawn, gl.UNSIGNED_INT, 0);
+    gl.drawElements(gl.TRIANGLES, FAN.length * drawn, gl.UNSIGNED_INT, 0);
   }
 
   function redraw() {
@@ -644,7 +681,9 @@
     const chosen = colourings[colouring.selectedIndex];
     for (let row = 0; row < count; row++) {
       const paint = paintOf(chosen, row);
-      for (let corner = 0; corner < 6; corner++) paints.set(paint, 24 * row + 4 * corner);
+      for (let corner = 0; corner < CORNERS; corner++) {
+        paints.set(paint, 4 * (CORNERS * row + corner));
+      }
     }
     gl.bindBuffer(gl.ARRAY_BUFFER, paintBuffer);
     gl.bufferData(gl.ARRAY_BUFFER, paints, gl.DYNAMIC_DRAW);
