@@ -102,8 +102,7 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.config import ModelsConfig
     from surfel_mapper.files.atomic import check_free, make_directory
     from surfel_mapper.files.model_files import PACKED, write_models, write_packed
-    from surfel_mapper.layers.drawings import PointsPicture
-    from surfel_mapper.layers.models.pictures import panels_of
+    from surfel_mapper.layers.models.pictures import picture_of
     from surfel_mapper.models import evaluate, fit
     from surfel_mapper.models import read as read_models
     from surfel_mapper.viz.drawings import draw_points
@@ -122,9 +121,7 @@ def run(args: argparse.Namespace) -> int:
     packed = write_packed(args.output / PACKED, whole)
     write_models(args.output, whole, args.formats or DEFAULT)
     model = replace(read_models(packed).translated(-origin_m), labels=model.labels)
-    picture = PointsPicture(
-        file_name='models.png', panels=panels_of(points, model), viewpoint=viewpoint
-    )
+    picture = picture_of(points, model, viewpoint)
     draw_points(args.output / picture.file_name, picture)
     content = figures(model, evaluate(model, points), len(points))
     show_lines(json.dumps(content) if args.json else report(content))

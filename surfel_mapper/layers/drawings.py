@@ -95,51 +95,6 @@ Drawing = MeshDrawing | RingsDrawing | EllipsoidsDrawing
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class PointsPanel:
-    """
-    A cloud, coloured by the distance from the viewer.
-
-    Attributes
-    ----------
-    title : str
-    points : (N, 3) float64
-
-    """
-
-    title: str
-    points: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class ShapesPanel:
-    """
-    Filled, shaded and outlined shapes.
-
-    Attributes
-    ----------
-    title : str
-    corners : (T, 3, 3) float64
-        Corners of triangles.
-    colors : (T, 3) float64
-        Their colours.
-    rings : sequence of (M, 3) float64
-        Outlines.
-    ring_colors : (R, 3) float64
-        Their colours.
-    legend : sequence of (str, face, edge)
-        Texts, each with a colour of faces and one of outlines or None.
-
-    """
-
-    title: str
-    corners: Array
-    colors: Array
-    rings: Sequence[Array]
-    ring_colors: Array
-    legend: Sequence[tuple[str, tuple[float, ...], tuple[float, ...] | None]] = ()
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PointsPicture:
     """
     A cloud, and shapes that stand for it, side by side and seen from the same place.
@@ -148,14 +103,20 @@ class PointsPicture:
     ----------
     file_name : str
         Name of the PNG file that a replay writes.
-    panels : PointsPanel, ShapesPanel
-        The cloud decides the direction of view.
+    points : (N, 3) float64
+        The cloud, coloured by the distance from the viewer.
+    drawings : sequence of Drawing
+        Shapes, filled, shaded and outlined.
+    titles : str, str
+        Titles of cloud and shapes.
     viewpoint : (3,) float64
 
     """
 
     file_name: str
-    panels: tuple[PointsPanel, ShapesPanel]
+    points: Array
+    drawings: Sequence[Drawing]
+    titles: tuple[str, str]
     viewpoint: Array
 
 

@@ -24,8 +24,8 @@ from surfel_mapper.layers.drawings import (
     EllipsoidsDrawing,
     MeshDrawing,
     PointsPicture,
+    RingsDrawing,
     Section,
-    ShapesPanel,
 )
 from surfel_mapper.models.shapes import CORNERS, FACES
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
@@ -51,6 +51,12 @@ MOST_RADIUS_PX = 4.0
 GROUND, LIGHT, AMBIENT = (0.93, 0.94, 0.95), np.array([-0.35, 0.5, 0.8]), 0.45
 """Background; direction to the light: right, up, towards the viewer; share of all sides."""
 
+EDGE = (0.1, 0.1, 0.1)
+"""Colour of outlines."""
+
+MOST_TRIANGLES = 60_000
+"""Limit of the triangles of shapes and ellipsoids in a picture."""
+
 NEAR_COLOR, FAR_COLOR = (0.95, 0.75, 0.25), (0.15, 0.2, 0.45)
 """Colours of points by their distance."""
 
@@ -67,7 +73,7 @@ def draw_points(path: str | Path, picture: PointsPicture) -> None:
     path : str or Path
         The file.
     picture : PointsPicture
-        The panels, and the place they are seen from.
+        The cloud, its shapes, and the place they are seen from.
 
     Raises
     ------
@@ -78,21 +84,22 @@ def draw_points(path: str | Path, picture: PointsPicture) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    cloud, shapes = picture.panels
-    R = view_axes(cloud.points, picture.viewpoint)
-    low, high = frame_of(np.concatenate([cloud.points, shapes.corners.reshape(-1, 3)]) @ R[:2].T)
+    R = view_axes(picture.points, picture.viewpoint)
+    mesh = page_mesh(picture.drawings, MOST_TRIANGLES)
+    corners = mesh.vertices[mesh.triangles.ravel()]
+    low, high = frame_of(np.concatenate([picture.points, corners]) @ R[:2].T)
     aspect = (high[1] - low[1]) / (high[0] - low[0])
     height = min(max(PANEL_INCH * aspect + TEXT_INCH, LEAST_INCH), MOST_INCH)
     size = 2.0 * PANEL_INCH + TEXT_INCH, height
     figure = Figure(figsize=size, dpi=DPI, layout='constrained')
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-    fill_points(left, cloud.points, R, (low, high))
-    fill_shapes(right, shapes, R)
-    for ax, panel in ((left, cloud), (right, shapes)):
+    fill_points(left, picture.points, R, (low, high))
+    fill_shapes(right, mesh, picture.drawings, R)
+    for ax, title in zip((left, right), picture.titles, strict=True):
         ax.set(aspect='equal', xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         ax.set(xticks=[], yticks=[], facecolor=GROUND)
-        ax.set_title(panel.title, fontsize='medium')
+        ax.set_title(title, fontsize='medium')
         draw_scale(ax, low, high)
     with replace_file(path) as file:
         figure.savefig(file, format='png')
@@ -131,24 +138,27 @@ def fill_points(ax: Axes, points: Array, R: Array, frame: tuple[Array, Array]) -
     bar.ax.tick_params(labelsize='small')
 
 
-def fill_shapes(ax: Axes, panel: ShapesPanel, R: Array) -> None:
-    """Draw triangles, shaded, and outlines from far to near, and the legend."""
+def fill_shapes(ax: Axes, mesh: Mesh, drawings: Sequence[Drawing], R: Array) -> None:
+    """Draw triangles, shaded, and the rings of drawings, from far to near."""
     from matplotlib.collections import PolyCollection
-    from matplotlib.patches import Patch
 
-    corners = panel.corners @ R.T
+    corners = mesh.vertices[mesh.triangles] @ R.T
     normals = face_normals(corners)
     lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-300)
     lit = np.abs(normals @ (LIGHT / np.linalg.norm(LIGHT))) / lengths
-    faces = panel.colors * (AMBIENT + (1.0 - AMBIENT) * lit)[:, None]
-    sides, edges = sides_of(panel, R)
+    faces = mesh.colors[mesh.triangles[:, 0]] / 255.0 * (AMBIENT + (1.0 - AMBIENT) * lit)[:, None]
+    rings = [
+        ring for drawing in drawings if isinstance(drawing, RingsDrawing) for ring in drawing.rings
+    ]
+    pairs = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) @ R.T for ring in rings]
+    sides = np.concatenate([np.empty((0, 2, 3)), *pairs])
     depth = np.concatenate([corners[:, :, 2].mean(axis=1), sides[:, :, 2].mean(axis=1)])
     # outlines are on top of their own triangles
     depth[len(corners) :] += 0.01 * max(float(np.ptp(depth)), 1e-9) if len(depth) else 0.0
     order = np.argsort(depth, kind='stable')
     outlines = [*corners[:, :, :2], *sides[:, :, :2]]
     widths = np.repeat([0.5, 0.9], [len(corners), len(sides)])
-    colors = np.concatenate([faces, edges])
+    colors = np.concatenate([faces, np.tile(EDGE, (len(sides), 1))])
     ax.add_collection(
         PolyCollection(
             [outlines[k] for k in order],
@@ -158,21 +168,6 @@ def fill_shapes(ax: Axes, panel: ShapesPanel, R: Array) -> None:
             closed=False,
         )
     )
-    handles = [
-        Patch(facecolor=face, edgecolor=edge or face, label=text)
-        for text, face, edge in panel.legend
-    ]
-    if handles:
-        below = {'loc': 'upper center', 'bbox_to_anchor': (0.5, 0.0), 'ncols': len(handles)}
-        ax.legend(handles=handles, fontsize='small', frameon=False, **below)
-
-
-def sides_of(panel: ShapesPanel, R: Array) -> tuple[Array, Array]:
-    """Return the sides of all rings, (S, 2, 3) in the axes of the picture, and their colours."""
-    sides = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) @ R.T for ring in panel.rings]
-    counts = [len(ring) for ring in panel.rings]
-    colors = np.repeat(panel.ring_colors, counts, axis=0)
-    return np.concatenate([np.empty((0, 2, 3)), *sides]), colors
 
 
 def draw_scale(ax: Axes, low: Array, high: Array) -> None:

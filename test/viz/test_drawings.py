@@ -8,12 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.layers.drawings import PointsPicture, Section, Table
-from surfel_mapper.layers.models.pictures import (
-    drawings_of,
-    panels_of,
-    section_of,
-)
+from surfel_mapper.layers.drawings import Section, Table
+from surfel_mapper.layers.models.pictures import drawings_of, picture_of, section_of
 from surfel_mapper.messages.model_messages import GREY, primitive_colors
 from surfel_mapper.models import fit
 from surfel_mapper.models.outlines import areas
@@ -83,8 +79,7 @@ def test_models_of_nothing_are_a_section_too():
 def test_models_are_a_layer_and_a_section_of_the_report(seen, tmp_path):
     model, shapes = seen
     picture = tmp_path / 'models.png'
-    panels = panels_of(room(160, 120)[0], model, 'voxels')
-    draw_points(picture, PointsPicture(file_name='models.png', panels=panels, viewpoint=VIEW))
+    draw_points(picture, picture_of(room(160, 120)[0], model, VIEW, 'voxels'))
     section = section_html(section_of(model, shapes), picture)
     mesh = page_mesh(shapes, model.gaussians)
     parsed = report(tmp_path, plane(20), layers={'models': mesh}, sections=[section])
@@ -98,8 +93,7 @@ def painted(tmp_path, points, model, viewpoint):
     """Return the pixels (H, W, 3) of the picture of a cloud and its models, 0 to 1."""
     pyplot = pytest.importorskip('matplotlib.pyplot')
     path = tmp_path / 'models.png'
-    panels = panels_of(points, model)
-    draw_points(path, PointsPicture(file_name=path.name, panels=panels, viewpoint=viewpoint))
+    draw_points(path, picture_of(points, model, viewpoint))
     return pyplot.imread(path)[:, :, :3]
 
 

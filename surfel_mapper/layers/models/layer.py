@@ -20,9 +20,9 @@ import numpy.typing as npt
 from surfel_mapper.config import Config
 from surfel_mapper.files.model_files import PACKED, TRIANGLES, write_models, write_packed
 from surfel_mapper.files.triangles import import_trimesh
-from surfel_mapper.layers.drawings import Drawing, PointsPicture, Section
+from surfel_mapper.layers.drawings import Drawing, Section
 from surfel_mapper.layers.layer import InsertedScan, Layer, Moment, Publication, Surroundings
-from surfel_mapper.layers.models.pictures import drawings_of, panels_of, section_of
+from surfel_mapper.layers.models.pictures import drawings_of, picture_of, section_of
 from surfel_mapper.messages.markers import marker_array, polygon_instance
 from surfel_mapper.messages.model_messages import (
     model_markers,
@@ -41,8 +41,6 @@ STEP = 50
 
 OUTLINES_KEPT = 1000
 """Depth of ~/outlines: there is a message for each polygon, and there may be hundreds at once."""
-
-PICTURE = 'models.png'
 
 
 class ModelsLayer(Layer):
@@ -157,11 +155,7 @@ class ModelsLayer(Layer):
         """Return figures, a picture, and a table of the largest patches."""
         model, surfels = self.models.model, self.models.surfels
         points = surfel_points(surfels, model.voxel_size_m)
-        picture = PointsPicture(
-            file_name=PICTURE,
-            panels=panels_of(points, model, f'{len(surfels)} voxels'),
-            viewpoint=above(surfels),
-        )
+        picture = picture_of(points, model, above(surfels), f'{len(surfels)} voxels')
         return section_of(model, self._current_shapes(), picture)
 
     def _make_shapes(self) -> bool:

@@ -9,7 +9,6 @@ Every plane and surface has a colour of its own; Gaussians are grey.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -19,32 +18,20 @@ from surfel_mapper.layers.drawings import (
     Drawing,
     EllipsoidsDrawing,
     MeshDrawing,
-    PointsPanel,
     PointsPicture,
     RingsDrawing,
     Section,
-    ShapesPanel,
     Table,
 )
 from surfel_mapper.messages.model_messages import GREY, primitive_colors
 from surfel_mapper.models.multi_model import Gaussians, MultiModel
-from surfel_mapper.models.shapes import (
-    ellipsoid_corners,
-    ellipsoid_frames,
-    FACES,
-    PatchShape,
-    shape_of,
-)
+from surfel_mapper.models.shapes import ellipsoid_frames, PatchShape, shape_of
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
+
+PICTURE = 'models.png'
 
 MOST_POINTS = 120_000
 """Maximum number of points drawn of a cloud; a larger one is subsampled evenly."""
-
-MOST_ELLIPSOIDS = 1_500
-"""Maximum number of Gaussians drawn in a picture, those of most points."""
-
-PLANE_EDGE, SURFACE_EDGE, FACE = (0.1, 0.1, 0.1), (0.05, 0.2, 0.7), (0.75, 0.8, 0.75)
-"""Outlines of planes and of surfaces, and the swatch of both in a legend."""
 
 MOST_ROWS = 25
 """Rows of the table of a report, for the largest planes and surfaces."""
@@ -90,11 +77,14 @@ def patches_mesh(shapes: Sequence[PatchShape]) -> Mesh:
     )
 
 
-def panels_of(
-    points: npt.NDArray[Any], model: MultiModel, title: str = ''
-) -> tuple[PointsPanel, ShapesPanel]:
+def picture_of(
+    points: npt.NDArray[Any],
+    model: MultiModel,
+    viewpoint: npt.NDArray[np.float64],
+    title: str = '',
+) -> PointsPicture:
     """
-    Return a cloud, and beside it the models that stand for it.
+    Return the picture of a cloud and, beside it, its models.
 
     Parameters
     ----------
@@ -102,36 +92,22 @@ def panels_of(
         The cloud; points that are not finite are left out.
     model : MultiModel
         Its models.
+    viewpoint : (3,) float64, m
+        Place from which they are seen.
     title : str
         Of the cloud; the number of its points by default.
 
     """
     cloud = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-    cloud = cloud[:: -(-len(cloud) // MOST_POINTS) or 1]
-    shapes = [shape_of(patch) for patch in model.patches]
-    gaussians = model.gaussians
-    largest = np.argsort(-gaussians.num_points, kind='stable')[:MOST_ELLIPSOIDS]
-    drawn = Gaussians(*(getattr(gaussians, f.name)[largest] for f in fields(gaussians)))
-    ellipsoids = ellipsoid_corners(drawn)[:, FACES].reshape(-1, 3, 3)
-    corners = [shape.corners for shape in shapes]
-    colors = [*primitive_colors([patch.id for patch in model.patches]), np.array(GREY[:3])]
-    counts = [*map(len, corners), len(ellipsoids)]
-    edges = [SURFACE_EDGE if shape.is_curved else PLANE_EDGE for shape in shapes]
-    panel = ShapesPanel(
-        title=f'{model.size_bytes:,} bytes',
-        corners=np.concatenate([*corners, ellipsoids]),
-        colors=np.repeat(np.array(colors)[:, :3], counts, axis=0),
-        rings=[ring for shape in shapes for ring in shape.rings],
-        ring_colors=np.array(
-            [edge for shape, edge in zip(shapes, edges, strict=True) for _ in shape.rings]
-        ).reshape(-1, 3),
-        legend=[
-            (f'{len(model.planes)} planes', FACE, PLANE_EDGE),
-            (f'{len(model.surfaces)} surfaces', FACE, SURFACE_EDGE),
-            (f'{len(gaussians)} Gaussians, 2 sigma', GREY, None),
-        ],
+    kinds = f'{len(model.planes)} planes, {len(model.surfaces)} surfaces'
+    kinds += f', {len(model.gaussians)} Gaussians (2 sigma)'
+    return PointsPicture(
+        file_name=PICTURE,
+        points=cloud[:: -(-len(cloud) // MOST_POINTS) or 1],
+        drawings=drawings_of([shape_of(patch) for patch in model.patches], model.gaussians),
+        titles=(title or f'{len(points):,} points', f'{kinds}: {model.size_bytes:,} bytes'),
+        viewpoint=viewpoint,
     )
-    return PointsPanel(title=title or f'{len(points):,} points', points=cloud), panel
 
 
 def section_of(
