@@ -194,14 +194,14 @@ def left_out(scene: MapScene, oblique: Camera, plan: Camera) -> str:
     """Return the sentence about surfels that the views do not show."""
     total = len(scene.discs) + scene.hidden
     outside = [scene.left_out(camera) for camera in (oblique, plan)]
-    text = f'{total:,} surfels; beyond the views are {outside[0]:,} on the left, '
-    text += f'{outside[1]:,} on the right'
+    text = f'Drawn as {total:,} surfels, large where the map is flat. Outside the views are '
+    text += f'{outside[0]:,} on the left, {outside[1]:,} on the right'
     if not all(camera.contains(scene.trajectory).all() for camera in (oblique, plan)):
         text += ', with a part of the trajectory'
     if scene.hidden:
-        text += f'; the ceiling is cut away at {scene.top_m - scene.ground_m:.1f} m above the '
-        text += f'ground with {scene.hidden:,}'
-    return text + '; those that face away are not drawn.'
+        text += f'. The ceiling is cut away at {scene.top_m - scene.ground_m:.1f} m above the '
+        text += f'ground, with {scene.hidden:,}'
+    return text + '. Surfels that face away are not drawn.'
 
 
 def draw_oblique(page: Axes, scene: MapScene, camera: Camera) -> None:
@@ -259,7 +259,8 @@ def draw_key(page: Axes, scene: MapScene, camera: Camera) -> None:
     x, y = BORDER + 450, low + 46
     for name, (right, up) in zip('xyz', camera.R_view_map[:2].T.tolist(), strict=True):
         page.annotate('', (x + 36 * right, y + 36 * up), (x, y), arrowprops=arrow)
-        page.text(x + 48 * right, y + 48 * up, name, ha='center', **text)
+        shift = 10 if name == 'z' else 0  # another axis may point up as well
+        page.text(x + 48 * right - shift, y + 48 * up, name, ha='center', **text)
     edge = BORDER + camera.width - BALL_PX
     across, along = np.meshgrid(np.linspace(-1.0, 1.0, BALL_PX), np.linspace(1.0, -1.0, BALL_PX))
     near = np.sqrt(np.maximum(1.0 - across**2 - along**2, 0.0))

@@ -70,8 +70,8 @@ def test_a_lamp_below_the_ceiling_is_cut_away_with_it():
     assert scene.hidden == 800 + 4
     assert scene.discs.position[:, 2].max() == 0.0
     text = left_out(scene, scene.oblique(), scene.plan(800))
-    assert text.startswith('1,604 surfels; ')
-    assert 'ceiling is cut away at 4.9 m above the ground with 804' in text
+    assert text.startswith('Drawn as 1,604 surfels, ')
+    assert 'ceiling is cut away at 4.9 m above the ground, with 804' in text
 
 
 def test_level_ground_is_of_one_colour_whatever_its_planarity(tmp_path):
