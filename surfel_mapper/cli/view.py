@@ -26,7 +26,6 @@ from surfel_mapper.errors import escaped
 
 if TYPE_CHECKING:
     from surfel_mapper.viz.contents import Content
-    from surfel_mapper.viz.gltf import GltfScene
     from surfel_mapper.viz.scene import Scene
 
 SUMMARY = 'Show maps, clouds, meshes, models, trajectories, bags or a running node.'
@@ -35,7 +34,7 @@ EXAMPLE = 'surfel-mapper view street_surfels/ --color height'
 
 COLOURS = (
     *('normal', 'height', 'planarity', 'curvature', 'num_points', 'thickness', 'normal_sigma'),
-    *('radius', 'num_scans', 'size', 'intensity', 'rgb', 'age', 'label'),
+    *('radius', 'num_scans', 'size', 'intensity', 'rgb', 'age'),
 )
 
 LAST_PORT = 65_534
@@ -81,9 +80,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument('--browser', action='store_true', help='serve a page until Ctrl-C')
     where.add_argument('--rrd', type=Path, metavar='FILE', help='write a file for rerun instead')
-    where.add_argument(
-        '--glb', type=Path, metavar='FILE', help='write glTF instead, for Blender and web pages'
-    )
     add(
         '--port',
         type=page_port,
@@ -110,20 +106,16 @@ def run(args: argparse.Namespace) -> int:
 
     if bool(args.what) == (args.live is not None):
         raise UsageError('expected WHAT to show, or --live')
-    for path in filter(None, (args.rrd, args.glb)):
-        check_free(path, args.overwrite)
+    if args.rrd is not None:
+        check_free(args.rrd, args.overwrite)
     if args.live is not None:
-        if args.glb is not None:
-            raise UsageError('--glb writes what files hold, not a live node')
         refuse_settings(args)
         show_live(args)
         return 0
-    many = len(args.what) > 1
     recordings = [path for path in args.what if path.exists() and not is_shown(path)]
-    if recordings and (many or args.glb is not None):
-        reason = 'a recording is shown alone' if many else 'for --glb map it with replay first'
-        raise UsageError(f'{recordings[0]}: {reason}')
     if recordings:
+        if len(args.what) > 1:
+            raise UsageError(f'{recordings[0]}: a recording is shown alone')
         with opened(args) as scene:
             announce(scene)
             show_recording(recordings[0], args, scene)
@@ -142,7 +134,7 @@ def refuse_settings(args: argparse.Namespace) -> None:
 
 
 def show_files(args: argparse.Namespace) -> None:
-    """Read files, show them or write them as glTF, and wait if there is a page to serve."""
+    """Read files, show them, and wait if there is a page to serve."""
     from surfel_mapper.viz.contents import contents
     from surfel_mapper.viz.server import import_rerun
 
@@ -155,11 +147,6 @@ def show_files(args: argparse.Namespace) -> None:
 
     with ThreadPoolExecutor(1) as reader:  # a large map takes longer to read than rerun to start
         reading = reader.submit(read)
-        if args.glb is not None:
-            from surfel_mapper.viz.gltf import GltfScene
-
-            show_all(GltfScene(args.glb), reading.result(), args)
-            return
         import_rerun()
         if args.rrd is not None or reading.done():
             reading.result()  # if it is refused, nothing is opened and no file overwritten
@@ -170,9 +157,7 @@ def show_files(args: argparse.Namespace) -> None:
                 scene.wait()
 
 
-def show_all(
-    scene: Scene | GltfScene, contents: Sequence[Content], args: argparse.Namespace
-) -> None:
+def show_all(scene: Scene, contents: Sequence[Content], args: argparse.Namespace) -> None:
     """Show contents as the arguments ask for, and print a sentence about each."""
     from surfel_mapper.viz.show import show_contents
 

@@ -142,7 +142,8 @@ class NodeView:
                 self._scene.mesh(path, marker_mesh(marker))
             elif marker.type == Marker.LINE_LIST:
                 lines = list(places_of(marker, 2).reshape(-1, 2, 3))
-                self._scene.lines(path, lines, colours_of(marker)[::2])
+                shape = self._scene.rerun.LineStrips3D(lines, colors=colours_of(marker)[::2])
+                self._scene.log(path, shape)
 
 
 def show_node(

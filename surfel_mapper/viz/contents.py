@@ -51,58 +51,39 @@ NEIGHBOURS = 20_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ExactMap:
+class Content:
     """
-    A map with its moments.
+    A map, surfels or points, a mesh, or poses.
 
     Attributes
     ----------
     name : str
         Path in the viewer, below ``map``.
-    moments : ScanMoments
+    shape : ScanMoments, DrawnDiscs, (N, 3) float64, Mesh or Trajectory
+        Moments in the frame of their map, all others in the fixed frame.
     origin_m : (3,) float64, m
+        Of a map.
     scans : list of WindowedScan
-        Those of its window, for ages.
+        Those of the window of a map, for ages.
 
     """
 
     name: str
-    moments: ScanMoments
-    origin_m: Array
+    shape: ScanMoments | DrawnDiscs | Array | Mesh | Trajectory
+    origin_m: Array = field(default_factory=lambda: np.zeros(3))
     scans: list[WindowedScan] = field(default_factory=list)
 
-    def middles(self) -> Array:
-        """Return the middles of up to some 100,000 voxels in the fixed frame, (N, 3) m."""
-        index = unpack_keys(self.moments.key[:: max(len(self.moments) // 100_000, 1)])
-        return np.asarray((index + 0.5) * self.moments.voxel_size_m + self.origin_m, np.float64)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Cloud:
-    """Surfels or points without moments in the fixed frame; discs if they have normals."""
-
-    name: str
-    position: Array
-    discs: DrawnDiscs | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ShownMesh:
-    """A mesh in the fixed frame."""
-
-    name: str
-    mesh: Mesh
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Way:
-    """Poses in the fixed frame."""
-
-    name: str
-    trajectory: Trajectory
-
-
-Content = ExactMap | Cloud | ShownMesh | Way
+    def positions(self) -> Array:
+        """Return positions in the fixed frame, (N, 3) m; of a map up to some 100,000 voxels."""
+        shape = self.shape
+        if isinstance(shape, ScanMoments):
+            index = unpack_keys(shape.key[:: max(len(shape) // 100_000, 1)])
+            return np.asarray((index + 0.5) * shape.voxel_size_m + self.origin_m, np.float64)
+        if isinstance(shape, Mesh):
+            return shape.vertices
+        if isinstance(shape, Trajectory):
+            return shape.xyz
+        return shape.position if isinstance(shape, DrawnDiscs) else shape
 
 
 def is_shown(path: Path) -> bool:
@@ -143,16 +124,16 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
         yield cloud(path, name)
     elif suffix == '.npz':
         surfel_map, scans = map_state.load_map(path)
-        yield ExactMap(name, surfel_map.moments(), surfel_map.origin_m, scans)
+        yield Content(name, surfel_map.moments(), surfel_map.origin_m, scans)
     elif suffix == '.parquet':
         surfel_map = parquet.read_map(path)
-        yield ExactMap(name, surfel_map.moments(), surfel_map.origin_m)
+        yield Content(name, surfel_map.moments(), surfel_map.origin_m)
     elif suffix in TRIANGLES:
-        yield ShownMesh(name, read_triangles(path))
+        yield Content(name, read_triangles(path))
     elif suffix in TRAJECTORIES:
-        yield Way(name, read_trajectory(path))
+        yield Content(name, read_trajectory(path))
     elif suffix == '.ply' and (mesh := ply.read_mesh(path)) is not None:
-        yield ShownMesh(name, mesh)
+        yield Content(name, mesh)
     elif suffix in CLOUDS:
         yield cloud(path, name)
     else:
@@ -168,7 +149,7 @@ def in_directory(path: Path, name: str) -> Iterator[Content]:
     map_path = map_in(path, DRAWABLE)
     if map_path is not None and map_path.is_dir():
         surfel_map = read_tiles(map_path)
-        yield ExactMap(f'{prefix}surfels', surfel_map.moments(), surfel_map.origin_m)
+        yield Content(f'{prefix}surfels', surfel_map.moments(), surfel_map.origin_m)
     elif map_path is not None:
         yield from contents(map_path, f'{prefix}surfels')
     for file_name in BESIDE:
@@ -178,14 +159,13 @@ def in_directory(path: Path, name: str) -> Iterator[Content]:
         yield from contents(apart, f'{prefix}{apart.stem}')
 
 
-def cloud(path: Path, name: str) -> Cloud:
+def cloud(path: Path, name: str) -> Content:
     """Return the surfels or points of a file, in the fixed frame."""
     points, columns = read_scan(path)
     position = points.astype(np.float64)
     if normal_names(columns) is None:
-        return Cloud(name, position[np.isfinite(position).all(axis=1)], None)
-    discs = discs_of(position, columns)
-    return Cloud(name, discs.position, discs)
+        return Content(name, position[np.isfinite(position).all(axis=1)])
+    return Content(name, discs_of(position, columns))
 
 
 def normal_names(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[str, ...] | None:

@@ -17,10 +17,9 @@ import numpy.typing as npt
 
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.coarsening import coarse_keys, coarse_surfels
-from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
+from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import concatenated, Surfels
-from surfel_mapper.threads import share, usable_cores
 
 Array = npt.NDArray[np.float64]
 
@@ -32,9 +31,6 @@ MOST_LEVEL = layout.INDEX_BITS - 1
 
 MOST_TILES = 256
 """Limit of the tiles, each of which is an entity of the viewer."""
-
-BLOCK = 1 << 16
-"""Number of keys that are masked at a time; half a megabyte stays in the cache."""
 
 STEPS = 60
 """Distances tried for the begin of the first coarser level, between a tile and the whole map."""
@@ -56,7 +52,7 @@ class DetailedMap:
     Attributes
     ----------
     tiles : (T, 2) int64
-        Voxel indices in i and j of the tiles, shifted right by ``bits``.
+        Indices of the tiles along x and y.
     edge_m : float
         Edge of a tile.
     counts : (L, T) int64
@@ -67,24 +63,25 @@ class DetailedMap:
     def __init__(self, moments: ScanMoments, min_points: int) -> None:
         self._moments, self._min_points = moments, min_points
         last = min(LEVELS, MOST_LEVEL - moments.level)
-        begin, columns = column_runs(moments.key, last)
-        indices = unpack_keys(columns)[:, :2].astype(np.int64) >> last
-        self.bits, self.tiles = tiles_of(indices, last)
-        self.edge_m = moments.voxel_size_m * 2.0**self.bits
-        tile = np.searchsorted(packed(self.tiles), packed(indices >> (self.bits - last)))
-        order = np.argsort(tile, kind='stable')
-        self._begin = begin[order]  # of the runs, in the order of their tiles
-        self._length = np.diff(begin, append=len(moments))[order]
-        self._ends = np.cumsum(np.bincount(tile, minlength=len(self.tiles)))
-        self.counts: npt.NDArray[np.int64] = np.zeros((last + 1, len(self.tiles)), np.int64)
-        fits = np.ones((last + 1, len(self.tiles)), bool)
-
-        def count(chunk: slice) -> None:
-            for number in range(chunk.start, chunk.stop):
-                self._count(number, fits)
-
-        share(count, len(self.tiles), usable_cores())
-        self.counts = self.counts[fits.all(axis=1)]
+        column = moments.voxel_index[:, :2].astype(np.int64)
+        bits, self.tiles = tiles_of(column >> last, last)
+        self.edge_m = moments.voxel_size_m * 2**bits
+        tile = np.searchsorted(packed(self.tiles), packed(column >> bits))
+        ends = np.cumsum(np.bincount(tile, minlength=len(self.tiles)))
+        # numbers of 16 bits are sorted by radix
+        self._voxels = np.split(np.argsort(tile.astype(np.uint16), kind='stable'), ends[:-1])
+        key, count, counts = moments.key, moments.count, []
+        for level in range(last + 1):
+            if level:
+                key, parent = coarse_keys(key, 1)
+                tile_of = np.empty(len(key), np.int64)
+                tile_of[parent] = tile
+                # float64 is exact below 2^53
+                count, tile = np.bincount(parent, count, len(key)).astype(np.int64), tile_of
+            if count.max(initial=0) > layout.MAX_MAP_COUNT >> 2 * (moments.level + level):
+                break
+            counts.append(np.bincount(tile[count >= min_points], minlength=len(self.tiles)))
+        self.counts: npt.NDArray[np.int64] = np.stack(counts)
 
     def __len__(self) -> int:
         """Return the number of tiles."""
@@ -119,38 +116,11 @@ class DetailedMap:
 
     def surfels(self, tile: int, level: int) -> Surfels:
         """Return the surfels of a tile at a level."""
-        return coarse_surfels(self._moments, level, self._voxels(tile), self._min_points)
+        return coarse_surfels(self._moments, level, self._voxels[tile], self._min_points)
 
     def all_surfels(self, level: npt.NDArray[np.int64]) -> list[Surfels]:
         """Return the surfels of all tiles, each at its level (T,)."""
-        by_tile: dict[int, Surfels] = {}
-
-        def sum_up(chunk: slice) -> None:
-            for tile in range(chunk.start, chunk.stop):
-                by_tile[tile] = self.surfels(tile, int(level[tile]))
-
-        share(sum_up, len(self.tiles), usable_cores())
-        return [by_tile[tile] for tile in range(len(self.tiles))]
-
-    def _voxels(self, tile: int) -> npt.NDArray[np.int64]:
-        """Return the rows of the moments in a tile."""
-        runs = slice(self._ends[tile - 1] if tile else 0, self._ends[tile])
-        length = self._length[runs]
-        offsets = np.cumsum(length) - length
-        return np.repeat(self._begin[runs] - offsets, length) + np.arange(length.sum())
-
-    def _count(self, tile: int, fits: npt.NDArray[np.bool_]) -> None:
-        """Count the surfels of a tile at each level; note the levels whose sums may overflow."""
-        voxels = self._voxels(tile)
-        key, count = self._moments.key[voxels], self._moments.count[voxels]
-        for level in range(len(fits)):
-            if level:
-                key, parent = coarse_keys(key, 1)
-                # float64 is exact below 2^53
-                count = np.bincount(parent, count, len(key)).astype(np.int64)
-                limit = layout.MAX_MAP_COUNT >> 2 * (self._moments.level + level)
-                fits[level:, tile] &= count.max() <= limit
-            self.counts[level, tile] = np.count_nonzero(count >= self._min_points)
+        return [self.surfels(tile, int(number)) for tile, number in enumerate(level)]
 
     def _distances(self, target: Array) -> Array:
         """Return the horizontal distance of each tile from a target, (T,) m; 0 inside."""
@@ -198,29 +168,6 @@ def tiles_of(columns: npt.NDArray[np.int64], level: int) -> tuple[int, npt.NDArr
         if len(tiles) <= MOST_TILES:
             return bits, tiles
         bits, tiles = bits + 1, tiles >> 1
-
-
-def column_runs(
-    key: npt.NDArray[np.int64], level: int
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """
-    Return the first voxel of each run of voxels in one column of a level, and the columns' keys.
-
-    Files have voxels in the order of their keys, some 60 of a column one after the other. The keys
-    are taken in blocks, as memory for masks of all of them takes longer to get than to fill.
-    """
-    beyond = (np.int64(1) << level) - 1
-    mask = ~(beyond << 2 * layout.INDEX_BITS | (beyond + 1 << layout.INDEX_BITS) - 1)
-    begin, columns, previous = [], [], np.int64(-1)
-    for start in range(0, len(key), BLOCK):
-        column = key[start : start + BLOCK] & mask
-        changes = np.flatnonzero(np.diff(column, prepend=previous))
-        begin.append(changes + start)
-        columns.append(column[changes])
-        previous = column[-1]
-    if not begin:
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    return np.concatenate(begin), np.concatenate(columns)
 
 
 def packed(tile: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -15,7 +15,7 @@ Servers listen on loopback only: what is shown is not protected by a password.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,8 @@ PORT = 9876
 PICKED = -0.5
 """Radius of the point that is picked, which rerun takes as pixels since it is negative."""
 
+POINT_RADIUS_M = 0.02
+
 AROUND_M = 12.0
 """Half of the side of the place that is looked at around a sensor, m."""
 
@@ -71,6 +73,11 @@ class Scene:
     file : RecordingFile, optional
         The file that is written, which gets its name with the end of the scene.
 
+    Attributes
+    ----------
+    rerun : module
+        Its archetypes are the shapes that ``log`` takes.
+
     """
 
     def __init__(
@@ -85,12 +92,12 @@ class Scene:
         self._file = file
         self.colouring = Colouring()
         self.origin_m: Array = np.zeros(3)
-        self._rerun = import_rerun()
+        self.rerun = import_rerun()
         self._stream = stream
         self._server = server
-        has_sides = hasattr(self._rerun.components, 'MeshFaceRendering')  # not of old versions
+        has_sides = hasattr(self.rerun.components, 'MeshFaceRendering')  # not of old versions
         self._from_front: dict[str, Any] = {'face_rendering': 'Front'} if has_sides else {}
-        stream.log('map', self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        stream.log('map', self.rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     @classmethod
     def to_file(cls, path: str | Path) -> Scene:
@@ -187,7 +194,7 @@ class Scene:
         """State the place of the frame of the map in the fixed frame, (3,) m."""
         self.origin_m = np.asarray(origin_m, np.float64)
         if self.origin_m.any():
-            about = self._rerun.AnyValues(origin_m=self.origin_m)
+            about = self.rerun.AnyValues(origin_m=self.origin_m)
             self._stream.log('map', about, static=True)
 
     def look(self, low: Array, high: Array, target: Array, hidden: Sequence[str] = ()) -> None:
@@ -230,7 +237,7 @@ class Scene:
         if not len(discs):
             self.clear(path, static=static)
             return
-        rerun, colours = self._rerun, self.colouring.of(discs)
+        rerun, colours = self.rerun, self.colouring.of(discs)
         corners, triangles = discs.triangles()
         mesh = rerun.Mesh3D(
             vertex_positions=corners,
@@ -238,88 +245,39 @@ class Scene:
             vertex_colors=np.repeat(colours, CORNERS, axis=0),
             **self._from_front,
         )
-        self._stream.log(f'{path}/discs', mesh, static=static)
+        self.log(f'{path}/discs', mesh, static=static)
         values = dict(discs.values)
         values.update(zip(NORMAL, discs.normal.T.astype(np.float32), strict=True))
         if self.origin_m.any():
             values.update(zip(FIXED, (discs.position + self.origin_m).T, strict=True))
         points = rerun.Points3D(discs.position, radii=PICKED, colors=colours)
-        self._stream.log(path, points, rerun.AnyValues(**values), static=static)
+        self.log(path, points, rerun.AnyValues(**values), static=static)
+
+    def log(self, path: str, *shapes: Any, static: bool = False) -> None:
+        """Show shapes, archetypes of rerun, in place of those that the path has had."""
+        self._stream.log(path, *shapes, static=static)
 
     def clear(self, path: str, *, static: bool = False) -> None:
         """Show nothing at a path and below."""
-        self._stream.log(path, self._rerun.Clear(recursive=True), static=static)
+        self.log(path, self.rerun.Clear(recursive=True), static=static)
 
     def mesh(self, path: str, mesh: Mesh, *, static: bool = False) -> None:
         """Show a mesh, in its colours or grey: rerun's white is lost on the light background."""
         if not len(mesh):
             self.clear(path, static=static)
             return
-        shown = self._rerun.Mesh3D(
+        shown = self.rerun.Mesh3D(
             vertex_positions=mesh.vertices.astype(np.float32),
             triangle_indices=mesh.triangles.astype(np.uint32),
             vertex_normals=vertex_normals(mesh),
             vertex_colors=mesh.colors if len(mesh.colors) else None,
             albedo_factor=None if len(mesh.colors) else GREY,
         )
-        self._stream.log(path, shown, static=static)
-
-    def points(
-        self,
-        path: str,
-        points: Array,
-        radius_m: float,
-        colour: Sequence[int] | None = None,
-        *,
-        static: bool = False,
-    ) -> None:
-        """Show points (N, 3), m."""
-        colours = None if colour is None else [tuple(colour)]
-        shown = self._rerun.Points3D(points, radii=radius_m, colors=colours)
-        self._stream.log(path, shown, static=static)
-
-    def lines(
-        self,
-        path: str,
-        lines: Sequence[Array],
-        colours: Any,
-        labels: Sequence[str] | None = None,
-        *,
-        static: bool = False,
-    ) -> None:
-        """Show lines, (M, 3) m each, with labels that are shown when they are picked."""
-        shown = self._rerun.LineStrips3D(
-            lines, colors=colours, labels=labels and list(labels), show_labels=False
-        )
-        self._stream.log(path, shown, static=static)
-
-    def ellipsoids(
-        self, path: str, centers: Array, half_sizes_m: Array, turns: Array, color: Any
-    ) -> None:
-        """Show ellipsoids with half axes (K, 3), m, turned by quaternions (K, 4), x y z w."""
-        shown = self._rerun.Ellipsoids3D(
-            centers=centers,
-            half_sizes=half_sizes_m,
-            quaternions=turns,
-            colors=[color] * len(centers),
-            fill_mode='solid',
-        )
-        self._stream.log(path, shown)
-
-    def pose(self, path: str, T_map_sensor: Array) -> None:
-        """Place what is below a path by a pose."""
-        placed = self._rerun.Transform3D(
-            translation=T_map_sensor[:3, 3], mat3x3=T_map_sensor[:3, :3]
-        )
-        self._stream.log(path, placed)
+        self.log(path, shown, static=static)
 
     def poses(self, path: str, stamp_ns: npt.NDArray[np.int64], xyz: Array, turns: Array) -> None:
         """Move a path along poses on the time line: positions (S, 3), quaternions (S, 4)."""
-        rerun = self._rerun
+        rerun = self.rerun
         times = rerun.TimeColumn('stamp', timestamp=stamp_ns.astype('datetime64[ns]'))
         columns = rerun.Transform3D.columns(translation=xyz, quaternion=turns)
         self._stream.send_columns(path, indexes=[times], columns=columns)
-
-    def values(self, path: str, values: Mapping[str, Any]) -> None:
-        """Attach values to a path, shown when it is selected."""
-        self._stream.log(path, self._rerun.AnyValues(**values), static=True)

@@ -1,13 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The package and the program rerun: where they are, and starting and ending its servers."""
+"""The package rerun, and starting and ending its servers."""
 
 from __future__ import annotations
 
 from contextlib import suppress
 import os
-from pathlib import Path
-import shutil
 import signal
 import socket
 import subprocess
@@ -40,8 +38,8 @@ def started_server(port: int, data_port: int, memory: str) -> Server:
     Beyond the memory, WHOLE or LIVE, it drops the oldest data that are not static.
     """
     command = [
-        *(rerun_program(), '--serve-web', '--bind', LOOPBACK, '--hide-welcome-screen'),
-        *('--port', str(data_port), '--web-viewer-port', str(port)),
+        *(sys.executable, '-m', 'rerun', '--serve-web', '--bind', LOOPBACK),
+        *('--hide-welcome-screen', '--port', str(data_port), '--web-viewer-port', str(port)),
         *('--server-memory-limit', memory),
     ]
     for number in (data_port, port):
@@ -68,17 +66,6 @@ def import_rerun() -> Any:
             "`pip install 'surfel_mapper[viewer]'` or `pip install rerun-sdk`"
         ) from error
     return rerun
-
-
-def rerun_program() -> str:
-    """Return the path of the program rerun, beside this Python or on the PATH."""
-    program = shutil.which('rerun', path=str(Path(sys.executable).parent)) or shutil.which('rerun')
-    if program is None:
-        raise DependencyError(
-            'the program rerun, which the package rerun-sdk installs, is neither beside '
-            f'{sys.executable} nor on the PATH'
-        )
-    return program
 
 
 def end_group(server: Server) -> None:

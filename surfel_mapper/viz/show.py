@@ -16,13 +16,16 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.files.trajectory import Trajectory
 from surfel_mapper.mapping.ages import ages_s, last_seen_ns
+from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.viz.contents import Cloud, Content, ExactMap, ShownMesh, Way
+from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.tsdf.mesh import Mesh
+from surfel_mapper.viz.contents import Content
 from surfel_mapper.viz.detail import DetailedMap
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
-from surfel_mapper.viz.gltf import GltfScene
-from surfel_mapper.viz.scene import ORANGE, RED, Scene
+from surfel_mapper.viz.scene import ORANGE, POINT_RADIUS_M, RED, Scene
 
 Array = npt.NDArray[np.float64]
 
@@ -41,7 +44,7 @@ ROUND_M = 1000.0
 
 
 def show_contents(
-    scene: Scene | GltfScene,
+    scene: Scene,
     contents: Sequence[Content],
     *,
     colouring: str = 'normal',
@@ -54,7 +57,7 @@ def show_contents(
 
     Parameters
     ----------
-    scene : Scene or GltfScene
+    scene : Scene
         Where they are shown.
     contents : sequence of Content
         As ``contents`` of contents.py yields them.
@@ -77,121 +80,107 @@ def show_contents(
     origin_m = shared_origin(contents)
     scene.set_origin(origin_m)
     looked_at = np.asarray(place_of(contents) if target is None else target, np.float64) - origin_m
-    maps = [content for content in contents if isinstance(content, ExactMap)]
-    shares = most_discs // max(len(maps), 1)
-    tiles: dict[str, DrawnDiscs] = {}
-    about: dict[str, str] = {}
-    for exact in maps:
-        shift_m = exact.origin_m - origin_m
-        by_path, about[exact.name] = map_tiles(
-            exact, min_points, shift_m, looked_at - shift_m, shares
-        )
-        tiles.update(by_path)
-    clouds = [
-        shifted_cloud(content, origin_m) for content in contents if isinstance(content, Cloud)
-    ]
-    drawn = list(tiles.values())
-    drawn += [cloud.discs for cloud in clouds if cloud.discs is not None]
-    if any(map(len, drawn)):
-        scene.colouring = Colouring.over(colouring, drawn)
-    positions = [discs.position for discs in drawn] + [cloud.position for cloud in clouds]
+    tiles, about = all_discs(contents, origin_m, looked_at, most_discs, min_points)
+    if any(map(len, tiles.values())):
+        scene.colouring = Colouring.over(colouring, list(tiles.values()))
+    positions = [discs.position for discs in tiles.values()]
+    positions += [c.shape - origin_m for c in contents if isinstance(c.shape, np.ndarray)]
     if not any(map(len, positions)):
-        positions = [positions_of(content) - origin_m for content in contents]
-    box = box_of(positions)
-    meshes = [f'map/{content.name}' for content in contents if isinstance(content, ShownMesh)]
-    hidden = meshes if any(map(len, drawn)) and isinstance(scene, Scene) else []
-    scene.look(*box, looked_at, hidden)
+        positions = [content.positions() - origin_m for content in contents]
+    meshes = [f'map/{content.name}' for content in contents if isinstance(content.shape, Mesh)]
+    hidden = meshes if any(map(len, tiles.values())) else []
+    scene.look(*box_of(positions), looked_at, hidden)
     for path, discs in tiles.items():
         scene.discs(path, discs, static=True)
-    for cloud in clouds:
-        about[cloud.name] = show_cloud(scene, cloud)
     for content in contents:
-        if isinstance(content, ShownMesh):
-            path = f'map/{content.name}'
-            mesh = replace(content.mesh, vertices=content.mesh.vertices - origin_m)
-            scene.mesh(path, mesh, static=True)
-            about[content.name] = f'{len(content.mesh):,} triangles'
+        path, shape = f'map/{content.name}', content.shape
+        if isinstance(shape, np.ndarray):
+            points = scene.rerun.Points3D(shape - origin_m, radii=POINT_RADIUS_M)
+            scene.log(path, points, static=True)
+            about[content.name] = f'{len(shape):,} points'
+        elif isinstance(shape, Mesh):
+            scene.mesh(path, replace(shape, vertices=shape.vertices - origin_m), static=True)
+            about[content.name] = f'{len(shape):,} triangles'
             if path in hidden:  # it would flicker through the discs on the same surfaces
                 about[content.name] += ', hidden: its eye in the panel of the viewer shows them'
-        elif isinstance(content, Way):
-            about[content.name] = show_way(scene, content, origin_m)
+        elif isinstance(shape, Trajectory):
+            about[content.name] = show_way(scene, path, shape, origin_m)
     scene.flush()
     return about
 
 
-def map_tiles(
-    shown: ExactMap, min_points: int, shift_m: Array, target: Array, most_discs: int
-) -> tuple[dict[str, DrawnDiscs], str]:
-    """
-    Return the discs of a map in tiles, by path, finest about a target, and a sentence about it.
-
-    Parameters
-    ----------
-    shown : ExactMap
-        The map.
-    min_points : int
-        Voxels with fewer points are not shown.
-    shift_m : (3,) float64, m
-        Origin of the map in the frame of the scene.
-    target : (3,) float64, m
-        Place looked at, in the frame of the map.
-    most_discs : int
-        Limit of its discs.
-
-    """
-    whole = DetailedMap(shown.moments, min_points)
-    level = whole.choose(target, most_discs)
-    tiles = {}
-    for tile, surfels in enumerate(whole.all_surfels(level)):
-        i, j = whole.tiles[tile]
-        discs = with_age(surfels, shown, int(level[tile]))
-        values = {**discs.values, 'level': np.full(len(discs), level[tile])}
-        name = f'tile_{i}_{j}'.replace('-', 'm')
-        moved = replace(discs, position=discs.position + shift_m, values=values)
-        tiles[f'map/{shown.name}/{name}'] = moved
-    about = f'{whole.counts[0].sum():,} surfels in voxels of {shown.moments.voxel_size_m:g} m'
-    if level.any():
-        drawn = whole.counts[level, np.arange(len(whole))].sum()
-        about += f', shown as {drawn:,} on levels {level.min()} to {level.max()}'
+def all_discs(
+    contents: Sequence[Content], origin_m: Array, target: Array, most_discs: int, min_points: int
+) -> tuple[dict[str, DrawnDiscs], dict[str, str]]:
+    """Return the discs of maps and surfels by path, and a sentence about each by name."""
+    num_maps = sum(isinstance(content.shape, ScanMoments) for content in contents)
+    tiles: dict[str, DrawnDiscs] = {}
+    about: dict[str, str] = {}
+    for content in contents:
+        shape, shift_m = content.shape, content.origin_m - origin_m
+        if isinstance(shape, ScanMoments):
+            whole = DetailedMap(shape, min_points)
+            level = whole.choose(target - shift_m, most_discs // num_maps)
+            tiles.update(map_tiles(content, whole, level, shift_m))
+            about[content.name] = map_text(whole, level, shape.voxel_size_m)
+        elif isinstance(shape, DrawnDiscs):
+            position = shape.position + shift_m
+            tiles[f'map/{content.name}'] = replace(shape, position=position, grid_m=shift_m)
+            text = f'{len(shape):,} surfels, without their moments: at one level of detail'
+            about[content.name] = text
     return tiles, about
 
 
-def with_age(surfels: Surfels, shown: ExactMap, level: int) -> DrawnDiscs:
+def map_tiles(
+    content: Content, whole: DetailedMap, level: npt.NDArray[np.int64], shift_m: Array
+) -> dict[str, DrawnDiscs]:
+    """Return the discs of the tiles of a map, each at its level, in the frame of the scene."""
+    tiles = {}
+    for tile, surfels in enumerate(whole.all_surfels(level)):
+        name = 'tile_{}_{}'.format(*whole.tiles[tile]).replace('-', 'm')
+        discs = with_age(surfels, content.scans, int(level[tile]))
+        values = {**discs.values, 'level': np.full(len(discs), level[tile])}
+        position = discs.position + shift_m
+        moved = replace(discs, position=position, values=values, grid_m=shift_m)
+        tiles[f'map/{content.name}/{name}'] = moved
+    return tiles
+
+
+def map_text(whole: DetailedMap, level: npt.NDArray[np.int64], voxel_size_m: float) -> str:
+    """Return a sentence about a map and the levels that are shown."""
+    text = f'{whole.counts[0].sum():,} surfels in voxels of {voxel_size_m:g} m'
+    if level.any():
+        drawn = whole.counts[level, np.arange(len(whole))].sum()
+        text += f', shown as {drawn:,} on levels {level.min()} to {level.max()}'
+    return text
+
+
+def with_age(surfels: Surfels, scans: Sequence[WindowedScan], level: int) -> DrawnDiscs:
     """Return surfels as discs, with their ages if the map has the scans of its window."""
-    if not shown.scans or level:
+    if not scans or level:
         return DrawnDiscs.of(surfels)
-    newest_ns = max(scan.stamp_ns for scan in shown.scans)
-    seen_ns = last_seen_ns(surfels.voxel_index, shown.scans)
+    newest_ns = max(scan.stamp_ns for scan in scans)
+    seen_ns = last_seen_ns(surfels.voxel_index, scans)
     return DrawnDiscs.of(surfels, {'age': ages_s(seen_ns, newest_ns)})
 
 
-def show_cloud(scene: Scene | GltfScene, cloud: Cloud) -> str:
-    """Show surfels of a file as discs, or points."""
-    path = f'map/{cloud.name}'
-    if cloud.discs is None:
-        scene.points(path, cloud.position, 0.02, static=True)
-        return f'{len(cloud.position):,} points'
-    scene.discs(path, cloud.discs, static=True)
-    return f'{len(cloud.discs):,} surfels, without their moments: at one level of detail'
-
-
-def show_way(scene: Scene | GltfScene, way: Way, origin_m: Array) -> str:
+def show_way(scene: Scene, path: str, poses: Trajectory, origin_m: Array) -> str:
     """Show a trajectory as a line, and as a sensor that moves if it has stamps."""
-    poses = way.trajectory
     xyz = poses.xyz - origin_m
-    scene.lines(f'map/{way.name}', [xyz], [RED], static=True)
+    line = scene.rerun.LineStrips3D([xyz], colors=[RED])
+    scene.log(path, line, static=True)
     if poses.stamp_ns is None or not len(poses):
         return f'{len(poses)} poses without stamps'
-    path = f'map/{way.name}/sensor'
-    scene.poses(path, poses.stamp_ns, xyz, poses.q_xyzw)
-    scene.points(path, np.zeros((1, 3)), 0.3, ORANGE, static=True)
+    scene.poses(f'{path}/sensor', poses.stamp_ns, xyz, poses.q_xyzw)
+    sensor = scene.rerun.Points3D(np.zeros((1, 3)), radii=0.3, colors=[ORANGE])
+    scene.log(f'{path}/sensor', sensor, static=True)
     return f'{len(poses)} poses over {(poses.stamp_ns[-1] - poses.stamp_ns[0]) / 1e9:.1f} s'
 
 
 def shared_origin(contents: Sequence[Content]) -> Array:
     """Return the origin of the shared frame in the fixed frame, (3,) m."""
     for content in contents:
-        if isinstance(content, ExactMap):
+        if isinstance(content.shape, ScanMoments):
             return content.origin_m
     middle = place_of(contents)
     if np.abs(middle).max() < FAR_M:
@@ -199,21 +188,12 @@ def shared_origin(contents: Sequence[Content]) -> Array:
     return np.asarray(ROUND_M * np.round(middle / ROUND_M), np.float64)
 
 
-def positions_of(content: Content) -> Array:
-    """Return the positions of a content in the fixed frame, (N, 3) m."""
-    if isinstance(content, ExactMap):
-        return content.middles()
-    if isinstance(content, ShownMesh):
-        return content.mesh.vertices
-    return content.trajectory.xyz if isinstance(content, Way) else content.position
-
-
 def place_of(contents: Sequence[Content]) -> Array:
     """Return a place worth looking at in the fixed frame, (3,) m."""
-    ways = [content.trajectory.xyz for content in contents if isinstance(content, Way)]
+    ways = [c.shape.xyz for c in contents if isinstance(c.shape, Trajectory)]
     if ways and len(ways[0]):
         return np.asarray(ways[0][-1], np.float64)
-    filled = [positions for positions in map(positions_of, contents) if len(positions)]
+    filled = [positions for positions in map(Content.positions, contents) if len(positions)]
     return np.asarray(np.median(filled[0], axis=0) if filled else np.zeros(3), np.float64)
 
 
@@ -224,11 +204,3 @@ def box_of(positions: Sequence[Array]) -> tuple[Array, Array]:
         return np.full(3, -10.0), np.full(3, 10.0)
     low, high = np.percentile(every, [1.0, 99.0], axis=0)
     return low, high
-
-
-def shifted_cloud(cloud: Cloud, origin_m: Array) -> Cloud:
-    """Return a cloud about an origin."""
-    discs = cloud.discs
-    if discs is not None:
-        discs = replace(discs, position=discs.position - origin_m)
-    return Cloud(cloud.name, cloud.position - origin_m, discs)

@@ -21,7 +21,7 @@ from surfel_mapper.mapping.ages import ages_s, last_seen_ns
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.messages.model_messages import quaternions
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
-from surfel_mapper.viz.scene import AROUND_M, ORANGE, RED, Scene
+from surfel_mapper.viz.scene import AROUND_M, ORANGE, POINT_RADIUS_M, RED, Scene
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
@@ -31,8 +31,6 @@ NEW = 0.25
 
 MAX_POINTS = 20_000
 """Limit of the points logged of a scan; larger scans are subsampled."""
-
-POINT_RADIUS_M = 0.02
 
 
 class Viewer:
@@ -103,18 +101,21 @@ class Viewer:
 
     def _show(self, update: Update, *, whole: bool) -> None:
         """Show a scan, its changes of the map, and the whole map if it is due."""
-        scene = self._scene
+        scene, rerun = self._scene, self._scene.rerun
         place = update.T_map_sensor[:3, 3]
         if not self._is_placed:
             self._is_placed = True
             scene.set_origin(self._mapper.map.origin_m)
             scene.look(place - AROUND_M, place + AROUND_M, place)
         scene.set_stamp(update.stamp_ns)
-        scene.pose('map/sensor', update.T_map_sensor)
-        scene.points('map/sensor/scan', picked(update.scan.points), POINT_RADIUS_M)
-        scene.lines('map/trajectory', [self._way()], [RED])
+        pose = rerun.Transform3D(translation=place, mat3x3=update.T_map_sensor[:3, :3])
+        scene.log('map/sensor', pose)
+        scan = rerun.Points3D(picked(update.scan.points), radii=POINT_RADIUS_M)
+        scene.log('map/sensor/scan', scan)
+        scene.log('map/trajectory', rerun.LineStrips3D([self._way()], colors=[RED]))
         window = np.array([scan.T_map_sensor[:3, 3] for scan in self._mapper.window])
-        scene.points('map/window', window.reshape(-1, 3), 0.15, ORANGE)
+        poses = rerun.Points3D(window.reshape(-1, 3), radii=0.15, colors=[ORANGE])
+        scene.log('map/window', poses)
         if whole:
             self._show_map()
         scene.discs('map/changed', self._discs(update.changed))
@@ -143,11 +144,18 @@ class Viewer:
             self._scene.mesh(name, drawing.mesh)
         elif isinstance(drawing, RingsDrawing):
             lines = [np.concatenate([ring, ring[:1]]) for ring in drawing.rings]
-            self._scene.lines(name, lines, drawing.colors, drawing.labels)
+            texts = {'labels': list(drawing.labels), 'show_labels': False}
+            rings = self._scene.rerun.LineStrips3D(lines, colors=drawing.colors, **texts)
+            self._scene.log(name, rings)
         else:
-            turns = quaternions(drawing.R_map_axes)
-            sizes = drawing.half_sizes_m
-            self._scene.ellipsoids(name, drawing.centers, sizes, turns, drawing.color)
+            ellipsoids = self._scene.rerun.Ellipsoids3D(
+                centers=drawing.centers,
+                half_sizes=drawing.half_sizes_m,
+                quaternions=quaternions(drawing.R_map_axes),
+                colors=[drawing.color] * len(drawing.centers),
+                fill_mode='solid',
+            )
+            self._scene.log(name, ellipsoids)
 
     def _surfels(self) -> Surfels:
         """Return the adaptive surfels; those of voxels if ages are shown, which voxels have."""

@@ -60,7 +60,7 @@ def test_evaluate_merge_extract_and_view_read_the_map_written_last(tmp_path, new
     assert main(['merge', str(out), '--output', str(tmp_path / 'sum'), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['digest'] == expected.digest()
     (shown,) = contents(out)
-    assert len(shown.moments) == expected.num_voxels
+    assert len(shown.shape) == expected.num_voxels
     points, *_ = read(Namespace(cloud=out, viewpoint=None, voxel_size=None, settings=[]))
     assert points[:, 0].max() == pytest.approx(LENGTHS_M[newest], abs=0.3)
 
