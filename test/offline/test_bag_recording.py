@@ -190,10 +190,11 @@ def test_a_static_transform_that_changes_holds_from_its_message_on(tmp_path):
     assert heights == [HEIGHT_M + MOUNT_M[2]] * 3 + [HEIGHT_M + 5.25] * 3
 
 
-def test_a_bad_static_transform_is_counted_once(tmp_path):
+@pytest.mark.parametrize('w', [0.5, float('nan')])
+def test_a_bad_static_transform_is_counted_once(tmp_path, w):
     entries = drive()
     entries.transform('/tf_static', START_NS, 'base_link', 'camera', (0, 0, 0))
-    entries[-1][3].transforms[0].transform.rotation.w = 0.5
+    entries[-1][3].transforms[0].transform.rotation.w = w
     mapper, _ = replayed(write_rosbag2(tmp_path / 'bag', entries))
     assert dict(mapper.counters.messages_ignored) == {'bad_pose': 1}
 
