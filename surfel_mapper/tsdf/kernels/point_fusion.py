@@ -322,28 +322,49 @@ def free_voxels(freed, corner, origin, settings, voxel_m, bits, rate, content):
              (NUM_FOUND,) int64, in and out
     """
     mean, total, figures = content
-    tau_m, least, mask = settings[TAU], settings[MIN_WEIGHT], (1 << bits) - 1
-    keeps = np.float32(1.0) - rate
+    tau_m, least = settings[TAU], settings[MIN_WEIGHT]
     for start in range(0, 64 * len(freed), 64):
         word = freed[start >> 6]
-        for voxel in range(start, start + 64 if word else start):
-            if word >> (voxel & 63) & 1 == 0:
-                continue
-            figures[OBSERVED] += 1
-            weight = total[voxel]
-            if weight == 0.0:
-                replace(voxel, tau_m, least, least, mean, total, figures)
-            elif mean[voxel] < tau_m:
-                x = corner[0] + (voxel & mask) + 0.5 - origin[0]
-                y = corner[1] + (voxel >> bits & mask) + 0.5 - origin[1]
-                z = corner[2] + (voxel >> 2 * bits) + 0.5 - origin[2]
-                new = np.float32(1.0 / ((x * x + y * y + z * z) * voxel_m * voxel_m))
-                faded, moved = max(weight * keeps**FADING, least), mean[voxel]
-                if moved < 0.0:
-                    moved += (tau_m - moved) * max(new / (weight + new), rate)
-                elif faded == least and rate > 0.0:
-                    moved = tau_m
-                replace(voxel, moved, faded, least, mean, total, figures)
+        if word == 0:
+            continue
+        signed, weights = mean[start : start + 64], total[start : start + 64]
+        num_new = num_near = num_freed = 0
+        for n in range(len(signed)):  # loops without branches are vectorised
+            is_freed = word >> n & 1
+            num_freed += is_freed
+            num_new += is_freed & (weights[n] == 0.0)
+            num_near += is_freed & (weights[n] > 0.0) & (signed[n] < tau_m)
+        figures[OBSERVED] += num_freed
+        if num_new > 0:
+            for n in range(len(signed)):
+                signed[n] = tau_m if (word >> n & 1) & (weights[n] == 0.0) else signed[n]
+            for n in range(len(signed)):
+                weights[n] = least if (word >> n & 1) & (weights[n] == 0.0) else weights[n]
+            figures[MOVED], figures[SOLID] = JUMP, 1
+        if num_near > 0:
+            fade(word, start, corner, origin, settings, voxel_m, bits, rate, content)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def fade(word, start, corner, origin, settings, voxel_m, bits, rate, content):
+    """Fuse that rays have crossed voxels near surfaces, of one word; see free_voxels."""
+    mean, total, figures = content
+    tau_m, least, mask = settings[TAU], settings[MIN_WEIGHT], (1 << bits) - 1
+    keeps = np.float32(1.0) - rate
+    for voxel in range(start, min(start + 64, len(mean))):
+        if word >> (voxel & 63) & 1 == 0 or mean[voxel] >= tau_m:
+            continue
+        x = corner[0] + (voxel & mask) + 0.5 - origin[0]
+        y = corner[1] + (voxel >> bits & mask) + 0.5 - origin[1]
+        z = corner[2] + (voxel >> 2 * bits) + 0.5 - origin[2]
+        new = np.float32(1.0 / ((x * x + y * y + z * z) * voxel_m * voxel_m))
+        weight, moved = total[voxel], mean[voxel]
+        faded = max(weight * keeps**FADING, least)
+        if moved < 0.0:
+            moved += (tau_m - moved) * max(new / (weight + new), rate)
+        elif faded == least and rate > 0.0:
+            moved = tau_m
+        replace(voxel, moved, faded, least, mean, total, figures)
 
 
 @njit(cache=True, nogil=True, inline='always')
