@@ -176,11 +176,6 @@ class BlockArrays:
         flat = self._slabs[name].array.view(np.float32)
         return flat.reshape(-1, width, self.voxels_per_block)
 
-    def _copied(self, rows: Int64) -> dict[str, npt.NDArray[Any]]:
-        """Return copies of the channels of rows, without their heads, by name."""
-        names = ('field', 'color', 'votes')
-        return {name: copied_rows(getattr(self, name), rows) for name in names}
-
     def _write(self, rows: Int64, blocks: Blocks) -> None:
         """Write the channels of blocks into rows; heads stay."""
         for name in self._slabs.keys() - {'head'}:
@@ -481,9 +476,9 @@ class BlockMap(BlockArrays):
 
     def copied(self, rows: Int64) -> Blocks:
         """Return a copy of the content of blocks."""
-        return Blocks(
-            index=self.index(rows), stamp_ns=self.head[rows, STAMP], **self._copied(rows)
-        )
+        names = ('field', 'color', 'votes')
+        channels = {name: copied_rows(getattr(self, name), rows) for name in names}
+        return Blocks(index=self.index(rows), stamp_ns=self.head[rows, STAMP], **channels)
 
     def insert(self, blocks: Blocks) -> None:
         """Write blocks into the map, replacing those of the same index; increments the version."""

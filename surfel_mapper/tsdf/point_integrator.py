@@ -244,12 +244,6 @@ class PointIntegrator:
             )
         return np.asarray(corner, np.int64)
 
-    def _position(self, frame: tuple[Float64, Int64]) -> Float64:
-        """Return the place of the sensor in the map frame, m."""
-        config, (origin, corner) = self.blocks.config, frame
-        position: Float64 = (origin + corner * config.voxels_per_side) * config.voxel_size_m
-        return position
-
     def _cells(self, points: Float64, solid: npt.NDArray[np.bool_], pose: Float64) -> ScanCells:
         """Return the points by voxel; free rays end at the range up to which they free."""
         near, far = self.blocks.config.min_range_m, self.blocks.config.max_range_m
@@ -330,8 +324,9 @@ class PointIntegrator:
         channels: tuple[npt.NDArray[Any], ...],
     ) -> Integrated:
         """Fuse a scan into its blocks."""
-        blocks = self.blocks
-        scan = scan.only(blocks.admit(scan.index, self._position(frame)))
+        blocks, config, (origin, corner) = self.blocks, self.blocks.config, frame
+        position = (origin + corner * config.voxels_per_side) * config.voxel_size_m
+        scan = scan.only(blocks.admit(scan.index, position))
         num_before = blocks.num_blocks
         rows = blocks.place(scan.index)
         try:

@@ -64,20 +64,10 @@ def sample(blocks: BlockMap, points: npt.ArrayLike) -> Sampled:
 
     """
     scaled, bits = in_voxels(blocks, points)
+    distance, gradient = np.empty(len(scaled), np.float32), np.empty(scaled.shape, np.float32)
+    scale = 1.0 / blocks.config.voxel_size_m
     head, table, state = blocks.lookup
-    distance = np.empty(len(scaled), np.float32)
-    gradient = np.empty((len(scaled), 3), np.float32)
-    kernels.sample(
-        scaled,
-        1.0 / blocks.config.voxel_size_m,
-        bits,
-        blocks.field,
-        head,
-        table,
-        state,
-        distance,
-        gradient,
-    )
+    kernels.sample(scaled, scale, bits, blocks.field, head, table, state, distance, gradient)
     return Sampled(distance=distance, gradient=gradient)
 
 
@@ -101,18 +91,9 @@ def states(blocks: BlockMap, points: npt.ArrayLike) -> npt.NDArray[np.uint8]:
 
     """
     scaled, bits = in_voxels(blocks, points)
-    head, table, state = blocks.lookup
-    states = np.empty(len(scaled), np.uint8)
-    kernels.classify(
-        scaled,
-        bits,
-        np.float32(0.5 * blocks.config.voxel_size_m),
-        blocks.field,
-        head,
-        table,
-        state,
-        states,
-    )
+    states, occupied_m = np.empty(len(scaled), np.uint8), 0.5 * blocks.config.voxel_size_m
+    most, (head, table, state) = np.float32(occupied_m), blocks.lookup
+    kernels.classify(scaled, bits, most, blocks.field, head, table, state, states)
     return states
 
 

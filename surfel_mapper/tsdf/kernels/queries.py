@@ -68,17 +68,8 @@ def sample(points, scale, bits, field, head, table, state, distance, gradient):
         u, v, w = x - i, y - j, z - k
         complete = True
         for n in range(8):
-            di, dj, dk = n & 1, n >> 1 & 1, n >> 2
-            row, voxel = find_voxel(
-                np.int64(i) + di,
-                np.int64(j) + dj,
-                np.int64(k) + dk,
-                bits,
-                recent,
-                head,
-                table,
-                depth,
-            )
+            a, b, c = np.int64(i) + (n & 1), np.int64(j) + (n >> 1 & 1), np.int64(k) + (n >> 2)
+            row, voxel = find_voxel(a, b, c, bits, recent, head, table, depth)
             if row < 0 or not field[row, 1, voxel] > 0.0:
                 complete = False
                 break
@@ -113,9 +104,8 @@ def classify(points, bits, occupied, field, head, table, state, states):
         states[p] = UNKNOWN
         if not (abs(x) < 1e12 and abs(y) < 1e12 and abs(z) < 1e12):
             continue
-        row, voxel = find_voxel(
-            np.int64(x), np.int64(y), np.int64(z), bits, recent, head, table, depth
-        )
+        i, j, k = np.int64(x), np.int64(y), np.int64(z)
+        row, voxel = find_voxel(i, j, k, bits, recent, head, table, depth)
         if row < 0 or not field[row, 1, voxel] > 0.0:
             continue
         states[p] = OCCUPIED if field[row, 0, voxel] <= occupied else FREE
