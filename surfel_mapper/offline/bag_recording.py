@@ -103,7 +103,10 @@ class BagRecording:
         static_transforms(reader, self.poses.static)  # refuses topics that disagree
         self.clocks: list[ClockOffset] = []
         if self.poses.kinds or (config.pose.source == 'registration' and path is None):
-            self.clocks = clock_offsets(sample(), self.topics, self.poses.kinds or None)
+            self.clocks = [
+                replace(clock, added_s=self.poses.offsets_ns.get(clock.clouds, 0) / 1e9)
+                for clock in clock_offsets(sample(), self.topics, self.poses.kinds or None)
+            ]
         self.config = config
         self.span = span_of(
             str(request.path),

@@ -165,6 +165,7 @@ def replay(
 
     """
     from surfel_mapper.memory import keep_freed_memory
+    from surfel_mapper.offline.motion_clock import MotionClock
     from surfel_mapper.offline.outputs import output_directory, write_files, write_maps
     from surfel_mapper.offline.recording import open_recording
     from surfel_mapper.offline.request import Request
@@ -184,9 +185,13 @@ def replay(
         _log.info('%s: poses from %s', request.path, recording.describe()['poses_from'])
         mapper = started_mapper(with_loops(recording.config, options, directory))
         mapper.outcomes, mapper.pose_source = [], recording.describe()['poses_from']
-        history = History()
+        history, motion_clock = History(), MotionClock(mapper, recording)
         with listeners(directory, options, mapper) as listening:
-            listen: list[Callable[[Update], object]] = [partial(history.add, mapper), *listening]
+            listen: list[Callable[[Update], object]] = [
+                partial(history.add, mapper),
+                motion_clock.add,
+                *listening,
+            ]
             mapper.derives = bool(listening)  # the files hold the surfels of the end
             start_s = clock()
             trajectory, was_stopped = mapped(recording, mapper, listen, progress, stopped)
@@ -201,6 +206,7 @@ def replay(
             mapper.finish_layers()
         figures = {
             **recording.describe(),
+            'clock_offsets': motion_clock.offsets(),
             'recorded_s': recording.recorded_s,
             'replay_s': replay_s,
             'compile_s': PROGRESS.seconds,

@@ -210,7 +210,8 @@ class ScanFolder:
             mapper.refuse_clouds('bad_cloud', str(self.path), str(error))
             return
         if self.poses is not None:
-            self.poses.add_for(mapper, stamp_ns, self._rows[number])
+            offset_ns = round(1e9 * mapper.config.input.time_offset_s)
+            self.poses.add_for(mapper, stamp_ns + offset_ns, self._rows[number])
         mapper.add_scan(scan)
 
     def _read(self, number: int, stamp_ns: int, frame: str) -> Scan:

@@ -40,23 +40,32 @@ class ClockOffset:
         Topic of the clouds; topic of the poses, or of other clouds if there are no poses.
     seconds : float
         Positive if the clouds are ahead.
+    measured_by : str
+        Times or motions that show it.
+    added_s : float
+        Seconds that ``--time-offset`` has already added to the stamps.
 
     """
 
     clouds: str
     reference: str
     seconds: float
+    measured_by: str = 'record times'
+    added_s: float = 0.0
 
     def __str__(self) -> str:
-        remedy = f'--time-offset {self.clouds}={-self.seconds:.3f} (or input.time_offset_s)'
-        return self.described('record', remedy)
+        topic = f'{self.clouds}=' if self.clouds.startswith('/') else ''
+        return self.described(
+            f'--time-offset {topic}{self.added_s - self.seconds:.3f} (or input.time_offset_s)'
+        )
 
-    def described(self, times: str, remedy: str) -> str:
-        """Return the offset in words, by times of messages, with the settings that correct it."""
+    def described(self, remedy: str) -> str:
+        """Return the offset in words, with the settings that correct it."""
         side = 'ahead of' if self.seconds > 0.0 else 'behind'
         return (
-            f'by the {times} times, stamps of {self.clouds} are {abs(self.seconds):.3f} s {side} '
-            f'those of {self.reference}: the clocks differ{self._hint()}; {remedy} corrects them'
+            f'by the {self.measured_by}, stamps of {self.clouds} are {abs(self.seconds):.3f} s '
+            f'{side} those of {self.reference}: the clocks differ{self._hint()}; {remedy} '
+            'corrects them'
         )
 
     def _hint(self) -> str:

@@ -90,7 +90,8 @@ class ClockWatch:
                 enough = min(len(leads), len(others)) >= LEAST
                 seconds = offset_s(leads, others) if enough and topic != reference else None
                 if seconds is not None:
-                    texts.append(self._text(ClockOffset(topic, reference, seconds)))
+                    offset = ClockOffset(topic, reference, seconds, 'arrival times')
+                    texts.append(self._text(offset))
                     self._warn_once(topic, seconds, texts[-1])
         self.problem = '; '.join(texts)
 
@@ -101,7 +102,7 @@ class ClockWatch:
             remedy = f'input.time_offsets_s, {wanted_s:.3f} for {topic},'
         else:
             remedy = f'input.time_offset_s: {self._config.offset_s(topic) - offset.seconds:.3f}'
-        return offset.described('arrival', remedy)
+        return offset.described(remedy)
 
     def _warn_once(self, topic: str, seconds: float, text: str) -> None:
         """Warn of an offset, unless it was the same at the last warning."""
