@@ -18,7 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.mapping.ages import ages_s, last_seen_ns
 from surfel_mapper.mapping.surfels import QUALITY, Surfels
+from surfel_mapper.mapping.window import WindowedScan
 
 Array = npt.NDArray[np.float64]
 
@@ -93,21 +95,18 @@ class DrawnDiscs:
     grid_m: Array = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
-    def of(
-        cls, surfels: Surfels, values: Mapping[str, npt.NDArray[Any]] | None = None
-    ) -> DrawnDiscs:
-        """Return the discs of surfels that have a normal, with further values (K,) of each."""
+    def of(cls, surfels: Surfels, scans: Sequence[WindowedScan] = ()) -> DrawnDiscs:
+        """Return the discs of surfels that have a normal, with their ages in a window of scans."""
         is_known = np.isfinite(surfels.planarity)
-        all_values = {
-            **{name: getattr(surfels, name) for name in COLUMNS},
-            **surfels.channels,
-            **(values or {}),
-        }
+        values = {name: getattr(surfels, name) for name in COLUMNS} | dict(surfels.channels)
+        if scans:
+            newest_ns = max(scan.stamp_ns for scan in scans)
+            values['age'] = ages_s(last_seen_ns(surfels.voxel_index, scans), newest_ns)
         return cls(
             surfels.position[is_known],
             surfels.normal[is_known],
             SPREAD * surfels.radius[is_known],
-            {name: value[is_known] for name, value in all_values.items()},
+            {name: value[is_known] for name, value in values.items()},
         )
 
     def __len__(self) -> int:

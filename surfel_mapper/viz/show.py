@@ -17,10 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.files.trajectory import Trajectory
-from surfel_mapper.mapping.ages import ages_s, last_seen_ns
 from surfel_mapper.mapping.moments import ScanMoments
-from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.contents import Content
 from surfel_mapper.viz.detail import DetailedMap
@@ -138,7 +135,7 @@ def map_tiles(
     tiles = {}
     for tile, surfels in enumerate(whole.all_surfels(level)):
         name = 'tile_{}_{}'.format(*whole.tiles[tile]).replace('-', 'm')
-        discs = with_age(surfels, content.scans, int(level[tile]))
+        discs = DrawnDiscs.of(surfels, [] if level[tile] else content.scans)
         values = {**discs.values, 'level': np.full(len(discs), level[tile])}
         position = discs.position + shift_m
         moved = replace(discs, position=position, values=values, grid_m=shift_m)
@@ -153,15 +150,6 @@ def map_text(whole: DetailedMap, level: npt.NDArray[np.int64], voxel_size_m: flo
         drawn = whole.counts[level, np.arange(len(whole))].sum()
         text += f', shown as {drawn:,} on levels {level.min()} to {level.max()}'
     return text
-
-
-def with_age(surfels: Surfels, scans: Sequence[WindowedScan], level: int) -> DrawnDiscs:
-    """Return surfels as discs, with their ages if the map has the scans of its window."""
-    if not scans or level:
-        return DrawnDiscs.of(surfels)
-    newest_ns = max(scan.stamp_ns for scan in scans)
-    seen_ns = last_seen_ns(surfels.voxel_index, scans)
-    return DrawnDiscs.of(surfels, {'age': ages_s(seen_ns, newest_ns)})
 
 
 def show_way(scene: Scene, path: str, poses: Trajectory, origin_m: Array) -> str:

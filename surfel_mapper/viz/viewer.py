@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing, RingsDrawing
-from surfel_mapper.mapping.ages import ages_s, last_seen_ns
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.messages.model_messages import quaternions
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
@@ -166,13 +165,8 @@ class Viewer:
 
     def _discs(self, surfels: Surfels) -> DrawnDiscs:
         """Return surfels as discs; with their ages if these are shown."""
-        values = {}
-        if self._colouring == 'age':
-            scans = list(self._mapper.window)
-            stamps = last_seen_ns(surfels.voxel_index, scans)
-            newest_ns = max((scan.stamp_ns for scan in scans), default=0)
-            values['age'] = ages_s(stamps, newest_ns)
-        return DrawnDiscs.of(surfels, values)
+        scans = list(self._mapper.window) if self._colouring == 'age' else []
+        return DrawnDiscs.of(surfels, scans)
 
 
 def picked(points: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -74,10 +74,10 @@ def test_surfels_without_a_normal_have_no_disc():
     surfel_map = SurfelMap(0.5)
     rng = np.random.default_rng(0)
     surfel_map.add(np.concatenate([[[9.1, 9.1, 9.1]], rng.uniform(0.0, 0.4, (20, 3))]))
-    found = DrawnDiscs.of(surfel_map.surfels(), {'age': np.array([1.0, 2.0])})
+    found = DrawnDiscs.of(surfel_map.surfels())
 
     assert len(found) == 1
-    assert set(found.values) == {*COLUMNS, 'age'}
+    assert set(found.values) == set(COLUMNS)
     assert found.values['num_points'].tolist() == [20]
 
 
