@@ -283,8 +283,8 @@ def static_transforms(
     by_child: dict[str, tuple[str, StampedPose]] = {}
     for (topic, child), pose in first.items():
         first_topic, agreed = by_child.setdefault(child, (topic, pose))
-        numbers = [[*other.xyz, *other.q_xyzw] for other in (agreed, pose)]
-        is_same = np.allclose(*numbers, atol=SAME_PLACE, rtol=0.0, equal_nan=True)
+        first_numbers, numbers = ([*other.xyz, *other.q_xyzw] for other in (agreed, pose))
+        is_same = np.allclose(first_numbers, numbers, atol=SAME_PLACE, rtol=0.0, equal_nan=True)
         if agreed.parent != pose.parent or not is_same:
             raise BagError(
                 f'{reader.path}: {first_topic} and {topic} disagree about the frame {child}: '
