@@ -201,22 +201,8 @@ def flatten(mapping: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str,
             yield f'{prefix}{name}', value
 
 
-SUCCESSORS = {
-    'layers.tsdf.sensor_rows': 'nothing: clouds need no model of their lidar',
-    'layers.tsdf.sensor_columns': 'nothing: clouds need no model of their lidar',
-    'layers.tsdf.carve': 'layers.tsdf.carve_m, 0 for false',
-    'layers.tsdf.distance': 'nothing: distances are those to planes',
-    'layers.tsdf.weight_mode': 'nothing: weights are 1/depth^2',
-    'layers.tsdf.max_age_s': 'layers.tsdf.max_radius_m or map.max_bytes',
-    'layers.tsdf.image_tolerance_s': 'nothing: stamps may differ by 0.02 s',
-}
-"""Settings of earlier versions, and what to use instead."""
-
-
 def near(name: str, names: Mapping[str, Any] | list[str]) -> str:
     """Return the successor of an old name, or '; did you mean ...?' for the most similar one."""
-    if name in SUCCESSORS:
-        return f' any more; use {SUCCESSORS[name]}'
     matches = difflib.get_close_matches(name, list(names), n=1)
     return f'; did you mean {matches[0]}?' if matches else ''
 
