@@ -343,19 +343,6 @@ def test_texts_like_numbers_with_an_exponent_stay_text(text):
     assert parse_yaml(text) == text.strip('"')
 
 
-@pytest.mark.parametrize(
-    ('name', 'successor'),
-    [
-        ('layers.tsdf.carve', 'use layers.tsdf.carve_m, 0 for false'),
-        ('layers.tsdf.max_age_s', 'use layers.tsdf.max_radius_m'),
-        ('layers.tsdf.sensor_rows', 'clouds need no model'),
-    ],
-)
-def test_a_setting_of_an_earlier_version_is_refused_with_its_successor(name, successor):
-    with pytest.raises(ConfigError, match=f'{name}: no such setting any more; .*{successor}'):
-        Config.from_mapping({name: 1})
-
-
 def test_the_distance_field_has_at_most_25_settings():
     names = [name for name in DECLARATIONS if name.startswith(('layers.tsdf.', 'esdf.'))]
     assert len(names) <= 25

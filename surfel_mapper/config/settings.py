@@ -202,7 +202,7 @@ def flatten(mapping: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str,
 
 
 def near(name: str, names: Mapping[str, Any] | list[str]) -> str:
-    """Return the successor of an old name, or '; did you mean ...?' for the most similar one."""
+    """Return "; did you mean ...?" for the most similar name; empty if none is similar."""
     matches = difflib.get_close_matches(name, list(names), n=1)
     return f'; did you mean {matches[0]}?' if matches else ''
 

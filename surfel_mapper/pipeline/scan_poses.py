@@ -162,7 +162,7 @@ class ScanPoses:
         if static:
             self.transforms.add_static(parent, child, transform)
         else:
-            self.transforms.add(parent, child, stamp_ns, transform, is_checked=True)
+            self.transforms.add(parent, child, stamp_ns, transform)
 
     def mount(self, frame_id: str) -> None:
         """Add the configured extrinsics of a sensor when its frame is first seen."""

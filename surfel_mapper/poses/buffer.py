@@ -32,7 +32,7 @@ from operator import attrgetter
 import numpy as np
 
 from surfel_mapper.errors import PoseError, PoseNotYetError, PosesLateError
-from surfel_mapper.geometry import check_rigid, compose, interpolate, inverse, Transform
+from surfel_mapper.geometry import compose, interpolate, inverse, Transform
 
 NS_PER_S = 1_000_000_000
 
@@ -196,11 +196,6 @@ class TransformBuffer:
     move : FrameMove, optional
         The last frame that moved; readers set it to None.
 
-    Raises
-    ------
-    ValueError
-        If a duration is negative or not finite.
-
     """
 
     def __init__(
@@ -209,9 +204,6 @@ class TransformBuffer:
         reset_after_s: float = 1.0,
         max_gap_s: float = math.inf,
     ) -> None:
-        for name, value in (('history_s', history_s), ('reset_after_s', reset_after_s)):
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f'{name}: {value}, expected zero or more seconds, finite')
         self._history_ns = round(history_s * NS_PER_S)
         self._reset_after_ns = round(reset_after_s * NS_PER_S)
         self.max_gap_s = max_gap_s
@@ -271,8 +263,6 @@ class TransformBuffer:
         child: str,
         stamp_ns: int,
         T_parent_child: Transform,
-        *,
-        is_checked: bool = False,
     ) -> None:
         """
         Add the transform of an edge at one stamp.
@@ -284,30 +274,27 @@ class TransformBuffer:
         stamp_ns : int
             Time of the transform.
         T_parent_child : (4, 4) float64
-            Takes points in the child frame to the parent frame; copied.
-        is_checked : bool
-            The transform was made by ``pose_matrix`` and is not changed later: it is neither
-            checked nor copied.
+            Takes points in the child frame to the parent frame; made by ``pose_matrix``, and not
+            changed later.
 
         Raises
         ------
         PoseError
-            If a name is empty, the transform is not rigid or not finite, the child has a static
-            transform in this parent, the edge would close a loop, or there would be more than
-            MAX_EDGES edges, or more than MAX_DEPTH above the child. The buffer is unchanged then.
+            If a name is empty, the child has a static transform in this parent, the edge would
+            close a loop, or there would be more than MAX_EDGES edges, or more than MAX_DEPTH above
+            the child. The buffer is unchanged then.
 
         """
         edge = self._edges.get(child)
         if edge is None or edge.is_static or edge.parent != parent:
             edge = self._edge(parent, child, is_static=False)
-        transform = T_parent_child if is_checked else rigid(parent, child, T_parent_child)
         num_before, is_back = len(edge.stamps), False
         if edge.stamps and stamp_ns < edge.stamps[-1] - self._reset_after_ns:
             edge.forget_oldest(num_before)
             is_back = edge is self._newest
         if not edge.stamps or (edge.parent != parent and stamp_ns >= edge.stamps[-1]):
-            self._note_move(edge, parent, transform)
-        edge.insert(stamp_ns, parent, transform)
+            self._note_move(edge, parent, T_parent_child)
+        edge.insert(stamp_ns, parent, T_parent_child)
         edge.forget_before(edge.stamps[-1] - self._history_ns)
         self.num_transforms += len(edge.stamps) - num_before
         self._enter(edge, parent)
@@ -321,9 +308,8 @@ class TransformBuffer:
     def add_static(self, parent: str, child: str, T_parent_child: Transform) -> None:
         """Set the transform of an edge for all time, in the place of an earlier one; see add."""
         edge = self._edge(parent, child, is_static=True)
-        transform = rigid(parent, child, T_parent_child)
-        self._note_move(edge, parent, transform)
-        edge.set_static(parent, transform)
+        self._note_move(edge, parent, T_parent_child)
+        edge.set_static(parent, T_parent_child)
         self._enter(edge, parent)
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
@@ -521,16 +507,6 @@ def _chained(edges: list[PoseTrack], stamp_ns: int) -> Transform | None:
         T_parent_child = edge.at(stamp_ns)
         product = T_parent_child if product is None else compose(T_parent_child, product)
     return product
-
-
-def rigid(parent: str, child: str, T_parent_child: Transform) -> Transform:
-    """Return a copy of a transform, or raise PoseError if it is not rigid."""
-    transform = np.array(T_parent_child, dtype=np.float64)
-    try:
-        check_rigid(f'transform {parent!r} -> {child!r}', transform)
-    except ValueError as error:
-        raise PoseError(str(error)) from None
-    return transform
 
 
 def seconds(stamp_ns: int) -> str:
