@@ -336,7 +336,6 @@ class InputConfig(Stage):
 class PublishConfig(Stage):
     """Topics that the node publishes, and their rates."""
 
-    changed: bool = setting(True, 'Publish ~/changed after every scan.', live=True)
     normals_rate_hz: float = setting(
         1.0, 'Rate of the full map on ~/normals, Hz; 0: never.', low=0.0, high=1000.0, live=True
     )

@@ -74,8 +74,6 @@ class Outputs:
         self._thread = thread
         self._adaptive = AdaptiveTracker(mapper) if mapper.config.publish.adaptive else None
         self._changes = self._adaptive or ChangeTracker(mapper)
-        # of ~/removed while publish.changed is false
-        self._removals = self._adaptive or ChangeTracker(mapper)
         self._origin = OriginOutput(node, mapper)
         self._alignment = AlignmentOutputs(node, mapper)
         self._layers = LayerOutputs(node, mapper, thread)
@@ -213,29 +211,18 @@ class Outputs:
     def _publish_changes(
         self, find: Callable[[ChangeTracker | AdaptiveTracker], MapChange]
     ) -> None:
-        """
-        Publish the changes that ``find`` returns of a tracker, if they are subscribed to.
-
-        While ``publish.changed`` is false, its tracker stays behind: ~/changed gets all changes
-        since as soon as it is published again. ~/removed has a tracker of its own meanwhile.
-        """
-        wants_changed = self._mapper.config.publish.changed
-        is_removed_read = self._removed.get_subscription_count() > 0
-        is_read = is_removed_read or self._changed.get_subscription_count() > 0
-        if not is_read:
+        """Publish the changes that ``find`` returns of the tracker, if they are subscribed to."""
+        topics = self._changed, self._removed
+        if any(topic.get_subscription_count() for topic in topics):
+            self._publish_change(find(self._changes))
+        else:
             self._changes.reset()
-        if wants_changed or not is_removed_read:
-            self._removals.reset()
-        if is_removed_read or (is_read and wants_changed):
-            self._publish_change(find(self._changes if wants_changed else self._removals))
 
     def _publish_change(self, change: MapChange) -> None:
-        mapper = self._mapper
-        if mapper.config.publish.changed:
-            self._changed.publish(self._surfel_cloud(change.surfels, change.removed))
+        self._changed.publish(self._surfel_cloud(change.surfels, change.removed))
         columns = voxel_columns(change.removed, change.removed_size_m)
         content = from_columns(columns)
-        self._removed.publish(cloud_message(content, self._stamp_ns, mapper.map_frame))
+        self._removed.publish(cloud_message(content, self._stamp_ns, self._mapper.map_frame))
 
     def _surfel_cloud(
         self, surfels: Surfels, removed: npt.NDArray[np.int32] = NO_VOXELS
