@@ -9,7 +9,6 @@ to each of two frames and solves for the transform between them, with scipy's sl
 (Longer than other files: most tests need the twin.)
 """
 
-
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np

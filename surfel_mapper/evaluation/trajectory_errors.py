@@ -123,64 +123,25 @@ def widths_m(T_map_pose: Floats) -> tuple[float, float]:
     return float(along) / len(position) ** 0.5, float(across) / len(position) ** 0.5
 
 
-def absolute_errors(
-    T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike, *, align: bool = True
-) -> PoseErrors:
-    """
-    Return the error of every pose.
-
-    Parameters
-    ----------
-    T_map_estimated, T_map_true : (S, 4, 4) float64
-        Poses of one frame at the same times.
-    align : bool
-        Apply the best rigid motion of the estimated positions first.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, or there is no pose.
-
-    """
-    estimated, true = _pairs(T_map_estimated, T_map_true, 1)
-    if align:
-        estimated = best_motion(estimated[:, :3, 3], true[:, :3, 3]) @ estimated
-    return _errors(np.linalg.inv(true) @ estimated)
+def absolute_errors(estimated: Floats, true: Floats) -> PoseErrors:
+    """Return the error of every pose (S, 4, 4) after the best rigid motion of all."""
+    aligned = best_motion(estimated[:, :3, 3], true[:, :3, 3]) @ estimated
+    return _errors(np.linalg.inv(true) @ aligned)
 
 
-def relative_errors(
-    T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike, *, step: int = 1
-) -> PoseErrors:
-    """
-    Return the error of the motion between every pose and the pose ``step`` later.
-
-    Parameters
-    ----------
-    T_map_estimated, T_map_true : (S, 4, 4) float64
-        Poses of one frame at the same times.
-    step : int
-        Number of poses between which a motion is taken.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, or there are at most ``step`` poses.
-
-    """
-    if step < 1:
-        raise ValueError(f'step: {step}, expected 1 or more')
-    estimated, true = _pairs(T_map_estimated, T_map_true, step + 1)
+def relative_errors(estimated: Floats, true: Floats, *, step: int = 1) -> PoseErrors:
+    """Return the error of the motion between every pose (S, 4, 4) and the pose ``step`` later."""
     rows = np.arange(len(true) - step)
     return _motion_errors(estimated, true, rows, rows + step)
 
 
-def drift(T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike) -> tuple[float, float]:
+def drift(estimated: Floats, true: Floats) -> tuple[float, float]:
     """
     Return the drift over segments from an eighth to half of the path.
 
     Parameters
     ----------
-    T_map_estimated, T_map_true : (S, 4, 4) float64
+    estimated, true : (S, 4, 4) float64
         Poses of one frame at the same times.
 
     Returns
@@ -188,13 +149,7 @@ def drift(T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike) -> tuple[fl
     translation_m, rotation_deg : float
         Root mean square over all segments, per 100 m; nan if the path has no length.
 
-    Raises
-    ------
-    ValueError
-        If the shapes differ, or there are fewer than two poses.
-
     """
-    estimated, true = _pairs(T_map_estimated, T_map_true, 2)
     steps_m = np.sqrt((np.diff(true[:, :3, 3], axis=0) ** 2).sum(axis=1))
     path_m = np.concatenate([[0.0], np.cumsum(steps_m)])
     if not path_m[-1] > 0.0:
@@ -248,18 +203,6 @@ def common_stamps(
     is_first = np.diff(nearest[order], prepend=-1) > 0
     rows = np.sort(order[is_first & (apart_ns[order] <= max_difference_ns)])
     return rows.astype(np.int64), nearest[rows].astype(np.int64)
-
-
-def _pairs(estimated: npt.ArrayLike, true: npt.ArrayLike, least: int) -> tuple[Floats, Floats]:
-    """Return two lists of poses as arrays; ValueError if they are not usable."""
-    first, second = np.asarray(estimated, np.float64), np.asarray(true, np.float64)
-    if first.shape != second.shape or first.ndim != 3 or first.shape[1:] != (4, 4):
-        raise ValueError(
-            f'poses of shapes {first.shape} and {second.shape}, expected (S, 4, 4) of both'
-        )
-    if len(first) < least:
-        raise ValueError(f'{len(first)} poses, expected at least {least}')
-    return first, second
 
 
 def _motion_errors(
