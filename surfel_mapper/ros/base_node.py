@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
-from functools import partial, wraps
+from functools import wraps
 import inspect
 import threading
 import types
@@ -34,7 +34,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
-from rosgraph_msgs.msg import Clock as ClockMessage
 
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.pipeline.drops import described
@@ -101,9 +100,7 @@ class BaseNode(Node):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[[Any], None], *args: Any, **kwargs: Any
     ) -> Subscription:
-        """Create a subscription; the one to /clock ignores negative times."""
-        if msg_type is ClockMessage:
-            callback = partial(self._on_clock, callback)
+        """Create a subscription."""
         survived = self._survived(f'a message on {topic}', callback)
         return super().create_subscription(msg_type, topic, survived, *args, **kwargs)
 
@@ -117,11 +114,9 @@ class BaseNode(Node):
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **kwargs: Any
     ) -> Service:
-        """Create a service; those that set parameters refuse values of unknown types."""
+        """Create a service."""
         if srv_type is SetParameters:
             callback = self._on_set_parameters
-        if srv_type in (SetParameters, SetParametersAtomically):
-            callback = partial(_with_known_types, callback)
         if srv_type is not ChangeState:  # its errors end the node, see MapperNode
             callback = self._answered(srv_name, callback)
         return super().create_service(srv_type, srv_name, callback, **kwargs)
@@ -152,46 +147,29 @@ class BaseNode(Node):
         @wraps(callback)
         async def answered(request: Any, response: Any) -> Any:
             try:
-                check_length(request)
+                check_request(request)
                 answer = callback(request, response)
                 return await answer if inspect.isawaitable(answer) else answer
+            except ConfigError as error:
+                return _refused(request, response, str(error))
             except Exception as error:  # MemoryError too
                 self.report_failure(f'a request to {name}', error)
                 return _refused(request, response, described(error))
 
         return answered
 
-    def _on_clock(self, set_time: Callable[[ClockMessage], None], msg: ClockMessage) -> None:
-        if msg.clock.sec >= 0:
-            set_time(msg)
-            return
-        self.get_logger().warning(
-            f'message on /clock ignored: {msg.clock.sec} s, expected a time that is not negative',
-            throttle_duration_sec=10.0,
-        )
 
-
-def check_length(request: Any) -> None:
-    """Raise ConfigError if a request has more than MAX_PARAMETERS parameters or prefixes."""
+def check_request(request: Any) -> None:
+    """Raise ConfigError for too many parameters or prefixes, and for values of unknown types."""
     for items in ('parameters', 'prefixes'):
         number = len(getattr(request, items, ()))
         if number > MAX_PARAMETERS:
             raise ConfigError(f'{number} {items}, expected at most {MAX_PARAMETERS}')
-
-
-def _with_known_types(set_parameters: Callable[..., Any], request: Any, response: Any) -> Any:
-    """Set parameters, or refuse the whole request if one value is of an unknown type."""
-    unknown = [p for p in request.parameters if p.value.type not in PARAMETER_TYPES]
-    if not unknown:
-        return set_parameters(request, response)
-    kind = unknown[0].value.type
-    reason = f'{unknown[0].name}: a value of type {kind}, expected 1 to {max(PARAMETER_TYPES)}'
-    refused = SetParametersResult(successful=False, reason=reason)
-    if isinstance(response, SetParametersAtomically.Response):
-        response.result = refused
-    else:
-        response.results = [refused] * len(request.parameters)
-    return response
+    for parameter in getattr(request, 'parameters', ()):
+        kind = parameter.value.type
+        if kind not in PARAMETER_TYPES:
+            expected = f'expected 1 to {max(PARAMETER_TYPES)}'
+            raise ConfigError(f'{parameter.name}: a value of type {kind}, {expected}')
 
 
 def _refused(request: Any, response: Any, reason: str) -> Any:
