@@ -139,20 +139,13 @@ class Counters:
             self.milliseconds.setdefault(stage, deque(maxlen=LATEST)).append(time_ms)
             self.stage_s[stage] = self.stage_s.get(stage, 0.0) + 1e-3 * time_ms
 
-    def add_filter(
-        self,
-        name: str,
-        points_in: int,
-        points_out: int,
-        milliseconds: float,
-        not_finite: int = 0,
-    ) -> None:
-        """Add the counts and time of a filter for a scan."""
-        counts = self.filters.setdefault(name, FilterCounts())
-        counts.points_in += points_in
-        counts.points_out += points_out
-        counts.not_finite += not_finite
-        counts.milliseconds.append(milliseconds)
+    def add_filter(self, step: Any) -> None:
+        """Add the counts and time of a step of a chain of filters (filters.chain.Step)."""
+        counts = self.filters.setdefault(step.name, FilterCounts())
+        counts.points_in += step.points_in
+        counts.points_out += step.points_out
+        counts.not_finite += step.not_finite
+        counts.milliseconds.append(step.milliseconds)
 
     def summary(self) -> dict[str, Any]:
         """Return all counters as plain numbers, with median and 99th percentile of the times."""

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Mapping
 import hashlib
 import json
 from pathlib import Path
-import re
 from typing import Any, BinaryIO
 import zipfile
 
@@ -52,7 +51,8 @@ def save_state(
     path : str or Path
         The file; see replace_file. Equal content gives equal bytes.
     arrays : mapping of str to array
-        Names of letters, digits, ``_``, ``-`` and ``.``; arrays of booleans, integers or floats.
+        Names of letters, digits, ``_``, ``-`` and ``.``; arrays of booleans, integers or floats,
+        which is not checked.
     attributes : mapping of str
         JSON values; tuples come back as lists.
     compress : bool
@@ -61,18 +61,12 @@ def save_state(
     Raises
     ------
     ValueError, TypeError
-        If a name, an array or an attribute cannot be stored.
+        If an attribute cannot be stored.
     FileFormatError
         If the file cannot be written.
 
     """
     contiguous = {name: np.asarray(array, order='C') for name, array in arrays.items()}
-    for name, array in contiguous.items():
-        if not is_array_name(name) or not is_array_type(array.dtype.str):
-            raise ValueError(
-                f'array {name!r} of dtype {array.dtype}, expected a name of letters, digits, _ - '
-                'and ., and booleans, integers or floats'
-            )
     manifest: dict[str, Any] = {
         'format': FORMAT,
         'version': VERSION,
@@ -167,13 +161,3 @@ def read_array(archive: zipfile.ZipFile, entry: Mapping[str, Any]) -> npt.NDArra
     if array.dtype.str != entry['dtype'] or list(array.shape) != entry['shape']:
         raise ValueError(f'{array.dtype.str} {array.shape}, expected {entry}')
     return array
-
-
-def is_array_name(name: str) -> bool:
-    """Return whether a name is valid for an array, and so for a member of the archive."""
-    return re.fullmatch(r'[A-Za-z0-9_.-]+', name) is not None
-
-
-def is_array_type(dtype: str) -> bool:
-    """Return whether arrays of this type are stored: booleans, integers and floats."""
-    return re.fullmatch(r'[<>|][biuf][1-9][0-9]*', dtype) is not None

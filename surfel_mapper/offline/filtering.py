@@ -294,9 +294,7 @@ class _Work:
         """Return the scan filtered, and count it."""
         filtered, steps = self.chain.run(replace(scan, T_base_sensor=self.pose))
         for step in steps:
-            self.counters.add_filter(
-                step.name, step.points_in, step.points_out, step.milliseconds, step.not_finite
-            )
+            self.counters.add_filter(step)
         self.done.scans += 1
         self.done.points_in += len(scan)
         self.done.points_out += len(filtered)

@@ -223,8 +223,8 @@ class Preparation:
     def _count_steps(self, prepared: Prepared) -> None:
         """Count what the filters did; raise if they left no points."""
         counters, num_points = self._drops.counters, len(prepared.filtered)
-        for s in prepared.steps:
-            counters.add_filter(s.name, s.points_in, s.points_out, s.milliseconds, s.not_finite)
+        for step in prepared.steps:
+            counters.add_filter(step)
         counters.points_left_out['filtered'] += len(prepared.scan) - num_points
         if not num_points:
             raise ScanRefusedError('filtered_out', 'the filters left none of its points')

@@ -76,22 +76,6 @@ def test_numpy_reads_the_arrays_alone(tmp_path):
             np.testing.assert_array_equal(archive[name], array)
 
 
-@pytest.mark.parametrize(
-    'arrays',
-    [
-        {'': np.zeros(1)},
-        {'../a': np.zeros(1)},
-        {'a': np.array([None])},
-        {'a': np.zeros(1, [('x', 'f4')])},
-        {'a': np.array('2020-01-01', 'M8[D]')},
-    ],
-)
-def test_arrays_that_cannot_be_stored_are_refused_and_leave_no_file(tmp_path, arrays):
-    with pytest.raises(ValueError, match='expected a name of letters'):
-        save_state(tmp_path / 'map.npz', arrays, {})
-    assert os.listdir(tmp_path) == []
-
-
 @pytest.mark.parametrize('value', [np.int64(1), {1, 2}, float('nan')])
 def test_attributes_that_are_not_json_are_refused(tmp_path, value):
     with pytest.raises((TypeError, ValueError)):

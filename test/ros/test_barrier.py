@@ -13,7 +13,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from surfel_mapper.errors import BagError, ConfigError
+from surfel_mapper.errors import BagError
 from surfel_mapper.ros.base_node import steady_timer
 from surfel_mapper.ros.line_logger import LineLogger
 
@@ -91,11 +91,7 @@ def test_a_request_of_more_than_500_parameters_is_refused(peer, failures):
     whole = peer.result(client.set_parameters_atomically(many)).result
     assert whole.reason == '501 parameters, expected at most 500'
     assert not peer.result(client.list_parameters(['use_sim_time'] * 501, 1)).result.names
-    assert failures == [
-        ('a request to peer/set_parameters', ConfigError),
-        ('a request to peer/set_parameters_atomically', ConfigError),
-        ('a request to peer/list_parameters', ConfigError),
-    ]
+    assert not failures
     assert peer.result(client.list_parameters(['use_sim_time'], 1)).result.names
 
 
