@@ -74,12 +74,19 @@ class CloudBytes:
 
     height: int
     width: int
-    fields: tuple[Field, ...]
+    fields: Sequence[Field]
     is_bigendian: bool
     point_step: int
     row_step: int
     data: npt.NDArray[np.uint8]
     is_dense: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RawCloud(CloudBytes):
+    """A sensor_msgs/PointCloud2; data is a read-only (row_step * height,) uint8 view."""
+
+    header: Header
 
 
 def to_scan(msg: Any, topic: str = 'points') -> Scan:
@@ -388,21 +395,6 @@ def field_of(name: str, layout: np.dtype[Any]) -> Field:
     dtype, offset = layout.fields[name][:2]
     count = dtype.shape[0] if dtype.shape else 1
     return Field(name, offset, DATATYPES[dtype.base.newbyteorder('=')], count)
-
-
-@dataclass(frozen=True, slots=True)
-class RawCloud:
-    """A sensor_msgs/PointCloud2; data is a read-only (row_step * height,) uint8 view."""
-
-    header: Header
-    height: int
-    width: int
-    fields: list[Field]
-    is_bigendian: bool
-    point_step: int
-    row_step: int
-    data: npt.NDArray[np.uint8]
-    is_dense: bool
 
 
 def parse_cloud(raw: bytes | memoryview, *, ros1: bool = False, topic: str = 'points') -> RawCloud:

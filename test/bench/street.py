@@ -9,7 +9,7 @@ parameters. Messages have the layout of drivers, 32 bytes a point, 4 MiB each.
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, fields
 import hashlib
 import json
 from pathlib import Path
@@ -92,17 +92,8 @@ class Street:
         stamp_ns = self.simulation.stamp_ns(number)
         scan = Scan(points=points, stamp_ns=stamp_ns, frame_id=SENSOR, columns=columns)
         cloud = cloud_bytes(scan, self._rows)
-        return RawCloud(
-            header=Header(Stamp(*divmod(stamp_ns, 10**9)), SENSOR),
-            height=cloud.height,
-            width=cloud.width,
-            fields=list(cloud.fields),
-            is_bigendian=cloud.is_bigendian,
-            point_step=cloud.point_step,
-            row_step=cloud.row_step,
-            data=cloud.data,
-            is_dense=cloud.is_dense,
-        )
+        header = Header(Stamp(*divmod(stamp_ns, 10**9)), SENSOR)
+        return RawCloud(header=header, **{f.name: getattr(cloud, f.name) for f in fields(cloud)})
 
     def _made(self, number: int) -> npt.NDArray[np.float32]:
         """Return the points of a scan that is not kept yet."""
