@@ -129,7 +129,7 @@ def undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     They are nine tenths of the time of a replay of a few scans, .5 s.
     """
     if request.node.get_closest_marker('drawn') is None:
-        from surfel_mapper.viz import picture, report
+        from surfel_mapper.offline import outputs
 
-        monkeypatch.setattr(picture, 'draw_map', lambda *_, **__: None)
-        monkeypatch.setattr(report, 'write_report', lambda *_, **__: None)
+        for name in ('draw_map', 'write_report'):
+            monkeypatch.setattr(outputs, name, lambda *_, **__: None)

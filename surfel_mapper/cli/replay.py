@@ -41,12 +41,7 @@ from surfel_mapper.cli._settings import add_settings, configured
 from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
 from surfel_mapper.errors import MapError
 from surfel_mapper.layers import formats as layer_formats
-from surfel_mapper.offline.outputs import (
-    known_formats,
-    MAP_FORMATS,
-    output_directory,
-)
-from surfel_mapper.offline.replay import replay, ReplayOptions
+from surfel_mapper.offline.options import known_formats, MAP_FORMATS, ReplayOptions
 from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import as_text, uncertain_text
 
@@ -254,6 +249,8 @@ def run(args: argparse.Namespace) -> int:
 
 def replay_one(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     """Map a recording in this process."""
+    from surfel_mapper.offline.replay import replay
+
     request, config = request_of(args, args.bags[0]), with_filters(args)
     chosen = replay_options(args)
     return replay(request, output=args.output, config=config, options=chosen, **options)
@@ -261,20 +258,15 @@ def replay_one(args: argparse.Namespace, options: dict[str, Any]) -> Any:
 
 def replay_options(args: argparse.Namespace) -> ReplayOptions:
     """Return the options of a replay that the arguments ask for."""
-    return ReplayOptions(
-        window=args.window,
-        align=args.align,
-        formats=args.formats or ReplayOptions().formats,
-        poses_out=args.poses_out,
-        truth=args.truth,
-        view=args.view,
-        rrd=args.rrd,
-        overwrite=args.overwrite,
-    )
+    names = ('window', 'align', 'poses_out', 'truth', 'view', 'rrd', 'overwrite')
+    formats = args.formats or ReplayOptions().formats
+    return ReplayOptions(formats=formats, **{name: getattr(args, name) for name in names})
 
 
 def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
     """Map recordings into one map, with the workers that were asked for."""
+    from surfel_mapper.cluster.replay import replay_bags
+    from surfel_mapper.offline.outputs import output_directory
     from surfel_mapper.offline.replay import all_scans
 
     refused = [name for name in ONE_PROCESS if getattr(args, name)]
@@ -285,8 +277,6 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
         )
     config = with_filters(args).replace(all_scans())
     output = output_directory(args.bags[0], args.output)
-    from surfel_mapper.cluster.replay import replay_bags
-
     return replay_bags(
         [request_of(args, bag) for bag in args.bags],
         config,

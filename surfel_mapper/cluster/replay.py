@@ -10,20 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
+from surfel_mapper.cluster.map_reduce import map_bags, MappedBags
+from surfel_mapper.cluster.shards import cut, shard_length_s
 from surfel_mapper.cluster.workers import never, open_workers
 from surfel_mapper.compilation import clock
-from surfel_mapper.config import AUTO
+from surfel_mapper.config import AUTO, Config
 from surfel_mapper.errors import BagError, ConfigError
 from surfel_mapper.files.atomic import check_free, finite_or_none
-from surfel_mapper.offline.outputs import BAG, check_formats, MAP_FORMATS
-from surfel_mapper.offline.replay import pose_errors, ReplayOptions, ReplayResult
+from surfel_mapper.offline.options import BAG, MAP_FORMATS, ReplayOptions
+from surfel_mapper.offline.outputs import check_formats, ScanTrajectory, write_files, write_maps
+from surfel_mapper.offline.recording import open_recording
+from surfel_mapper.offline.replay import pose_errors, ReplayResult
 from surfel_mapper.offline.request import Request
-
-if TYPE_CHECKING:
-    from surfel_mapper.cluster.map_reduce import MappedBags
-    from surfel_mapper.config import Config
 
 
 def replay_bags(
@@ -78,9 +78,6 @@ def replay_bags(
         If workers cannot be reached or are lost, or Dask is not installed.
 
     """
-    from surfel_mapper.cluster.map_reduce import map_bags
-    from surfel_mapper.cluster.shards import cut, shard_length_s
-
     began = clock()
     options = ReplayOptions() if options is None else options
     check(config, options, output)
@@ -151,8 +148,6 @@ def written(
     output: Path, options: ReplayOptions, mapped: MappedBags, summary: dict[str, Any]
 ) -> ReplayResult:
     """Write the files of a replay."""
-    from surfel_mapper.offline.outputs import ScanTrajectory, write_files, write_maps
-
     mapper = mapped.mapper
     mapper.outcomes = mapped.outcomes
     trajectory = ScanTrajectory(mapper)
@@ -167,8 +162,6 @@ def written(
 
 def surveyed(request: Request, config: Config) -> dict[str, Any]:
     """Return duration, cut files and clocks of a recording; raise BagError if it has no poses."""
-    from surfel_mapper.offline.recording import open_recording
-
     with open_recording(request, config) as recording:
         description = recording.describe()
         if description['poses_from'] == 'registration':

@@ -24,7 +24,8 @@ from surfel_mapper.filters.registry import all_filters
 from surfel_mapper.layers import switches
 from surfel_mapper.messages.images import warm_up as warm_up_depth
 from surfel_mapper.models import evaluate, fit
-from surfel_mapper.offline.replay import replay, ReplayOptions
+from surfel_mapper.offline.options import ReplayOptions
+from surfel_mapper.offline.replay import replay
 from surfel_mapper.offline.request import Request
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.warm_up import node_stages

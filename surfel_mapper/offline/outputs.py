@@ -10,31 +10,46 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import csv
+from dataclasses import asdict
 import io
 import os
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
-from surfel_mapper.errors import ConfigError, FileFormatError
-from surfel_mapper.files.atomic import make_directory, nearest_directory
-from surfel_mapper.offline.summary import rounded
+import numpy as np
+import numpy.typing as npt
 
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from surfel_mapper.config import Config
-    from surfel_mapper.layers.drawings import Drawing
-    from surfel_mapper.pipeline import Mapper, ScanOutcome, Update
-    from surfel_mapper.pipeline.map_part import ApartMap
-    from surfel_mapper.tsdf.mesh import Mesh
-    from surfel_mapper.viz.history import History
+from surfel_mapper.config import Config
+from surfel_mapper.counters import STAGES
+from surfel_mapper.errors import ConfigError, FileFormatError, one_line
+from surfel_mapper.files import parquet, pcd, ply
+from surfel_mapper.files.atomic import (
+    make_directory,
+    nearest_directory,
+    replace_file,
+    write_json,
+)
+from surfel_mapper.files.map_state import save_map
+from surfel_mapper.files.parquet_tiles import check_dataset, write_tiles
+from surfel_mapper.files.trajectory import TRAJECTORY, write_tum
+from surfel_mapper.layers import formats as layer_formats
+from surfel_mapper.layers import load as load_layer
+from surfel_mapper.layers.drawings import Drawing
+from surfel_mapper.offline.options import BAG, known_formats, MAP_FORMATS, TILES
+from surfel_mapper.offline.summary import in_order, rounded
+from surfel_mapper.pipeline import Mapper, ScanOutcome, Update
+from surfel_mapper.pipeline.map_part import ApartMap
+from surfel_mapper.pipeline.saved_state import save_mapper
+from surfel_mapper.tsdf.mesh import Mesh
+from surfel_mapper.viz.detail import drawn_surfels
+from surfel_mapper.viz.drawings import draw_points, page_meshes, section_html
+from surfel_mapper.viz.history import History
+from surfel_mapper.viz.picture import draw_map
+from surfel_mapper.viz.report import write_report
+from surfel_mapper.viz.turning_view import most_shown
 
 SCANS = 'scans.csv'
 """File of the outcomes of all scans."""
-
-BAG = 'bag'
-"""Format that is written while mapping: a bag of normals in the directory ``normals``."""
 
 COLUMNS = (
     'stamp_ns',
@@ -48,35 +63,9 @@ COLUMNS = (
 )
 """Columns of scans.csv before the times; the attributes of ScanOutcome."""
 
-TILES = 'tiles'
-"""Format of a Parquet dataset in the directory ``map``."""
-
-MAP_FORMATS = {
-    'ply': 'map.ply',
-    'pcd': 'map.pcd',
-    'parquet': 'map.parquet',
-    TILES: 'map',
-    'npz': 'map.npz',
-    BAG: 'normals',
-}
-"""File of each format of the map; npz, parquet and tiles are exact, to be loaded again.
-
-In the order of writing: of several maps in a directory the one written last is read."""
-
-
-def known_formats() -> dict[str, str]:
-    """Return the file of each format in the output directory: of the map, and of all layers."""
-    from surfel_mapper.config import load_layer_packages
-    from surfel_mapper.layers import formats
-
-    load_layer_packages()
-    return {**MAP_FORMATS, **{name: layer.formats[name] for name, layer in formats().items()}}
-
 
 def file_names(formats: Sequence[str]) -> list[str]:
     """Return the names of the files of a replay in the output directory, for some formats."""
-    from surfel_mapper.files.trajectory import TRAJECTORY
-
     files = known_formats()
     always = (TRAJECTORY, SCANS, 'map.png', 'report.html', 'summary.json')
     return [*(files[name] for name in formats), *always]
@@ -94,9 +83,7 @@ def check_layer_formats(names: Sequence[str], config: Config) -> None:
         If a package that it needs for the format is not installed.
 
     """
-    from surfel_mapper.layers import formats, load
-
-    by_format = formats()
+    by_format = layer_formats()
     for name in (name for name in names if name in by_format):
         layer = by_format[name]
         if layer.switch and not config.to_mapping()[layer.switch]:
@@ -104,7 +91,7 @@ def check_layer_formats(names: Sequence[str], config: Config) -> None:
                 f'formats: {name} is written by the layer {layer.name}, expected {layer.switch}: '
                 'true in the configuration'
             )
-        load(layer).check_formats([name])
+        load_layer(layer).check_formats([name])
 
 
 def output_directory(recording: Path, wanted: Path | None) -> Path:
@@ -156,15 +143,11 @@ def check_formats(formats: Sequence[str], output: Path) -> None:
 
     """
     if 'parquet' in formats or TILES in formats:
-        from surfel_mapper.files.parquet import import_pyarrow
-
-        import_pyarrow()
+        parquet.import_pyarrow()
     for name in file_names(formats):
         if (output / name).exists() and name not in (MAP_FORMATS[BAG], MAP_FORMATS[TILES]):
             check_writable(output / name)
     if TILES in formats:
-        from surfel_mapper.files.parquet_tiles import check_dataset
-
         check_dataset(output / MAP_FORMATS[TILES])
 
 
@@ -206,15 +189,11 @@ class ScanTrajectory:
 
     def write(self, path: Path) -> None:
         """Write the poses in the fixed frame as TUM text."""
-        from surfel_mapper.files.trajectory import write_tum
-
         write_tum(path, *self.by_time)
 
     @property
     def by_time(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
         """Ascending stamps, (S,), and T_fixed_sensor, (S, 4, 4); the first scan of each stamp."""
-        import numpy as np
-
         stamps_ns, rows = np.unique(np.array(self.stamps_ns, np.int64), return_index=True)
         poses = self.matrices[rows]
         poses[:, :3, 3] += self._map.origin_m
@@ -223,8 +202,6 @@ class ScanTrajectory:
     @property
     def matrices(self) -> npt.NDArray[np.float64]:
         """The poses in the map as one array, (S, 4, 4)."""
-        import numpy as np
-
         return np.array(self.poses).reshape(-1, 4, 4)
 
     @property
@@ -247,8 +224,6 @@ def write_maps(
     Parts that registration could not place on the map become apart_1.npz and apart_1.tum, and so
     on; those of an earlier replay are removed.
     """
-    from surfel_mapper.files.trajectory import TRAJECTORY
-
     make_directory(output)
     for name, file in MAP_FORMATS.items():
         if name in formats:
@@ -262,11 +237,6 @@ def write_maps(
 
 def write_apart(path: Path, apart: ApartMap) -> None:
     """Write a part of the map that stayed apart, and the poses on it, to path.npz and .tum."""
-    import numpy as np
-
-    from surfel_mapper.files.map_state import save_map
-    from surfel_mapper.files.trajectory import write_tum
-
     save_map(path.with_suffix('.npz'), apart.map)
     write_tum(path.with_suffix('.tum'), list(apart.stamps_ns), np.array(apart.poses))
 
@@ -275,8 +245,6 @@ def write_layers(
     output: Path, formats: Sequence[str], mapper: Mapper
 ) -> tuple[dict[str, Mesh], list[str]]:
     """Write the files and pictures of layers; return their meshes and sections for the report."""
-    from surfel_mapper.viz.drawings import draw_points, page_meshes, section_html
-
     drawings: list[Drawing] = []
     sections: list[str] = []
     for layer in mapper.layers.values():
@@ -309,12 +277,6 @@ def write_files(
         The files of the formats, then trajectory, scans, picture, report and summary.
 
     """
-    from surfel_mapper.files.atomic import write_json
-    from surfel_mapper.viz.detail import drawn_surfels
-    from surfel_mapper.viz.picture import draw_map
-    from surfel_mapper.viz.report import write_report
-    from surfel_mapper.viz.turning_view import most_shown
-
     meshes, sections = write_layers(output, formats, mapper) if mapper.layers else ({}, [])
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     surfels = mapper.map.surfels(mapper.config.map.min_points)
@@ -336,13 +298,6 @@ def write_files(
 
 def write_outcomes(path: Path, outcomes: Sequence[ScanOutcome]) -> None:
     """Write the outcomes of scans as a table, one row a scan; the times are ms by stage."""
-    from dataclasses import asdict
-
-    from surfel_mapper.counters import STAGES
-    from surfel_mapper.errors import one_line
-    from surfel_mapper.files.atomic import replace_file
-    from surfel_mapper.offline.summary import in_order
-
     times_ms = {stage: 0.0 for outcome in outcomes for stage in outcome.milliseconds}
     stages = [stage for stage, _ in in_order(times_ms, STAGES)]
     text = io.StringIO(newline='')
@@ -364,9 +319,6 @@ def write_outcomes(path: Path, outcomes: Sequence[ScanOutcome]) -> None:
 
 def write_map(path: Path, name: str, mapper: Mapper, *, window: bool = False) -> None:
     """Write the map in one format."""
-    from surfel_mapper.files import parquet, pcd, ply
-    from surfel_mapper.pipeline.saved_state import save_mapper
-
     derive = mapper.map.adaptive if mapper.config.publish.adaptive else mapper.map.surfels
     min_points, origin_m = mapper.config.map.min_points, mapper.map.origin_m
     if name == 'ply':
@@ -376,8 +328,6 @@ def write_map(path: Path, name: str, mapper: Mapper, *, window: bool = False) ->
     elif name == 'parquet':
         parquet.write_map(path, mapper.map)
     elif name == TILES:
-        from surfel_mapper.files.parquet_tiles import write_tiles
-
         write_tiles(path, mapper.map)
     elif name == 'npz':
         save_mapper(path, mapper, with_window=window)

@@ -5,8 +5,7 @@ Replay: a recording into a map, its picture, a report and figures, in this proce
 
 Outputs are checked before the first scan. The files are written when the whole recording is
 mapped, the map before everything that may fail after it; a viewer that fails ends alone. A replay
-that maps nothing is an error, because an empty map looks like a result. Heavy modules are imported
-inside functions, so that ``surfel_mapper.replay`` loads neither rosbags nor matplotlib early.
+that maps nothing is an error, because an empty map looks like a result.
 """
 
 from __future__ import annotations
@@ -18,23 +17,42 @@ from functools import partial
 import logging
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TYPE_CHECKING
+from typing import Any
+
+import numpy as np
 
 from surfel_mapper.arguments import as_path, check_kind
+from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.compilation import clock, PROGRESS
+from surfel_mapper.config import Config, load_config
 from surfel_mapper.errors import BagError, ConfigError, MapError
-from surfel_mapper.files.atomic import finite_or_none, make_directory
-from surfel_mapper.offline.summary import causes_text
-
-if TYPE_CHECKING:
-    from surfel_mapper.config import Config
-    from surfel_mapper.mapping.surfel_map import SurfelMap
-    from surfel_mapper.offline.normals_bag import NormalsBag
-    from surfel_mapper.offline.outputs import ScanTrajectory
-    from surfel_mapper.offline.recording import Recording
-    from surfel_mapper.offline.request import Request
-    from surfel_mapper.pipeline import Mapper, Update
-    from surfel_mapper.viz.viewer import Viewer
+from surfel_mapper.evaluation.trajectory_errors import compare
+from surfel_mapper.evaluation.truth import true_poses
+from surfel_mapper.files.atomic import check_free, finite_or_none, make_directory
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SETTINGS
+from surfel_mapper.memory import keep_freed_memory
+from surfel_mapper.offline.motion_clock import MotionClock
+from surfel_mapper.offline.normals_bag import NormalsBag
+from surfel_mapper.offline.options import BAG, known_formats, MAP_FORMATS, ReplayOptions
+from surfel_mapper.offline.outputs import (
+    check_formats,
+    check_layer_formats,
+    check_writable,
+    output_directory,
+    ScanTrajectory,
+    write_files,
+    write_maps,
+)
+from surfel_mapper.offline.recording import open_recording, Recording
+from surfel_mapper.offline.request import Request
+from surfel_mapper.offline.summary import causes_text, uncertain_text
+from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.pipeline.checkpoints import load_start
+from surfel_mapper.threads import usable_cores
+from surfel_mapper.viz.history import History
+from surfel_mapper.viz.server import import_rerun
+from surfel_mapper.viz.viewer import Viewer
 
 REPLAY_THREADS = 2
 """Threads of a replay if there are the cores: one reduces the next scan."""
@@ -43,44 +61,6 @@ SAME_TIME_NS = 10_000_000
 """A pose is compared with a true pose at most 10 ms apart."""
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReplayOptions:
-    """
-    Options of a replay beside its configuration.
-
-    Attributes
-    ----------
-    window : bool
-        Let scans leave the map by the window of the configuration, as the node does; else all
-        scans stay.
-    align : bool, optional
-        Close loops, and align all scans with each other at the end; the latter keeps all points
-        in memory until then. By default loops are closed if poses come from registration.
-    formats : tuple of str
-        Formats: ply, pcd, parquet, npz and bag of the map, obj and glb of the layer models.
-    poses_out : Path, optional
-        File for the poses of the scans, as TUM text.
-    truth : Path, optional
-        True poses of the sensor, a file or a simulated bag; the summary states the errors.
-    view : bool
-        Show the map in rerun while it grows.
-    rrd : Path, optional
-        File for the same, for rerun to open.
-    overwrite : bool
-        Replace files that exist; without it, the output must be a new or an empty directory.
-
-    """
-
-    window: bool = False
-    align: bool | None = None
-    formats: tuple[str, ...] = ('ply', 'npz')
-    poses_out: Path | None = None
-    truth: Path | None = None
-    view: bool = False
-    rrd: Path | None = None
-    overwrite: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,13 +144,6 @@ def replay(
     (5, ['map.ply', 'map.npz'])
 
     """
-    from surfel_mapper.memory import keep_freed_memory
-    from surfel_mapper.offline.motion_clock import MotionClock
-    from surfel_mapper.offline.outputs import output_directory, write_files, write_maps
-    from surfel_mapper.offline.recording import open_recording
-    from surfel_mapper.offline.request import Request
-    from surfel_mapper.viz.history import History
-
     options = ReplayOptions() if options is None else options
     check_kind('options', options, ReplayOptions)
     check_kind('progress', progress, Callable)  # type: ignore[arg-type]
@@ -254,10 +227,6 @@ def map_recording(
         If the recording cannot be read, lacks topics or poses, or none of its scans was mapped.
 
     """
-    from surfel_mapper.offline.recording import open_recording
-    from surfel_mapper.offline.request import Request
-    from surfel_mapper.offline.summary import uncertain_text
-
     options = ReplayOptions()
     request = Request(path=Path(path), bin_columns=bin_columns)
     with (
@@ -290,8 +259,6 @@ DEPTH_VOXEL_M = 0.08
 
 def changed_settings(config: Config | str | Path | None) -> list[str]:
     """Return the names of the settings that a configuration changes."""
-    from surfel_mapper.config import Config, load_config
-
     chosen = config if isinstance(config, Config) else load_config(config)
     default = Config().to_mapping()
     return [name for name, value in chosen.to_mapping().items() if value != default[name]]
@@ -299,9 +266,6 @@ def changed_settings(config: Config | str | Path | None) -> list[str]:
 
 def configured(config: Config | str | Path | None, options: ReplayOptions) -> Config:
     """Return the configuration for a replay with some options, after checking their formats."""
-    from surfel_mapper.config import Config, load_config
-    from surfel_mapper.offline.outputs import check_layer_formats, known_formats
-
     if config is not None and not isinstance(config, (Config, str, Path)):
         raise ConfigError(
             f'config: a {type(config).__name__}, expected a Config or the path of a YAML file; '
@@ -316,16 +280,12 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
     if options.align:
         settings = settings.replace({'window.keep_points': True})
     if not settings.map.threads:
-        from surfel_mapper.threads import usable_cores
-
         settings = settings.replace({'map.threads': min(usable_cores(), REPLAY_THREADS)})
     return settings if options.window else settings.replace(all_scans())
 
 
 def all_scans() -> dict[str, Any]:
     """Return the settings with which no scan leaves the map: no limit of the window."""
-    from surfel_mapper.mapping.window import SETTINGS
-
     return {**{f'window.{name}': 0 for name in SETTINGS}, 'map.max_bytes': 0}
 
 
@@ -365,9 +325,6 @@ def align(mapper: Mapper, options: ReplayOptions) -> dict[str, Any]:
 
 def started_mapper(config: Config) -> Mapper:
     """Return a mapper with compiled kernels and the map that ``map.load`` names, if any."""
-    from surfel_mapper.pipeline import Mapper
-    from surfel_mapper.pipeline.checkpoints import load_start
-
     mapper = Mapper(config)
     load_start(mapper)
     mapper.warm_up()
@@ -376,9 +333,6 @@ def started_mapper(config: Config) -> Mapper:
 
 def check_outputs(directory: Path, options: ReplayOptions) -> None:
     """Raise if an output cannot be written, shown or compared, before the first scan."""
-    from surfel_mapper.files.atomic import check_free
-    from surfel_mapper.offline.outputs import check_formats, check_writable
-
     check_free(directory, options.overwrite)
     check_formats(options.formats, directory)
     for path in (options.poses_out, options.rrd):
@@ -386,8 +340,6 @@ def check_outputs(directory: Path, options: ReplayOptions) -> None:
             check_writable(path)
             check_free(path, options.overwrite)
     if options.view or options.rrd is not None:
-        from surfel_mapper.viz.server import import_rerun
-
         import_rerun()
     if options.truth is not None:
         check_truth(options.truth)
@@ -408,8 +360,6 @@ def listeners(
     directory: Path, options: ReplayOptions, mapper: Mapper
 ) -> Iterator[list[Callable[[Update], None]]]:
     """Open the bag of normals and the viewers that were asked for; yield their callbacks."""
-    from surfel_mapper.offline.outputs import BAG
-
     with ExitStack() as files:
         callbacks = viewers(options, mapper, files)
         if BAG not in options.formats:
@@ -439,8 +389,6 @@ def viewers(
     paths += [options.rrd] if options.rrd is not None else []
     if not paths:
         return []
-    from surfel_mapper.viz.viewer import Viewer
-
     return [files.enter_context(shown(Viewer(mapper, path), path)) for path in paths]
 
 
@@ -478,10 +426,6 @@ def shown(viewer: Viewer, path: Path | None) -> Iterator[Callable[[Update], None
 
 def normals_bag(directory: Path, mapper: Mapper, files: ExitStack) -> NormalsBag:
     """Begin the bag of normals; it is complete when the files are closed, or does not exist."""
-    from surfel_mapper.bags.writer import BagWriter
-    from surfel_mapper.offline.normals_bag import NormalsBag
-    from surfel_mapper.offline.outputs import BAG, MAP_FORMATS
-
     writer = BagWriter(directory / MAP_FORMATS[BAG], overwrite=True)
     return NormalsBag(files.enter_context(writer), mapper)
 
@@ -494,8 +438,6 @@ def mapped(
     stopped: Callable[[], bool],
 ) -> tuple[ScanTrajectory, bool]:
     """Map all scans; return their poses, and whether mapping was stopped."""
-    from surfel_mapper.offline.outputs import ScanTrajectory
-
     trajectory, total = ScanTrajectory(mapper), recording.num_scans
     for update in recording.replay(mapper, stopped):
         with mapper.counters.timed('record'):
@@ -524,10 +466,6 @@ def refuse_empty(recording: Recording, mapper: Mapper, was_stopped: bool) -> Non
 
 def check_truth(truth: Path) -> None:
     """Raise if there are no true poses at a path, before hours of work."""
-    import numpy as np
-
-    from surfel_mapper.evaluation.truth import true_poses
-
     true_poses(truth, np.zeros(1, np.int64))
 
 
@@ -535,9 +473,6 @@ def pose_errors(truth: Path | None, trajectory: ScanTrajectory) -> dict[str, Any
     """Return the errors of the poses for the summary; empty without truth."""
     if truth is None:
         return {}
-    from surfel_mapper.evaluation.trajectory_errors import compare  # 0.2 s, only with truth
-    from surfel_mapper.evaluation.truth import true_poses
-
     stamps_ns, poses = trajectory.by_time
     try:
         errors = compare(

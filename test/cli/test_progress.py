@@ -15,7 +15,7 @@ from surfel_mapper.cli import _progress as progress_module
 from surfel_mapper.cli._progress import progress, stopped_by_interrupt
 from surfel_mapper.cli.main import main
 from surfel_mapper.files.map_state import load_map
-from surfel_mapper.viz import picture
+from surfel_mapper.offline import outputs
 from test.bags.recorded import drive, Entries, PERIOD_NS, START_NS, write_rosbag2
 
 pytestmark = pytest.mark.usefixtures('undrawn')
@@ -68,13 +68,13 @@ def test_the_first_interrupt_is_reported_and_the_second_interrupts():
 
 @pytest.mark.drawn
 def test_ctrl_c_while_files_are_written_leaves_all_of_them(tmp_path, monkeypatch, capsys):
-    draw, pressed = picture.draw_map, []
+    draw, pressed = outputs.draw_map, []
 
     def pressing(*args, **options):
         pressed.append(signal.raise_signal(signal.SIGINT))
         draw(*args, **options)
 
-    monkeypatch.setattr(picture, 'draw_map', pressing)
+    monkeypatch.setattr(outputs, 'draw_map', pressing)
     bag = write_rosbag2(tmp_path / 'bag', drive())
 
     assert main(['replay', str(bag), '--output', str(tmp_path / 'out'), '--json']) == 130
