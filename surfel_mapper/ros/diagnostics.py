@@ -248,7 +248,7 @@ def figures(session: Session) -> dict[str, Any]:
     finished = counters.mapped + counters.gated + counters.localised + counters.dropped.total()
     return {
         'clouds_lost': session.inputs.clouds_lost,
-        'qos': session.inputs.reliabilities(),
+        'qos': session.inputs.subscriptions.reliabilities(),
         'queue': session.thread.num_clouds,
         'waiting': counters.received - finished,
         'latency_ms': {

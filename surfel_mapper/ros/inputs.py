@@ -83,6 +83,8 @@ class Inputs:
     ----------
     poses : PoseInputs
         The subscriptions to poses.
+    subscriptions : SubscriptionExecutor
+        All subscriptions, and their thread.
     clocks : ClockWatch
         Compares the clocks of clouds and poses.
     cloud_topics : list of str
@@ -128,7 +130,7 @@ class Inputs:
         self._node = node
         self._config = config
         self._thread = thread
-        self._subscriptions = subscriptions
+        self.subscriptions = subscriptions
         self._search: TopicSearch | None = None
         if config.input.kind == 'cloud' and not config.input.topics:
             self._search = TopicSearch(node, DEFAULT_TOPICS['cloud'], PointCloud2)
@@ -152,20 +154,8 @@ class Inputs:
         for kind, topic in self._image_topics.items():
             self._subscribe_images(kind, topic)
         self._start_s = time.monotonic()
-        self._subscriptions.on_turn = self._on_turn
-        self._subscriptions.start()
-
-    def unsubscribe(self) -> None:
-        """Take the messages received so far, and unsubscribe."""
-        self._subscriptions.stop()
-
-    def topics(self) -> list[str]:
-        """Return the full names of the topics subscribed to."""
-        return self._subscriptions.topics()
-
-    def reliabilities(self) -> dict[str, str]:
-        """Return the reliability of each subscription, by topic."""
-        return self._subscriptions.reliabilities()
+        self.subscriptions.on_turn = self._on_turn
+        self.subscriptions.start()
 
     def loss(self) -> str:
         """Return the number of lost clouds and the remedy, as text; empty if none was lost."""
@@ -175,7 +165,7 @@ class Inputs:
         size = self._largest_bytes[topic]
         text = f'clouds lost on the way ({self.lost[topic]} of {topic}'
         text += f', up to {size / 1e6:.1f} MB each)' if size else ', none arrived)'
-        senders = self._subscriptions.publishers(topic)
+        senders = self.subscriptions.publishers(topic)
         weak = sorted(
             f'{info.node_namespace.rstrip("/")}/{info.node_name}'
             for info in senders
@@ -185,7 +175,7 @@ class Inputs:
             return f'{text}: they arrive faster than they are taken; is the machine overloaded?'
         remedy = f'put in front of its command: FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}'
         if senders and not weak:
-            if self.reliabilities().get(topic) == 'best effort':
+            if self.subscriptions.reliabilities().get(topic) == 'best effort':
                 return f'{text}: their publisher is reliable, but qos_overrides says best_effort'
             return (
                 f'{text}: their publisher is reliable, but Fast DDS repeats parts of messages '
@@ -222,7 +212,7 @@ class Inputs:
         if self._search is not None:
             self._find_clouds(self._search)
         if self._search is None and not self.poses.is_looking:
-            self._subscriptions.on_turn = None
+            self.subscriptions.on_turn = None
 
     def _find_clouds(self, search: TopicSearch) -> None:
         """Read the only topic of clouds, if the default one has no publisher for a while."""
@@ -244,7 +234,7 @@ class Inputs:
 
     def _read_instead(self, topic: str, alternative: str) -> None:
         """Read the clouds of another topic; the counts of both are kept."""
-        self._subscriptions.unsubscribe(topic)
+        self.subscriptions.unsubscribe(topic)
         self.lost = {**self.lost, alternative: 0}
         self._largest_bytes = {**self._largest_bytes, alternative: 0}
         self._received_s = {alternative: time.monotonic()}
@@ -254,7 +244,7 @@ class Inputs:
     def _subscribe_clouds(self, topic: str) -> None:
         """Subscribe to the clouds or images of one sensor."""
         on_lost = partial(self._on_lost, topic, self.lost[topic])
-        subscribe = partial(self._subscriptions.subscribe, qos=CLOUDS)
+        subscribe = partial(self.subscriptions.subscribe, qos=CLOUDS)
         if self._config.input.kind == 'cloud':
             on_cloud = partial(self._on_cloud, topic)
             subscribe(PointCloud2, topic, on_cloud, on_lost=on_lost, raw=True)
@@ -264,7 +254,7 @@ class Inputs:
 
     def _subscribe_images(self, kind: str, topic: str) -> None:
         """Subscribe to images of colours or labels, and to the calibration if needed."""
-        subscribe = partial(self._subscriptions.subscribe, qos=CLOUDS)
+        subscribe = partial(self.subscriptions.subscribe, qos=CLOUDS)
         if self._scenes.needs_cameras:
             on_info = partial(self._on_scene, partial(self._scenes.add_info, kind, topic))
             subscribe(CameraInfo, camera_info_topic(topic), on_info)

@@ -210,7 +210,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         session.activate()
         self._bond.start()
         self.get_logger().info(
-            f'ready: reads {", ".join(session.inputs.topics())} (pose.source '
+            f'ready: reads {", ".join(session.inputs.subscriptions.topics())} (pose.source '
             f'{self._config.pose.source}), maps in frame {session.mapper.map_frame} with voxels '
             f'of {self._config.map.voxel_size_m:g} m'
         )

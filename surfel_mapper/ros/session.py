@@ -98,7 +98,7 @@ class Session:
         try:
             self.inputs.subscribe()
         except SurfelMapperError:
-            self.inputs.unsubscribe()
+            self.inputs.subscriptions.stop()
             raise
         with self._changing:
             self._is_active = True
@@ -106,7 +106,7 @@ class Session:
 
     def deactivate(self) -> None:
         """Unsubscribe, map the messages received so far, publish the map, and stop publishing."""
-        self.inputs.unsubscribe()
+        self.inputs.subscriptions.stop()
         with self._changing:
             self._is_active = False
             self.outputs.stop_timers()

@@ -262,7 +262,7 @@ def loss(size, reliability=ReliabilityPolicy.BEST_EFFORT, reads='reliable'):
         qos_profile=QoSProfile(depth=1, reliability=reliability),
     )
     inputs = inputs_of(Config.from_mapping(SETTINGS), [publisher])
-    inputs._subscriptions.reliabilities = lambda: {'/points': reads}
+    inputs.subscriptions.reliabilities = lambda: {'/points': reads}
     inputs._on_cloud('/points', bytes(size))
     inputs._on_lost('/points', 0, 5)
     assert inputs.clouds_lost == 5
