@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.loop_search import LoopClosure, LoopSearch, Refusal
-from surfel_mapper.alignment.window import extent
 from surfel_mapper.config import Config
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.files.scan_spool import ScanSpool
@@ -30,6 +29,7 @@ from surfel_mapper.mapping.reducer import within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow
 from surfel_mapper.pipeline.scan_poses import viewpoint
+from surfel_mapper.pipeline.window_aligner import moved_rows
 from surfel_mapper.scan import Scan
 
 LISTED = 20
@@ -220,15 +220,7 @@ class LoopCloser:
     def move(self, closure: LoopClosure, config: Config) -> LoopMove:
         """Move all scans to the poses of a closure; an error leaves all at their poses before."""
         previous = self.T_map_sensor
-        extents = [
-            extent(compose(inverse(old), new))
-            for old, new in zip(previous, closure.T_map_sensor, strict=True)
-        ]
-        moved = [
-            number
-            for number, (way_m, turn_deg) in enumerate(extents)
-            if way_m > config.align.move_m or turn_deg > config.align.move_deg
-        ]
+        moved, largest_m, largest_deg = moved_rows(previous, closure.T_map_sensor, config.align)
         full = self._map.keys(config.map.min_points)
         self._begin_emptied()
         self._move_all(moved, closure.T_map_sensor, config)
@@ -238,8 +230,8 @@ class LoopCloser:
             closure=closure,
             stamps_ns=np.array(self._stamps_ns, np.int64),
             num_moved=len(moved),
-            largest_m=max((extents[number][0] for number in moved), default=0.0),
-            largest_deg=max((extents[number][1] for number in moved), default=0.0),
+            largest_m=largest_m,
+            largest_deg=largest_deg,
             correction=compose(self._poses[-1], inverse(previous[-1])) if has_moved else np.eye(4),
             removed_voxel_index=unpack_keys(np.setdiff1d(full, still_full)),
         )

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from surfel_mapper.alignment import align_scans, Samples, WindowAlignment
 from surfel_mapper.alignment.window import extent
-from surfel_mapper.config import Config
+from surfel_mapper.config import AlignConfig, Config
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.geometry import compose, inverse, Transform
 from surfel_mapper.mapping.moments import ScanMoments
@@ -166,15 +166,8 @@ class WindowAligner:
         samples = self._samples_of(scans, config.align.voxel_size_m)
         frames = [scan.frame_id for scan in scans]
         alignment = align_scans(samples, old_poses, config.align, frames)
-        extents = [
-            extent(compose(inverse(old), new))
-            for old, new in zip(old_poses, alignment.T_map_sensor, strict=True)
-        ]
-        moved = {
-            index: self._moved(scans[index], alignment.T_map_sensor[index])
-            for index, (way_m, turn_deg) in enumerate(extents)
-            if way_m > config.align.move_m or turn_deg > config.align.move_deg
-        }
+        rows, largest_m, largest_deg = moved_rows(old_poses, alignment.T_map_sensor, config.align)
+        moved = {row: self._moved(scans[row], alignment.T_map_sensor[row]) for row in rows}
         fallen = window.move(moved, config.map.min_points)
         new_poses = np.array([scan.T_map_sensor for scan in window])
         if len(scans) - 1 in moved:
@@ -185,8 +178,8 @@ class WindowAligner:
             T_map_sensor=new_poses,
             T_map_fixed=self.T_map_fixed,
             num_moved=len(moved),
-            largest_m=max((extents[index][0] for index in moved), default=0.0),
-            largest_deg=max((extents[index][1] for index in moved), default=0.0),
+            largest_m=largest_m,
+            largest_deg=largest_deg,
             removed_voxel_index=fallen,
         )
 
@@ -214,6 +207,17 @@ class WindowAligner:
             kept[id(scan.points)] = cached or (scan.points, _samples(scan, voxel_size_m))
         self._samples = kept
         return [kept[id(scan.points)][1] for scan in scans]
+
+
+def moved_rows(
+    old: npt.NDArray[np.float64], new: npt.NDArray[np.float64], limits: AlignConfig
+) -> tuple[list[int], float, float]:
+    """Return the rows of poses (S, 4, 4) that move, and their largest motion, m and deg."""
+    pairs = zip(old, new, strict=True)
+    extents = enumerate(extent(compose(inverse(T_old), T_new)) for T_old, T_new in pairs)
+    moved = {row: e for row, e in extents if e[0] > limits.move_m or e[1] > limits.move_deg}
+    largest_m, largest_deg = np.max([(0.0, 0.0), *moved.values()], axis=0).tolist()
+    return list(moved), largest_m, largest_deg
 
 
 def _samples(scan: WindowedScan, voxel_size_m: float) -> Samples:
