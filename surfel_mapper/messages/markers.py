@@ -55,11 +55,6 @@ class Marker:
     text : str
         Of a TEXT_VIEW_FACING.
 
-    Raises
-    ------
-    ValueError
-        If the points or the colours are of another shape.
-
     """
 
     ns: str
@@ -74,15 +69,6 @@ class Marker:
     points: npt.NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
     colors: npt.NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 4), np.float32))
     text: str = ''
-
-    def __post_init__(self) -> None:
-        """Check the shapes."""
-        if self.points.ndim != 2 or self.points.shape[1] != 3:
-            raise ValueError(f'points: shape {self.points.shape}, expected (P, 3)')
-        if self.colors.shape not in ((0, 4), (len(self.points), 4)):
-            raise ValueError(
-                f'colors: shape {self.colors.shape}, expected (0, 4) or ({len(self.points)}, 4)'
-            )
 
 
 def marker_array(markers: Sequence[Marker]) -> bytes:

@@ -183,20 +183,9 @@ class World:
             Outward normal at the hit, nan for no hit. From inside of a solid, and from behind a
             rectangle, it points along the ray.
 
-        Raises
-        ------
-        ValueError
-            If shapes do not match, a direction is not a unit vector, or an origin is not finite.
-
         """
         start = _rows(origins, 'origins')
         ahead = _rows(directions, 'directions')
-        if len(start) not in (1, len(ahead)):
-            raise ValueError(f'origins: {len(start)} rows for {len(ahead)} directions')
-        if not np.isfinite(start).all():
-            raise ValueError('origins: not all finite')
-        if not (np.abs(np.einsum('ij,ij->i', ahead, ahead) - 1.0) < 1e-6).all():
-            raise ValueError('directions: not all unit vectors')
         range_m = np.full(len(ahead), max_range_m, dtype=np.float64)
         surface = np.empty(len(ahead), dtype=np.int64)
         raycast.cast(start, ahead, *self._tables, range_m, surface)
@@ -236,13 +225,6 @@ class World:
     def primitive_of(self, surface: IntArray) -> IntArray:
         """Return the index of the primitive that each surface belongs to; -1 for -1."""
         return np.where(surface < 0, -1, surface // surfaces.FACES)
-
-    def is_plane(self, surface: IntArray) -> npt.NDArray[np.bool_]:
-        """Return whether each surface is flat: rectangles, faces of boxes, caps; False for -1."""
-        kind = np.append(self._kind, -1)[self.primitive_of(surface)]
-        cap = (kind == surfaces.CYLINDER) & (surface % surfaces.FACES > 0)
-        plane: npt.NDArray[np.bool_] = np.isin(kind, (surfaces.RECTANGLE, surfaces.BOX)) | cap
-        return plane
 
     def reflectivity(self, surface: IntArray) -> FloatArray:
         """Return the reflectivity of each surface in [0, 1], nan for -1."""

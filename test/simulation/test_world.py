@@ -32,13 +32,12 @@ def test_an_invalid_primitive_is_refused(changed, says):
         Primitive(**{**good, **changed})
 
 
-def test_surfaces_have_a_primitive_flatness_and_reflectivity():
+def test_surfaces_have_a_primitive_and_reflectivity():
     world = World([BOX, POLE, BALL])
     surface, distance_m, normal = world.surface_at(
         [[0.9, 0.1, 0.2], [0.0, 0.0, -4.0], [5.2, 0.0, 1.0], [5.0, 0.02, 2.6], [-5.0, 0.0, 2.0]]
     )
     assert world.primitive_of(surface).tolist() == [0, 0, 1, 1, 2]
-    assert world.is_plane(surface).tolist() == [True, True, False, True, False]
     assert world.reflectivity(surface).tolist() == [0.9, 0.9, 0.2, 0.2, 0.5]
     np.testing.assert_allclose(distance_m, [0.1, 1.0, 0.1, 0.1, 1.0], atol=1e-15)
     np.testing.assert_allclose(
@@ -51,7 +50,6 @@ def test_no_surface_is_of_no_primitive():
     none = np.array([-1])
     world = World([BOX])
     assert world.primitive_of(none).tolist() == [-1]
-    assert world.is_plane(none).tolist() == [False]
     assert np.isnan(world.reflectivity(none)).all()
 
 
