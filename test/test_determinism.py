@@ -55,7 +55,7 @@ def bag(tmp_path_factory):
     with BagWriter(path) as writer:
         for stamp_ns, xyz, q_xyzw, points in drive():
             pose = StampedPose('odom', 'base_link', stamp_ns, xyz, q_xyzw)
-            writer.write_odometry('/odom', stamp_ns, pose, np.zeros(6))
+            writer.write_odometry('/odom', stamp_ns, pose)
             cloud = from_columns(dict(zip('xyz', points.T, strict=True)))
             writer.write_cloud('/points', stamp_ns, stamp_ns, 'base_link', cloud)
     return path

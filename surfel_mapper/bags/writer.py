@@ -10,7 +10,7 @@ names the storage file after its directory, so the hidden directory contains one
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, ExitStack, suppress
 from pathlib import Path
 import sqlite3
@@ -170,13 +170,11 @@ class BagWriter:
         write_pose(message, pose)
         self.write(topic, TF, record_ns, message.join(), latched=latched)
 
-    def write_odometry(
-        self, topic: str, record_ns: int, pose: StampedPose, twist: Iterable[float]
-    ) -> None:
-        """Append a nav_msgs/Odometry; the twist in the child's frame, m/s and then rad/s."""
-        message, unknown = MessageWriter(), [0.0] * 36
+    def write_odometry(self, topic: str, record_ns: int, pose: StampedPose) -> None:
+        """Append a nav_msgs/Odometry without covariances and velocity."""
+        message = MessageWriter()
         write_pose(message, pose)
-        message.numbers('d', *unknown, *twist, *unknown)
+        message.numbers('d', *[0.0] * (36 + 6 + 36))
         self.write(topic, ODOMETRY, record_ns, message.join())
 
     def _check_free(self) -> None:

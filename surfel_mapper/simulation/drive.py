@@ -20,11 +20,9 @@ import numpy.typing as npt
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import (
     compose,
-    inverse,
     pose_matrix,
     q_xyzw,
     se3_exp,
-    se3_log,
     Transform,
 )
 from surfel_mapper.scan import Scan
@@ -36,9 +34,6 @@ START_NS = 1_700_000_000_000_000_000
 
 END_NS = 2**31 * 10**9
 """First time whose seconds do not fit a stamp of ROS, ns."""
-
-TWIST_STEP_NS = 1_000_000
-"""Half the interval over which the twist is computed, ns."""
 
 WEAVE_M = ((1.0, 70.0), (0.5, 31.0))
 """Amplitude and wavelength of the lateral curves, m; the heading deviates by up to 11 deg."""
@@ -121,12 +116,6 @@ class Drive:
     def T_odom_sensor(self, stamp_ns: int) -> Transform:
         """Return the pose of the lidar at a stamp."""
         return compose(self.T_odom_base(stamp_ns), self.T_base_sensor)
-
-    def twist(self, stamp_ns: int) -> npt.NDArray[np.float64]:
-        """Return the velocity of base_link in base_link (6,), m/s and then rad/s."""
-        start = self.T_odom_base(stamp_ns - TWIST_STEP_NS)
-        end = self.T_odom_base(stamp_ns + TWIST_STEP_NS)
-        return se3_log(compose(inverse(start), end)) / (2e-9 * TWIST_STEP_NS)
 
 
 @dataclass(frozen=True, slots=True)

@@ -94,7 +94,7 @@ def record(
         for record_ns, number in heapq.merge(_pose_times(simulation), _scan_times(simulation)):
             if number < 0:
                 pose = StampedPose(ODOM, BASE, record_ns, *drive.pose(record_ns))
-                bag.write_odometry('/odom', record_ns, pose, drive.twist(record_ns))
+                bag.write_odometry('/odom', record_ns, pose)
                 bag.write_transform('/tf', record_ns, pose)
             else:
                 scan = simulation.scan(number, SENSOR)

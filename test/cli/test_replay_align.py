@@ -30,7 +30,7 @@ def bag(tmp_path_factory):
         for scan, pose in zip(scans, drifted(true[:NUM_SCANS], 0.02, 0.2), strict=False):
             stamp_ns = scan.stamp_ns
             stamped = StampedPose('odom', 'lidar', stamp_ns, pose[:3, 3], q_xyzw(pose))
-            writer.write_odometry('/odom', stamp_ns, stamped, np.zeros(6))
+            writer.write_odometry('/odom', stamp_ns, stamped)
             writer.write_cloud('/points', stamp_ns + 1, stamp_ns, 'lidar', cloud_bytes(scan, 64))
     return path
 

@@ -117,7 +117,7 @@ def bag(tmp_path):
             if i == 1:
                 del columns['ring']
             pose = StampedPose('odom', 'base_link', stamp_ns, np.zeros(3), (0, 0, 0, 1))
-            writer.write_odometry('/odom', stamp_ns, pose, np.zeros(6))
+            writer.write_odometry('/odom', stamp_ns, pose)
             cloud = from_columns(columns)
             writer.write_cloud('/points', stamp_ns + 1, stamp_ns, 'lidar', cloud)
     return tmp_path / 'bag'
