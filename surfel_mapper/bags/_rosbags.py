@@ -103,41 +103,30 @@ def ros2_connection(
         Format (ros2msg, ros2idl) and text of the message definition.
 
     """
-    from rosbags.interfaces import (
-        Connection,
-        ConnectionExtRosbag2,
-        MessageDefinition,
-        MessageDefinitionFormat,
-    )
+    from rosbags import interfaces
 
-    formats = {'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL}
+    kinds = interfaces.MessageDefinitionFormat
+    formats = {'ros2msg': kinds.MSG, 'ros2idl': kinds.IDL}
     kind, text = definition
-    stated = MessageDefinition(formats.get(kind, MessageDefinitionFormat.NONE), text)
+    stated = interfaces.MessageDefinition(formats.get(kind, kinds.NONE), text)
     profiles = [latched_profile()] if TRANSIENT_LOCAL.search(qos) else []
-    ext = ConnectionExtRosbag2(encoding, profiles)
-    return Connection(key, topic, type_, stated, '', 0, ext, owner)
+    ext = interfaces.ConnectionExtRosbag2(encoding, profiles)
+    return interfaces.Connection(key, topic, type_, stated, '', 0, ext, owner)
 
 
 def latched_profile() -> Qos:
     """Return the quality of service of a publisher that keeps its last message for latecomers."""
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
+    from rosbags import interfaces
 
-    never = QosTime(sec=9223372036, nsec=854775807)
-    return Qos(
-        history=QosHistory.KEEP_LAST,
+    never = interfaces.QosTime(sec=9223372036, nsec=854775807)
+    return interfaces.Qos(
+        history=interfaces.QosHistory.KEEP_LAST,
         depth=1,
-        reliability=QosReliability.RELIABLE,
-        durability=QosDurability.TRANSIENT_LOCAL,
+        reliability=interfaces.QosReliability.RELIABLE,
+        durability=interfaces.QosDurability.TRANSIENT_LOCAL,
         deadline=never,
         lifespan=never,
-        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness=interfaces.QosLiveliness.AUTOMATIC,
         liveliness_lease_duration=never,
         avoid_ros_namespace_conventions=False,
     )

@@ -80,10 +80,8 @@ def run(args: argparse.Namespace) -> int:
             overwrite=args.overwrite,
             show=show,
         )
-    if args.json:
-        print(json.dumps({**asdict(done), 'outputs': [str(path) for path in done.outputs]}))
-    else:
-        show_lines(report(done))
+    content = {**asdict(done), 'outputs': [str(path) for path in done.outputs]}
+    show_lines(json.dumps(content) if args.json else report(done))
     return 0
 
 

@@ -99,14 +99,12 @@ def run(args: argparse.Namespace) -> int:
         'distance_m': round(args.speed * simulation.num_scans / args.rate, 3),
         'seconds': round(clock() - begin, 1),
     }
-    if args.json:
-        print(json.dumps(report))
-    else:
-        show_lines(
-            f'{escaped(str(args.output))}: scans {report["scans"]}   '
-            f'points {rounded(report["points"])} ({rounded(returns)} returns)   '
-            f'{report["distance_m"]:g} m   {report["seconds"]} s'
-        )
+    text = (
+        f'{escaped(str(args.output))}: scans {report["scans"]}   '
+        f'points {rounded(report["points"])} ({rounded(returns)} returns)   '
+        f'{report["distance_m"]:g} m   {report["seconds"]} s'
+    )
+    show_lines(json.dumps(report) if args.json else text)
     return 0
 
 

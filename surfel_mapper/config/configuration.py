@@ -146,18 +146,7 @@ class Config:
             If a name is unknown (with the nearest known one), or a value is refused.
 
         """
-        stages, of_no_stage = by_stage(mapping)
-        made = {
-            entry.name: entry.default_factory(**stages.get(stage, {}))  # type: ignore[operator]
-            for stage, entry in stage_fields().items()
-        }
-        more = {name: stage(**stages.get(name, {})) for name, stage in layer_stages().items()}
-        return cls(**made, **of_no_stage, more=more)
-
-    @property
-    def image_topics(self) -> dict[str, str]:
-        """Topics of the images joined with the scans, by kind: color, label."""
-        return self.tsdf.image_topics
+        return cls().replace(mapping)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all settings as ``stage.name`` to value, in the order they are declared."""

@@ -53,11 +53,6 @@ class ScanSpool:
         """Return the number of scans."""
         return len(self._offsets)
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the file, bytes."""
-        return os.fstat(self._file.fileno()).st_size
-
     def append(self, points: npt.NDArray[Any], columns: Mapping[str, npt.NDArray[Any]]) -> None:
         """
         Add a scan: points (N, 3), float32 or float64, and columns (N,).

@@ -138,11 +138,6 @@ class LoopCloser:
         return len(self._poses)
 
     @property
-    def nbytes(self) -> int:
-        """Size of the file with the points, bytes."""
-        return self._spool.nbytes
-
-    @property
     def stamps_ns(self) -> list[int]:
         """Stamps of all scans."""
         return list(self._stamps_ns)

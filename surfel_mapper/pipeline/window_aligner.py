@@ -167,7 +167,11 @@ class WindowAligner:
         frames = [scan.frame_id for scan in scans]
         alignment = align_scans(samples, old_poses, config.align, frames)
         rows, largest_m, largest_deg = moved_rows(old_poses, alignment.T_map_sensor, config.align)
-        moved = {row: self._moved(scans[row], alignment.T_map_sensor[row]) for row in rows}
+        moved = {}
+        for row in rows:
+            scan, pose = scans[row], alignment.T_map_sensor[row]
+            moments = self._moments_at(scan, pose)
+            moved[row] = replace(scan, moments=moments, T_map_sensor=pose)
         fallen = window.move(moved, config.map.min_points)
         new_poses = np.array([scan.T_map_sensor for scan in window])
         if len(scans) - 1 in moved:
@@ -182,10 +186,6 @@ class WindowAligner:
             largest_deg=largest_deg,
             removed_voxel_index=fallen,
         )
-
-    def _moved(self, scan: WindowedScan, pose: Transform) -> WindowedScan:
-        """Return a scan at another pose."""
-        return replace(scan, moments=self._moments_at(scan, pose), T_map_sensor=pose)
 
     def _check(self, num_scans: int, scans: list[WindowedScan], columns: tuple[str, ...]) -> None:
         num_kept = sum(

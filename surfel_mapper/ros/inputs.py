@@ -41,6 +41,7 @@ from surfel_mapper.ros.context import PROFILE
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import time_message
 from surfel_mapper.ros.pose_inputs import PoseInputs
+from surfel_mapper.ros.publishers import full_name
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
 from surfel_mapper.ros.topic_search import TopicSearch
 from surfel_mapper.scan import Scan
@@ -120,7 +121,7 @@ class Inputs:
         self.cloud_topics = cloud_topics(node, config)
         self._image_topics = {
             kind: resolved(node, f'layers.tsdf.{kind}_topic', name)
-            for kind, name in config.image_topics.items()
+            for kind, name in config.tsdf.image_topics.items()
         }
         self.lost = dict.fromkeys(self.cloud_topics, 0)
         self._received_s = dict.fromkeys(self.cloud_topics, time.monotonic())
@@ -167,7 +168,7 @@ class Inputs:
         text += f', up to {size / 1e6:.1f} MB each)' if size else ', none arrived)'
         senders = self.subscriptions.publishers(topic)
         weak = sorted(
-            f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+            full_name(info)
             for info in senders
             if info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
         )

@@ -100,14 +100,12 @@ class MappingThread:
     ----------
     paused : bool
         If true, clouds are dropped and counted; poses are still used.
+    num_clouds : int
+        Number of clouds in the queue.
 
     """
 
-    def __init__(
-        self,
-        mapper: Mapper,
-        on_failure: Callable[[BaseException], None],
-    ) -> None:
+    def __init__(self, mapper: Mapper, on_failure: Callable[[BaseException], None]) -> None:
         self.paused = False
         self._mapper = mapper
         self._on_failure = on_failure
@@ -117,7 +115,7 @@ class MappingThread:
         self._poses: deque[StampedPose] = deque()
         self._images: defaultdict[str, deque[SceneImage]] = defaultdict(deque)  # by kind
         self._work: deque[QueuedCloud | Call] = deque()
-        self._num_clouds = 0
+        self.num_clouds = 0
         self._num_bytes = 0
         self._max_bytes = machine_bytes() // SHARE_OF_MEMORY
         self._is_behind = False  # because of kernels that were compiled
@@ -204,20 +202,15 @@ class MappingThread:
 
     def _is_full(self) -> bool:
         """Return whether the oldest cloud has to go; called with the lock held."""
-        self._is_behind &= self._num_clouds > self._max_clouds or PROGRESS.is_active
+        self._is_behind &= self.num_clouds > self._max_clouds or PROGRESS.is_active
         if self._is_behind:
-            return self._num_bytes > self._max_bytes and self._num_clouds > 1
-        return self._num_clouds > self._max_clouds
+            return self._num_bytes > self._max_bytes and self.num_clouds > 1
+        return self.num_clouds > self._max_clouds
 
     def _count_cloud(self, msg: Any, number: int) -> None:
         """Count a cloud that enters (1) or leaves (-1) the queue; called with the lock held."""
-        self._num_clouds += number
+        self.num_clouds += number
         self._num_bytes += number * len(msg.data)
-
-    @property
-    def num_clouds(self) -> int:
-        """Number of clouds in the queue."""
-        return self._num_clouds
 
     def call(self, function: Callable[[], Result]) -> Future[Result]:
         """
@@ -286,7 +279,7 @@ class MappingThread:
             with self._mapper.guarded('a task between two scans'):
                 run_call(item)
         with self._mapper.guarded('mapping'):
-            for update in self._mapper.insert_ready(more_follows=self._num_clouds > 0):
+            for update in self._mapper.insert_ready(more_follows=self.num_clouds > 0):
                 with self._mapper.guarded('publishing'):
                     on_update(update)
         return True

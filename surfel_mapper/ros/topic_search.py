@@ -15,7 +15,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
 from surfel_mapper.messages.converters import converter
-from surfel_mapper.ros.publishers import publishers_of, with_converter
+from surfel_mapper.ros.publishers import full_name, publishers_of, with_converter
 
 MARK = 'clear_polygon'
 """Private topic that every mapping node subscribes to, by which they are recognised."""
@@ -123,7 +123,7 @@ class TopicSearch:
     def _is_input(self, topic: str, marks: set[str]) -> bool:
         """Return whether a topic has a publisher of the type that is no mapping node."""
         return any(
-            f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}/{MARK}' not in marks
+            f'{full_name(publisher)}/{MARK}' not in marks
             for message in self._messages
             for publisher in publishers_of(self._node, topic, message)
         )

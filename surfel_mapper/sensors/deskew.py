@@ -5,7 +5,7 @@ Deskewing: a pose of its own for every point of a sweep.
 
 A lidar at 10 Hz on a car at 10 m/s sees the last point of a turn from 1 m ahead of the first.
 Drivers write the time of each point in a field; ``point_times`` finds it and its unit,
-``deskewed`` takes the points to the sensor frame at the stamp of the scan, as if all had been
+``deskewing`` takes the points to the sensor frame at the stamp of the scan, as if all had been
 measured then. All later stages (filters, map, window) see rigid scans only.
 
 Poses are looked up at the stamps of the pose source, and between them at steps of at most
@@ -134,14 +134,14 @@ def point_times(
     return PointTimes(offsets, scan.stamp_ns + first, scan.stamp_ns + last)
 
 
-def deskewed(
+def deskewing(
     scan: Scan,
     pose_at: Callable[[int], Transform],
     stamps_ns: Iterable[int] = (),
     min_range_m: float = 0.0,
-) -> Scan:
+) -> Callable[[], Scan]:
     """
-    Return a scan with all points in the sensor frame at its stamp.
+    Look up the poses within a sweep; return the function that deskews it, for another thread.
 
     Parameters
     ----------
@@ -156,20 +156,11 @@ def deskewed(
 
     Returns
     -------
-    Scan
-        The points in the same order, (N, 3) float64, all at the stamp; those without a time nan.
+    callable
+        Returns the scan with the points in the same order, (N, 3) float64, all in the sensor frame
+        at the stamp; those without a time are nan.
 
     """
-    return deskewing(scan, pose_at, stamps_ns, min_range_m)()
-
-
-def deskewing(
-    scan: Scan,
-    pose_at: Callable[[int], Transform],
-    stamps_ns: Iterable[int] = (),
-    min_range_m: float = 0.0,
-) -> Callable[[], Scan]:
-    """Look up all poses that ``deskewed`` needs; return the rest of it, for another thread."""
     times = scan.times
     assert times is not None, 'point_times comes before'
     stamps = [s for s in stamps_ns if times.first_ns < s < times.last_ns]
@@ -209,7 +200,7 @@ def warm_up() -> None:
         times = point_times(scan, unit='ns', reference='epoch')
     for dtype in (np.float32, np.float64):
         points = scan.points.astype(dtype, order='F')
-        deskewed(replace(scan, points=points, times=times), lambda _: np.eye(4))
+        deskewing(replace(scan, points=points, times=times), lambda _: np.eye(4))()
 
 
 def readable(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
