@@ -108,14 +108,7 @@ class BagRecording:
                 for clock in clock_offsets(sample(), self.topics, self.poses.kinds or None)
             ]
         self.config = config
-        self.span = span_of(
-            str(request.path),
-            reader.start_ns,
-            reader.end_ns,
-            start_s=request.start_s,
-            duration_s=request.duration_s,
-            every=request.every,
-        )
+        self.span = span_of(request, reader.start_ns, reader.end_ns)
         if path is not None and not path.has_stamps:
             self._check_number(path)
 

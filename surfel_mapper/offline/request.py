@@ -114,47 +114,27 @@ WHOLE = Span()
 """All of a recording."""
 
 
-def span_of(
-    name: str,
-    first_ns: int,
-    last_ns: int,
-    *,
-    start_s: float = 0.0,
-    duration_s: float = math.inf,
-    every: int = 1,
-) -> Span:
+def span_of(request: Request, first_ns: int, last_ns: int) -> Span:
     """
-    Return a part of a recording.
-
-    Parameters
-    ----------
-    name : str
-        Name of the recording in errors.
-    first_ns, last_ns : int
-        Record time of its first and last message.
-    start_s : float
-        Start of the part, s after the first message.
-    duration_s : float
-        Length of the part, s.
-    every : int
-        Map the first of every this many clouds.
+    Return the part of a recording, from its first to its last message, that is asked for.
 
     Raises
     ------
     BagError
-        If the part is empty, or begins outside of the recording.
+        If the part begins outside of the recording, or its length or ``every`` is not positive.
 
     """
     whole_s = (last_ns - first_ns) / 1e9
+    path, start_s, duration_s = request.path, request.start_s, request.duration_s
     if not 0.0 <= start_s <= whole_s:
-        raise BagError(f'{name}: start {start_s:g} s, expected 0 to {whole_s:.3f} s')
+        raise BagError(f'{path}: start {start_s:g} s, expected 0 to {whole_s:.3f} s')
     if not duration_s > 0.0:
-        raise BagError(f'{name}: duration {duration_s:g} s, expected more than 0')
-    if every < 1:
-        raise BagError(f'{name}: every {every}, expected 1 or more')
+        raise BagError(f'{path}: duration {duration_s:g} s, expected more than 0')
+    if request.every < 1:
+        raise BagError(f'{path}: every {request.every}, expected 1 or more')
     start_ns = first_ns + round(start_s * 1e9)
     return Span(
         start_ns=start_ns if start_s > 0.0 else None,
         stop_ns=None if duration_s > whole_s else start_ns + round(duration_s * 1e9),
-        every=every,
+        every=request.every,
     )

@@ -35,7 +35,7 @@ from surfel_mapper.offline.pose_choice import (
     why_not_deskewed,
 )
 from surfel_mapper.offline.pose_sources import PosePath
-from surfel_mapper.offline.request import Request, Span, span_of
+from surfel_mapper.offline.request import Request, span_of
 from surfel_mapper.offline.scan_times import (
     is_gapless,
     numbered,
@@ -134,14 +134,7 @@ class ScanFolder:
         if is_alone and (seen_from := with_viewpoint(config, viewpoints)):
             self.config, self.pose_reason = seen_from, PLACE
         self.deskew_reason = why_not_deskewed(self.config, [first] if first else [])
-        self.span: Span = span_of(
-            str(self.path),
-            self.stamps[0],
-            self.stamps[-1],
-            start_s=request.start_s,
-            duration_s=request.duration_s,
-            every=request.every,
-        )
+        self.span = span_of(request, self.stamps[0], self.stamps[-1])
         if poses is not None and self.num_scans:
             poses.check_scan(self._rows[self._numbers[-1]])
 

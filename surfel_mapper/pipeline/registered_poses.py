@@ -57,32 +57,27 @@ class StateTimes:
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
-        self._scans = dict.fromkeys(STATES, 0)
-        self._seconds = dict.fromkeys(self._scans, 0.0)
-        self._spans_ns: dict[str, tuple[int, int]] = {}
+        self._spent: dict[str, dict[str, float]] = {
+            state: {'scans': 0, 'seconds': 0.0} for state in STATES
+        }
 
     def add(self, stamp_ns: int, states: list[str]) -> None:
         """Count a scan, and the time since the one before, under its states."""
         step_s = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) / 1e9
         self._last_ns = stamp_ns
         for state in states:
-            self._scans[state] += 1
-            self._seconds[state] += min(max(step_s, 0.0), MAX_STEP_S)
-            self._spans_ns[state] = (self._spans_ns.get(state, (stamp_ns, 0))[0], stamp_ns)
+            spent = self._spent[state]
+            spent['scans'] += 1
+            spent['seconds'] += min(max(step_s, 0.0), MAX_STEP_S)
+            spent.setdefault('first_s', stamp_ns / 1e9)
+            spent['last_s'] = stamp_ns / 1e9
 
     def summary(self) -> dict[str, dict[str, float]]:
         """Return scans and seconds by state, with the stamps of its first and last scan."""
         return {
-            state: {'scans': number, 'seconds': round(self._seconds[state], 3)} | self._span(state)
-            for state, number in self._scans.items()
+            state: {**spent, 'seconds': round(spent['seconds'], 3)}
+            for state, spent in self._spent.items()
         }
-
-    def _span(self, state: str) -> dict[str, float]:
-        """Return the stamps of the first and last scan in a state, s; empty without one."""
-        if state not in self._spans_ns:
-            return {}
-        first_ns, last_ns = self._spans_ns[state]
-        return {'first_s': first_ns / 1e9, 'last_s': last_ns / 1e9}
 
 
 class RegisteredPoses:
