@@ -59,15 +59,10 @@ def assert_is_the_drive(found):
 
 
 @pytest.mark.parametrize(('storage', 'compression'), KINDS)
-def test_a_rosbag2_directory_yields_the_written_messages(tmp_path, storage, compression):
+def test_a_rosbag2_directory_and_its_only_file_are_read(tmp_path, storage, compression):
     path = write_rosbag2(tmp_path / 'drive', drive(), storage, compression)
 
     assert_is_the_drive(read(path))
-
-
-@pytest.mark.parametrize(('storage', 'compression'), KINDS)
-def test_the_only_file_of_a_directory_reads_like_the_directory(tmp_path, storage, compression):
-    path = write_rosbag2(tmp_path / 'drive', drive(), storage, compression)
     (file,) = (file for file in path.iterdir() if file.name != 'metadata.yaml')
 
     assert_is_the_drive(read(file))

@@ -132,6 +132,7 @@ UNSIZED = HEADER.replace('WIDTH 2', 'WIDTH 0')
         (HEADER + 'DATA binary\n' + '\0' * 8 + '1234', 'is its header damaged'),
         (HEADER + 'DATA binary\n' + '\0' * 4105, 'is its header damaged'),
         (HEADER + 'DATA ascii\n1\n', '1 rows, expected 2 points'),
+        (HEADER.replace('WIDTH 2', 'WIDTH 3') + 'DATA ascii\n1\n2\n', 'WIDTH 3, HEIGHT 1'),
         (HEADER + 'DATA packed\n', 'DATA packed, expected'),
         (HEADER + 'DATA binary_compressed\n1234', 'truncated'),
         (HEADER + 'DATA binary_compressed\n\x02\0\0\0\x08\0\0\0ab', 'damaged'),

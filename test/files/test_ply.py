@@ -138,6 +138,10 @@ HEADER = 'ply\nformat binary_little_endian 1.0\n'
             HEADER + 'element vertex 2\nproperty float x\nend_header\n1234567',
             '7 bytes after the header, expected 8 for 2 vertices',
         ),
+        (
+            HEADER + 'element vertex 2\nproperty float x\nend_header\n123456789012',
+            '12 bytes after the header, expected 8',
+        ),
         (HEADER + f'element vertex {10**30}\nproperty double x\nend_header\n', 'truncated'),
     ],
 )

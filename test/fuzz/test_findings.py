@@ -202,33 +202,6 @@ TEXT_PLY = 'ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_heade
 TEXT_PCD = 'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA '
 
 
-@pytest.mark.parametrize(
-    ('name', 'content', 'problem'),
-    [
-        ('a.ply', TEXT_PLY + '1.25\n2.5\n3.5\n', '3 rows, expected 2'),
-        ('a.pcd', TEXT_PCD.replace('WIDTH 2', 'WIDTH 3') + 'ascii\n1\n2\n', 'WIDTH 3, HEIGHT 1'),
-        ('a.pcd', TEXT_PCD + 'binary\n' + 'x' * 12, '12 bytes after the header, expected 8'),
-        (
-            'a.ply',
-            TEXT_PLY.replace('ascii', 'binary_little_endian') + 'x' * 12,
-            '12 bytes after the header, expected 8',
-        ),
-    ],
-)
-def test_counts_are_compared_with_the_points(tmp_path, name, content, problem):
-    path = tmp_path / name
-    path.write_text(content)
-    with pytest.raises(FileFormatError, match=problem):
-        (ply if name == 'a.ply' else pcd).read_points(path)
-
-
-def test_text_with_an_end_of_line_is_read(tmp_path):
-    (tmp_path / 'a.ply').write_text(TEXT_PLY + '1.25\n2.5\n')
-    (tmp_path / 'a.pcd').write_text(TEXT_PCD + 'ascii\n1.25\n2.5\n')
-    for reader, name in ((ply, 'a.ply'), (pcd, 'a.pcd')):
-        assert reader.read_points(tmp_path / name)['x'].tolist() == [1.25, 2.5]
-
-
 @pytest.mark.parametrize(('name', 'type_'), [('a.ply', 'uchar'), ('a.pcd', 'U')])
 @pytest.mark.parametrize('number', ['300', '-1', '1.5', 'nan', '1e300'])
 def test_numbers_that_a_type_cannot_hold_are_refused(tmp_path, name, type_, number):

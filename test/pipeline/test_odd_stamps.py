@@ -142,20 +142,6 @@ def test_a_scan_after_a_step_far_longer_than_those_before_it_is_held():
     assert mapper.counters.resets == 0
 
 
-def test_a_sensor_with_another_clock_does_not_clear_the_map():
-    mapper = mapper_with()
-    for k in range(20):
-        stamp_s = 100.0 + 0.1 * k
-        add_pose(mapper, stamp_s)
-        insert(mapper, scan_at(stamp_s, 'front'))
-        insert(mapper, scan_at(stamp_s - 30.0, 'rear'))
-    mapper.finish()
-    assert mapper.counters.resets == 0
-    assert mapper.counters.mapped == 20
-    assert mapper.counters.dropped == {'odd_stamp': 20}
-    assert_counts_add_up(mapper)
-
-
 def test_a_sensor_whose_scans_come_late_does_not_clear_the_map():
     mapper = mapper_with()
     late_s = 1.1  # more than input.reset_after_s, but near to the poses
