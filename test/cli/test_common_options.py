@@ -90,42 +90,28 @@ def test_a_new_directory_an_empty_one_and_overwriting_are_accepted(inputs, tmp_p
     assert names
 
 
-@pytest.mark.parametrize('option', ['--poses-out', '--rrd'])
-def test_a_file_of_a_replay_is_not_replaced_unasked(inputs, tmp_path, capsys, option):
-    extras.load('rerun')
-    file, output = tmp_path / 'file', str(tmp_path / 'out')
+@pytest.mark.parametrize(
+    ('words', 'package'),
+    [
+        (('replay', 'drive', '-o', 'out', '--poses-out', 'file.tum'), ''),
+        (('replay', 'drive', '-o', 'out', '--rrd', 'file.rrd'), 'rerun'),
+        (('view', 'map.npz', '--rrd', 'file.rrd'), 'rerun'),
+        (('filter', 'chain.yaml', 'a.ply', '-o', 'file.ply'), ''),
+    ],
+)
+def test_a_file_is_not_replaced_unasked(inputs, tmp_path, monkeypatch, capsys, words, package):
+    if package:
+        extras.load(package)
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / words[-1]
     file.write_text('mine')
-    words = ['replay', str(inputs / 'drive'), '-o', output, option, str(file)]
+    command = [str(inputs / word) if (inputs / word).exists() else word for word in words]
 
-    assert main(words) == 1
-    assert f'{file}: exists; expected a new name, or --overwrite' in capsys.readouterr().err
+    assert main(command) == 1
+    assert f'{file.name}: exists; expected a new name, or --overwrite' in capsys.readouterr().err
     assert file.read_text() == 'mine'
-    assert main([*words, '--overwrite']) == 0
+    assert main([*command, '--overwrite']) == 0
     assert file.read_bytes() != b'mine'
-
-
-def test_a_file_of_view_is_not_replaced_unasked(inputs, tmp_path, capsys):
-    pytest.importorskip('rerun')
-    file = tmp_path / 'file.rrd'
-    file.write_text('mine')
-    words = ['view', str(inputs / 'map.npz'), '--rrd', str(file)]
-
-    assert main(words) == 1
-    assert f'{file}: exists; expected a new name, or --overwrite' in capsys.readouterr().err
-    assert file.read_text() == 'mine'
-    assert main([*words, '--overwrite']) == 0
-    assert file.read_bytes() != b'mine'
-
-
-def test_a_filtered_cloud_is_not_replaced_unasked(inputs, tmp_path, capsys):
-    file = tmp_path / 'out.ply'
-    file.write_text('mine')
-    words = ['filter', str(inputs / 'chain.yaml'), str(inputs / 'a.ply'), '-o', str(file)]
-
-    assert main(words) == 1
-    assert f'{file}: exists; expected a new name, or --overwrite' in capsys.readouterr().err
-    assert main([*words, '--overwrite']) == 0
-    assert file.read_bytes().startswith(b'ply')
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_frames_are_shown_without_the_slash_of_ros1(tmp_path, capsys):
 
 def test_names_of_columns_cannot_write_to_the_terminal(tmp_path, capsys):
     """A PLY has its columns' names, and a file its own, from outside."""
-    folder = tmp_path / 'scans\x1b[2J'
+    folder = tmp_path / 'scans\x1b[2J\nforged: line'
     folder.mkdir()
     properties = ''.join(f'property float {name}\n' for name in ('x', 'y', 'z', '\x1b[31m'))
     (folder / '1.ply').write_text(
@@ -109,8 +109,9 @@ def test_names_of_columns_cannot_write_to_the_terminal(tmp_path, capsys):
     assert main(['info', str(folder)]) == 0
     text = capsys.readouterr().out
     assert 'further columns: \\x1b[31m' in text
-    assert 'scans\\x1b[2J: scans in files' in text
+    assert 'scans\\x1b[2J\\nforged: line: scans in files' in text
     assert '\x1b' not in text
+    assert not any(line.startswith('forged') for line in text.splitlines())
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from PIL import Image
 from PIL.JpegImagePlugin import JpegImageFile
 import pytest
 
-from surfel_mapper.cli.main import main
 from surfel_mapper.counters import Counters, OTHERS
 from surfel_mapper.errors import (
     CloudFormatError,
@@ -93,16 +92,6 @@ def test_poses_beyond_any_place_are_refused(far_m):
     pose[1, 3] = far_m
     with pytest.raises(ValueError, match='expected a rigid transform'):
         SurfelMap(0.5).reduce(np.zeros((5, 3)), pose)
-
-
-def test_names_with_an_end_of_line_stay_on_their_line(tmp_path, capsys):
-    folder = tmp_path / 'a\nforged: line'
-    folder.mkdir()
-    np.zeros((3, 4), np.float32).tofile(folder / '1.bin')
-    assert main(['info', str(folder)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert r'a\nforged: line: scans in files' in lines[0]
-    assert not any(line.startswith('forged') for line in lines)
 
 
 def taken(count):

@@ -254,21 +254,6 @@ def test_the_most_silent_of_several_lidars_is_found():
     assert inputs.most_silent[0] == '/front'
 
 
-def loss(size, reliability=ReliabilityPolicy.BEST_EFFORT, reads='reliable'):
-    """Return the report about five lost clouds of a size from a publisher of a reliability."""
-    publisher = SimpleNamespace(
-        node_namespace='/robot',
-        node_name='lidar',
-        qos_profile=QoSProfile(depth=1, reliability=reliability),
-    )
-    inputs = inputs_of(Config.from_mapping(SETTINGS), [publisher])
-    inputs.subscriptions.reliabilities = lambda: {'/points': reads}
-    inputs._on_cloud('/points', bytes(size))
-    inputs._on_lost('/points', 0, 5)
-    assert inputs.clouds_lost == 5
-    return inputs.loss()
-
-
 @pytest.mark.skipif(any(map(os.environ.get, FASTDDS_VARIABLES)), reason='Fast DDS is configured')
 def test_lost_large_clouds_are_reported_with_a_remedy(start, peer):
     node = start('node', *arguments(**{'pose.source': 'identity'}))
@@ -300,5 +285,13 @@ def test_lost_large_clouds_are_reported_with_a_remedy(start, peer):
 
 
 def test_an_override_that_loses_large_clouds_is_named():
-    said = loss(4_000_000, ReliabilityPolicy.RELIABLE, reads='best effort')
+    publisher = SimpleNamespace(
+        node_namespace='/robot', node_name='lidar', qos_profile=RELIABLE_QOS
+    )
+    inputs = inputs_of(Config.from_mapping(SETTINGS), [publisher])
+    inputs.subscriptions.reliabilities = lambda: {'/points': 'best effort'}
+    inputs._on_cloud('/points', bytes(4_000_000))
+    inputs._on_lost('/points', 0, 5)
+    assert inputs.clouds_lost == 5
+    said = inputs.loss()
     assert said.endswith('their publisher is reliable, but qos_overrides says best_effort')

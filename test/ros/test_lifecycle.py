@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from importlib.util import find_spec
 import signal
 
 import pytest
@@ -109,16 +108,6 @@ def test_an_impossible_transition_is_refused(start, peer):
     assert transit(peer, 'configure')
     assert transit(peer, 'activate')
     assert node.stop(signal.SIGTERM) == 0
-
-
-@pytest.mark.skipif(find_spec('tf2_msgs') is not None, reason='tf2_msgs is installed')
-def test_a_missing_tf2_msgs_is_refused_before_kernels_compile(start, peer):
-    node = start('node', *WAITING, '-p', 'pose.source:=tf')
-    assert not transit(peer, 'configure')
-    assert 'refused: pose.source tf needs the package tf2_msgs' in node.output
-    assert 'compiling' not in node.output
-    assert state(peer) == 'unconfigured'
-    assert node.stop() == 0
 
 
 def test_a_failed_transition_states_the_reason_and_keeps_the_state(start, peer):

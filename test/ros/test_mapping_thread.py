@@ -86,20 +86,6 @@ def test_no_cloud_is_dropped_because_kernels_compile(bench):
     assert not bench.mapper.counters.dropped
 
 
-def test_poses_overtake_clouds_so_that_a_backlog_is_mapped_completely(bench):
-    stamps = [START_NS + i * PERIOD_NS for i in range(MAX_CLOUDS)]
-    bench.hold()
-    for stamp_ns in stamps:  # 2 s, four times as long as a scan may wait for its pose
-        bench.put_cloud(stamp_ns)
-    for stamp_ns in stamps:
-        bench.put_pose(stamp_ns)
-    bench.release()
-    bench.thread.stop()
-
-    assert bench.stamps == stamps
-    assert not bench.mapper.counters.dropped
-
-
 def test_a_full_queue_drops_and_counts_the_oldest_clouds(bench):
     stamps = [START_NS + i * PERIOD_NS for i in range(MAX_CLOUDS + 3)]
     bench.hold()
