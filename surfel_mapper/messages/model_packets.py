@@ -73,8 +73,8 @@ class ModelStream:
         if not changed and not removed:
             return None
         self._sent = model
-        part = selected(model, changed)
-        return self._message(part, versions, tuple(removed), is_complete=False, **message)
+        update = selected(model, changed)
+        return self._message(update, versions, tuple(removed), is_complete=False, **message)
 
     def complete(self, model: MultiModel, versions: Mapping[int, int], **message: Any) -> bytes:
         """Return the message of all models; see ``changes``."""
@@ -104,13 +104,13 @@ def changed_ids(old: MultiModel, new: MultiModel) -> set[int]:
     """
     patches = {patch.id: patch for patch in old.patches}
     changed = {patch.id for patch in new.patches if patches.get(patch.id) is not patch}
-    previous, now = old.gaussians, new.gaussians
-    _, rows, others = np.intersect1d(now.id, previous.id, return_indices=True)
-    same = (now.num_points[rows] == previous.num_points[others]) & np.logical_and(
-        (now.mean[rows] == previous.mean[others]).all(axis=1),
-        (now.covariance[rows] == previous.covariance[others]).all(axis=(1, 2)),
+    previous, current = old.gaussians, new.gaussians
+    _, rows, previous_rows = np.intersect1d(current.id, previous.id, return_indices=True)
+    same = (current.num_points[rows] == previous.num_points[previous_rows]) & np.logical_and(
+        (current.mean[rows] == previous.mean[previous_rows]).all(axis=1),
+        (current.covariance[rows] == previous.covariance[previous_rows]).all(axis=(1, 2)),
     )
-    return changed | set(np.delete(now.id, rows[same]).tolist())
+    return changed | set(np.delete(current.id, rows[same]).tolist())
 
 
 def selected(model: MultiModel, ids: Collection[int]) -> MultiModel:

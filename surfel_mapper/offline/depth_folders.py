@@ -275,8 +275,8 @@ def camera_of(
     path: Path, nominal: Intrinsics | None, units_per_m: float
 ) -> tuple[Intrinsics, float]:
     """Return intrinsics and units of depth, of a file in the folder or above it, else as known."""
-    places = [folder / name for folder in (path, path.parent) for name in INTRINSICS]
-    file = next(filter(Path.is_file, places), None)
+    candidates = [folder / name for folder in (path, path.parent) for name in INTRINSICS]
+    file = next(filter(Path.is_file, candidates), None)
     if file is None and nominal is None:
         raise FileFormatError(f'{path}: no intrinsics of its camera, expected {INTRINSICS[0]}')
     if file is None:

@@ -127,10 +127,10 @@ def tracking_text(summary: Mapping[str, Any]) -> str:
     states = summary.get('registration', {}).get('tracking', {})
     received = summary['scans']['received']
     return ''.join(
-        f'registration: {found["scans"]} of {received} scans {statement} '
-        f'({found["first_s"]:.3f} to {found["last_s"]:.3f} s)\n'
+        f'registration: {counts["scans"]} of {received} scans {statement} '
+        f'({counts["first_s"]:.3f} to {counts["last_s"]:.3f} s)\n'
         for state, statement in STATES.items()
-        if (found := states.get(state)) and 'first_s' in found
+        if (counts := states.get(state)) and 'first_s' in counts
     )
 
 

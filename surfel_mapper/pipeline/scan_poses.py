@@ -309,8 +309,8 @@ class ScanQueue:
     def push(self, scan: Scan) -> None:
         """Add a scan, before newer ones of its source; beyond the limit the first is dropped."""
         source, row = source_of(scan), len(self.waiting)
-        for at, other in enumerate(self.waiting):
-            if other.stamp_ns > scan.stamp_ns and source_of(other) == source:
+        for at, queued in enumerate(self.waiting):
+            if queued.stamp_ns > scan.stamp_ns and source_of(queued) == source:
                 row = at
                 break
         self.waiting.insert(row, scan)
@@ -321,10 +321,10 @@ class ScanQueue:
     def drop_odd(self, scan: Scan, odd_ns: int) -> None:
         """Drop the scan of a stamp ahead of the next one of its frame, if it still waits."""
         reason = f'its stamp is {(odd_ns - scan.stamp_ns) / 1e9:.3f} s ahead of the next scan'
-        for row, other in enumerate(self.waiting):
-            if (source_of(other), other.stamp_ns) == (source_of(scan), odd_ns):
+        for row, queued in enumerate(self.waiting):
+            if (source_of(queued), queued.stamp_ns) == (source_of(scan), odd_ns):
                 del self.waiting[row]
-                self._drops.scan(other, 'odd_stamp', reason)
+                self._drops.scan(queued, 'odd_stamp', reason)
                 return
         at = f'scan at {odd_ns / 1e9:.6f} s in frame {scan.frame_id!r}'
         self._drops.warn('odd_stamp', f'{at}: {reason}, but it is mapped')
@@ -398,10 +398,10 @@ def viewpoint(T_map_sensor: Transform, config: Config) -> Transform | None:
     """Return the position of the sensor; None if unknown, and normals stay as they are."""
     if config.pose.source != 'identity':
         return T_map_sensor[:3, 3]
-    place = standing_sensor(config)
-    if place is None:
+    position = standing_sensor(config)
+    if position is None:
         return None
-    moved: npt.NDArray[np.float64] = (T_map_sensor[:3, :3] * place).sum(axis=1)
+    moved: npt.NDArray[np.float64] = (T_map_sensor[:3, :3] * position).sum(axis=1)
     return moved + T_map_sensor[:3, 3]
 
 

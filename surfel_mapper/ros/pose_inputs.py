@@ -300,8 +300,8 @@ class PoseInputs:
 
     def _subscribe(self, kind: str, topic: str) -> None:
         """Subscribe to poses or transforms."""
-        known = {ODOMETRY: Odometry, POSE: self._pose_message}
-        message = known.get(kind) or transform_message()
+        messages = {ODOMETRY: Odometry, POSE: self._pose_message}
+        message = messages.get(kind) or transform_message()
         qos = STATIC_TRANSFORMS if topic == STATIC_TOPIC else POSES
         if self.is_choosing and topic != STATIC_TOPIC:
             self._waiting.setdefault(topic, deque(maxlen=MAX_POSES))
