@@ -148,6 +148,11 @@ class Config:
         """
         return cls().replace(mapping)
 
+    @property
+    def image_topics(self) -> dict[str, str]:
+        """Topics of the images joined with the scans, by kind: color, label."""
+        return self.tsdf.image_topics
+
     def to_mapping(self) -> dict[str, Any]:
         """Return all settings as ``stage.name`` to value, in the order they are declared."""
         owners: dict[str, Any] = {'': self}

@@ -227,7 +227,7 @@ def chosen_topics(reader: BagReader, request: Request, config: Config) -> list[s
     if config.input.kind == 'depth':
         choose = reader.topics.choose_image
     topics = [choose(name) for name in dict.fromkeys(names)]
-    for name in config.tsdf.image_topics.values():
+    for name in config.image_topics.values():
         reader.topics.choose_image(f'/{name.lstrip("/")}')
     return topics
 
@@ -309,11 +309,11 @@ def feed(
 
     images: DepthFeed | None = None
     scenes: SceneFeed | None = None
-    if mapper.config.input.kind == 'depth' or mapper.config.tsdf.image_topics:
+    if mapper.config.input.kind == 'depth' or mapper.config.image_topics:
         from surfel_mapper.offline.image_feeds import DepthFeed, SceneFeed  # the compiler
 
         images = DepthFeed(clouds, add) if mapper.config.input.kind == 'depth' else None
-        scenes = SceneFeed(mapper) if mapper.config.tsdf.image_topics else None
+        scenes = SceneFeed(mapper) if mapper.config.image_topics else None
     infos = images.info_topics if images else {}
     scene_topics = scenes.topics if scenes else set()
     stream = messages(reader, {*clouds, *infos, *scene_topics}, poses, span)

@@ -96,7 +96,7 @@ class SceneFeed:
     """
 
     def __init__(self, mapper: Mapper) -> None:
-        named = mapper.config.tsdf.image_topics
+        named = mapper.config.image_topics
         self._mapper = mapper
         self._images = SceneImages(mapper.config)
         self._kinds = {f'/{topic.lstrip("/")}': kind for kind, topic in named.items()}

@@ -121,7 +121,7 @@ class Inputs:
         self.cloud_topics = cloud_topics(node, config)
         self._image_topics = {
             kind: resolved(node, f'layers.tsdf.{kind}_topic', name)
-            for kind, name in config.tsdf.image_topics.items()
+            for kind, name in config.image_topics.items()
         }
         self.lost = dict.fromkeys(self.cloud_topics, 0)
         self._received_s = dict.fromkeys(self.cloud_topics, time.monotonic())
