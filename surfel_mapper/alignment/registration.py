@@ -27,7 +27,14 @@ from surfel_mapper.alignment.kernels.steps import solve_step
 from surfel_mapper.alignment.scan_view import ScanView
 from surfel_mapper.alignment.surfel_planes import means, PlaneLevels, SurfelPlanes
 from surfel_mapper.config import RegistrationConfig
-from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
+from surfel_mapper.geometry import (
+    compose,
+    inverse,
+    pose_matrix,
+    q_xyzw,
+    rotation_angle,
+    Transform,
+)
 from surfel_mapper.mapping.reducer import Reducer
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
@@ -500,43 +507,8 @@ def solve(
 
 
 def moved(T_map_sensor: Transform, step: npt.NDArray[np.float64]) -> Transform:
-    """
-    Return a pose moved by step[:3], m, and rotated in place by the vector step[3:], rad.
-
-    In plain Python: numpy's calls take four times as long on so few numbers.
-    """
-    x, y, z = step[3:].tolist()
-    angle = math.sqrt(x * x + y * y + z * z)
-    a, b = 1.0, 0.5  # sin(angle) / angle, (1 - cos(angle)) / angle^2
-    if angle > 1e-8:
-        half = math.sin(0.5 * angle) / angle
-        a, b = math.sin(angle) / angle, 2.0 * half * half
-    turn = (
-        (1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y),
-        (b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x),
-        (b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)),
-    )
-    *columns, position = zip(*T_map_sensor[:3].tolist(), strict=True)
-    first, second = ([_dot(row, column) for column in columns] for row in turn[:2])
-    first = _unit(first)  # the product is off by rounding
-    along = _dot(second, first)
-    second = _unit([value - along * base for value, base in zip(second, first, strict=True)])
-    third = [
-        first[1] * second[2] - first[2] * second[1],
-        first[2] * second[0] - first[0] * second[2],
-        first[0] * second[1] - first[1] * second[0],
-    ]
-    rows = zip((first, second, third), position, step[:3].tolist(), strict=True)
-    moved_rows = [[*rotation, old + shift] for rotation, old, shift in rows]
-    return np.array([*moved_rows, [0.0, 0.0, 0.0, 1.0]])
-
-
-def _dot(a: Sequence[float], b: Sequence[float]) -> float:
-    """Return the scalar product of two vectors of three numbers."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _unit(vector: Sequence[float]) -> list[float]:
-    """Return a vector of three numbers scaled to length 1."""
-    length = math.sqrt(_dot(vector, vector))
-    return [value / length for value in vector]
+    """Return a pose moved by step[:3], m, and rotated in place by the vector step[3:], rad."""
+    half = 0.5 * math.hypot(*step[3:])
+    scale = 0.5 * math.sin(half) / half if half > 0.0 else 0.5
+    turn = pose_matrix((0.0, 0.0, 0.0), [*(scale * step[3:]), math.cos(half)])
+    return pose_matrix(T_map_sensor[:3, 3] + step[:3], q_xyzw(compose(turn, T_map_sensor)))
