@@ -137,46 +137,25 @@ class LUM:
         self.jacobian = jacobian
         self.max_iterations = max_iterations
         self.convergence_threshold = convergence_threshold
+        self._check_settings()
+
+    def _check_settings(self) -> None:
+        """Raise AlignmentError if a setting, which may have been changed, is out of bounds."""
+        number, threshold = self.max_iterations, self.convergence_threshold
+        if self.jacobian not in JACOBIANS:
+            expected = ', '.join(JACOBIANS)
+            raise AlignmentError(f'jacobian {self.jacobian!r}, expected one of {expected}')
+        if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < 1:
+            raise AlignmentError(f'max_iterations {number!r}, expected an integer, one or more')
+        if not 0.0 <= threshold < math.inf:
+            raise AlignmentError(
+                f'convergence_threshold {threshold}, expected zero or more, finite'
+            )
 
     @property
     def num_vertices(self) -> int:
         """Number of clouds in the graph."""
         return self.graph.num_vertices
-
-    @property
-    def jacobian(self) -> str:
-        """``exact``, or ``pcl`` for the steps that PCL takes."""
-        return self._jacobian
-
-    @jacobian.setter
-    def jacobian(self, value: str) -> None:
-        if value not in JACOBIANS:
-            raise AlignmentError(f'jacobian {value!r}, expected one of {", ".join(JACOBIANS)}')
-        self._jacobian = value
-
-    @property
-    def max_iterations(self) -> int:
-        """Maximum number of steps."""
-        return self._max_iterations
-
-    @max_iterations.setter
-    def max_iterations(self, value: int) -> None:
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-            raise AlignmentError(f'max_iterations {value!r}, expected an integer')
-        if value < 1:
-            raise AlignmentError(f'max_iterations {value}, expected one or more')
-        self._max_iterations = int(value)
-
-    @property
-    def convergence_threshold(self) -> float:
-        """Mean change of a pose at which iteration ends."""
-        return self._convergence_threshold
-
-    @convergence_threshold.setter
-    def convergence_threshold(self, value: float) -> None:
-        if not 0.0 <= value < math.inf:
-            raise AlignmentError(f'convergence_threshold {value}, expected zero or more, finite')
-        self._convergence_threshold = float(value)
 
     def add_point_cloud(self, points: npt.ArrayLike, pose: npt.ArrayLike | None = None) -> int:
         """
@@ -264,6 +243,7 @@ class LUM:
             with ``jacobian='pcl'``; poses are unchanged then.
 
         """
+        self._check_settings()
         num_others = self.num_vertices - 1
         if num_others < 1:
             raise AlignmentError(f'{self.num_vertices} vertices, expected two or more')

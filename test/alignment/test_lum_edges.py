@@ -42,11 +42,8 @@ def pair():
         ),
         (lambda lum: lum.correspondences(1, 0), 'no edge 1 -> 0'),
         (lambda lum: lum.set_point_cloud(1, np.eye(3)[:2]), 'names point 2 of vertex 1'),
-        (lambda lum: setattr(lum, 'max_iterations', 0), 'max_iterations 0'),
-        (
-            lambda lum: setattr(lum, 'max_iterations', True),
-            'max_iterations True, expected an integer',
-        ),
+        (lambda lum: (setattr(lum, 'max_iterations', 0), lum.compute()), 'max_iterations 0'),
+        (lambda _: LUM(max_iterations=True), 'max_iterations True, expected an integer'),
         (
             lambda lum: lum.set_correspondences(0, 1, [[0, 0]], [np.eye(3) + np.eye(3, k=1)]),
             'edge 0 -> 1: weight 0 is not symmetric',
