@@ -28,7 +28,7 @@ from surfel_mapper.arguments import as_array, as_numbers
 from surfel_mapper.config import setting, Settings
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.columns import LazyColumns
-from surfel_mapper.kernels.selection import compact
+from surfel_mapper.filters.kernels.selection import compact
 from surfel_mapper.scan import Scan
 
 Mask = npt.NDArray[np.bool_]

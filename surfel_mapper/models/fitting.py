@@ -26,7 +26,6 @@ from surfel_mapper.compilation import clock
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import AXIS_BITS, KEY_BITS
-from surfel_mapper.kernels.selection import number_ranges
 from surfel_mapper.mapping.moments import are_far_apart, OTHER_UNIT
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.coarse_growth import (
@@ -413,7 +412,7 @@ def assembled(
     free = np.flatnonzero(of_cluster < 0)
     of_cluster[free] = len(numbered) + np.arange(len(free))
     labels = np.empty(len(clusters.points), np.int32)
-    number_ranges(clusters.rows, of_cluster, clusters.order, labels)
+    labels[clusters.order] = np.repeat(of_cluster, clusters.num_points)
     model = MultiModel(
         planes=numbered[: len(planes)],
         surfaces=[patch for patch in numbered if isinstance(patch, Surface)],

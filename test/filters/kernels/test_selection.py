@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.selection import compact
+from surfel_mapper.filters.kernels.selection import compact
 from test.kernels.modes import both
 
 
