@@ -74,28 +74,11 @@ class BoundingBox(Filter):
         """Return which points stay."""
         low = (self.x_min_m, self.y_min_m, self.z_min_m)
         high = (self.x_max_m, self.y_max_m, self.z_max_m)
-        test = outside if self.remove_inside else inside
-        return test(scan.points, low, high)
-
-
-def inside(points: npt.NDArray[Any], low: Any, high: Any) -> Mask:
-    """Return which points lie in a box, not on its faces."""
-    lows, highs = rounded(low, points.dtype), rounded(high, points.dtype)
-    mask = np.ones(len(points), np.bool_)
-    for axis in range(3):
-        mask &= points[:, axis] > lows[axis]
-        mask &= points[:, axis] < highs[axis]
-    return mask
-
-
-def outside(points: npt.NDArray[Any], low: Any, high: Any) -> Mask:
-    """Return which points lie outside of a box or on its faces."""
-    lows, highs = rounded(low, points.dtype), rounded(high, points.dtype)
-    mask = np.zeros(len(points), np.bool_)
-    for axis in range(3):
-        mask |= points[:, axis] <= lows[axis]
-        mask |= points[:, axis] >= highs[axis]
-    return mask
+        points, dtype = scan.points, scan.points.dtype
+        lows, highs = rounded(low, dtype), rounded(high, dtype)
+        if self.remove_inside:
+            return np.asarray(((points <= lows) | (points >= highs)).any(axis=1))
+        return np.asarray(((points > lows) & (points < highs)).all(axis=1))
 
 
 def rounded(bounds: Any, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
