@@ -31,13 +31,10 @@ from surfel_mapper.filters.kernels.nearest import find_nearest
 from surfel_mapper.filters.kernels.search_tree import build_nodes, LEAF, RIGHT
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
-from surfel_mapper.threads import PARTS, share
+from surfel_mapper.threads import share
 
 AT_ONCE = 2**17
 """Neighbours in a piece: the arrays stay in the cache."""
-
-MANY_LEAVES = 256
-"""Trees of fewer leaves are built by one thread."""
 
 Points = npt.NDArray[np.float64]
 Ids = npt.NDArray[np.int64]
@@ -102,23 +99,14 @@ def threads_of_search() -> Any:
     )
 
 
-def search_tree(points: Points, threads: int = 1) -> SearchTree:
-    """Return the search tree of points, (N, 3) finite."""
+def search_tree(points: Points) -> SearchTree:
+    """Build the tree of the points (N, 3), which are finite."""
     num_leaves = -(-len(points) // LEAF)
     order, xyz = np.arange(len(points), dtype=np.int32), np.empty((3, num_leaves * LEAF))
     xyz[:, len(points) :] = np.inf
     links, boxes = np.full((3, 2 * num_leaves), -1, np.int32), np.empty((2 * num_leaves, 6))
-    arrays = points, order, links, boxes, xyz
-    is_shared = threads > 1 and num_leaves >= MANY_LEAVES
-    least = num_leaves // (PARTS * threads) if is_shared else 0
-    tasks = np.empty((4 * PARTS * threads, 3), np.int64)
-    num_tasks = build_nodes(*arrays, 0, 0, num_leaves, least, tasks) if num_leaves else 0
-
-    def build(chunk: slice) -> None:
-        for node, begin, end in tasks[:num_tasks][chunk].tolist():
-            build_nodes(*arrays, node, begin, end, 0, tasks[:0])
-
-    share(build, int(num_tasks), threads)
+    if num_leaves:
+        build_nodes(points, order, links, boxes, xyz, num_leaves)
     leaves = np.flatnonzero(links[RIGHT, : 2 * num_leaves - 1] < 0).astype(np.int32)
     return SearchTree(xyz, order, links, boxes, leaves)
 
@@ -194,7 +182,7 @@ def neighbour_rows(points: Points, number: int, threads: int = 1) -> npt.NDArray
         Nearest first; N where the squared distance is infinite.
 
     """
-    tree = search_tree(points, threads)
+    tree = search_tree(points)
     ids = np.empty((len(points), number), np.int32)
 
     def gather(span: slice, near: Indices, _: Points) -> None:
@@ -228,7 +216,7 @@ class StatisticalOutliers(FiniteFilter):
         number = min(self.num_neighbours + 1, len(points))  # the nearest is the point itself
         if number < 2 or self.std_ratio == math.inf:
             return np.ones(len(points), np.bool_)
-        tree = search_tree(points, self.threads)
+        tree = search_tree(points)
         distances = np.empty(len(points))
 
         def average(span: slice, _: Indices, squared: Points) -> None:
@@ -258,7 +246,7 @@ class RadiusOutliers(FiniteFilter):
             return np.zeros(len(points), np.bool_)
         if number == 1:
             return np.ones(len(points), np.bool_)
-        tree = search_tree(points, self.threads)
+        tree = search_tree(points)
         stays = np.empty(len(points), np.bool_)
 
         def decide(span: slice, near: Indices, _: Points) -> None:

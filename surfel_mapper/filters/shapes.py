@@ -274,7 +274,7 @@ class SurfaceNormal(ShapeFilter):
         """Return the scan with the columns added."""
         points = coordinates(scan)
         number = min(self.num_neighbours, len(points))
-        tree = search_tree(points, self.threads)
+        tree = search_tree(points)
         none = self.describe(tree, slice(0, 0), np.empty((0, 1), np.int32))
         columns: dict[str, npt.NDArray[Any]] = {
             name: np.empty((len(points), *column.shape[1:])) for name, column in none.items()

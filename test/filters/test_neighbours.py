@@ -14,7 +14,7 @@ from test.filters.examples import filter_of, kept, random_scan, scan_of
 
 
 def all_neighbours(points, number, *limits, threads=1):
-    tree = search_tree(points, threads)
+    tree = search_tree(points)
     ids = np.full((len(points), number), -7)
     distances = np.full((len(points), number), np.nan)
 

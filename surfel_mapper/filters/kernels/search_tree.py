@@ -5,7 +5,7 @@ The search tree of a scan: boxes of points, halved at the median along their lon
 
 A leaf holds LEAF consecutive points of the tree's order. A node is the tight box of a run of
 leaves; children follow their parent in preorder, so that the subtree of a node with m leaves has
-2 m - 1 nodes and can be built separately, by another thread.
+2 m - 1 nodes.
 
 The tree as a tuple: xyz (3, L * LEAF) float64, points in the tree's order, padded with inf; order
 (N,) int32, their rows; links (3, 2 L) int32, of each node FIRST its first leaf, RIGHT its right
@@ -29,21 +29,18 @@ FIRST, RIGHT, PARENT = range(3)
 
 
 @kernel(fastmath={'nnan'})
-def build_nodes(points, order, links, boxes, xyz, node, begin, end, least, tasks):
+def build_nodes(points, order, links, boxes, xyz, num_leaves):
     """
-    Build the subtree of a node; return the number of nodes that were left as tasks.
+    Build all nodes.
 
-    points      (N, 3) float64, m, finite
-    order       (N,) int32, in and out: rows of the points; those of the node are permuted
-    xyz         (3, L * LEAF) float64, out: the points of the leaves; of the node's part, xyz[0]
-                holds the coordinates by which it is halved before
-    begin, end  first leaf of the node, and the one after its last
-    least       nodes of at most this number of leaves are left unsplit
-    tasks       (T, 3) int64, out: node, begin and end of each
+    points  (N, 3) float64, m, finite
+    order   (N,) int32, in and out: rows of the points, permuted
+    xyz     (3, L * LEAF) float64, out: the points of the leaves; before, xyz[0] holds the
+            coordinates by which a node is halved
     """
     stack = np.empty((64, 3), np.int64)
-    stack[0, 0], stack[0, 1], stack[0, 2] = node, begin, end
-    top, num_tasks = 1, 0
+    stack[0, 0], stack[0, 1], stack[0, 2] = 0, 0, num_leaves
+    top = 1
     values = xyz[0]
     while top > 0:
         top -= 1
@@ -56,10 +53,6 @@ def build_nodes(points, order, links, boxes, xyz, node, begin, end, least, tasks
                 row = U(order[i])
                 xyz[0, i], xyz[1, i], xyz[2, i] = points[row, 0], points[row, 1], points[row, 2]
             continue
-        if end - begin <= least:
-            tasks[num_tasks, 0], tasks[num_tasks, 1], tasks[num_tasks, 2] = node, begin, end
-            num_tasks += 1
-            continue
         middle = (begin + end) >> 1
         for i in range(first, last):
             values[U(i)] = points[U(order[U(i)]), axis]
@@ -70,7 +63,6 @@ def build_nodes(points, order, links, boxes, xyz, node, begin, end, least, tasks
         stack[top, 0], stack[top, 1], stack[top, 2] = upper, middle, end
         stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = lower, begin, middle
         top += 2
-    return num_tasks
 
 
 @inlined()
