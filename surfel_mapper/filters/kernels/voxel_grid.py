@@ -21,9 +21,6 @@ from surfel_mapper.kernels.grouping import AHEAD, CHUNK, enlarged_table, find_ru
 ROWS = 4096
 """Initial number of voxels that the table has room for."""
 
-LONG = 3
-"""Mean length of the runs of a chunk from which they are summed run by run, not by point."""
-
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def group_points(xyz, size, shift, base, bits, keys, sums, first, rows):
@@ -64,10 +61,7 @@ def group_points(xyz, size, shift, base, bits, keys, sums, first, rows):
             # rows are numbered as they appear; a branch would be mispredicted at new voxels
             first[new_row] = start + np.int64(starts[run])
             new_row += run_rows[run] == new_row
-        if LONG * num_runs > len(x):
-            add_points(x, y, z, chunk_keys, run_rows, flat)
-        else:
-            add_runs(x, y, z, starts, num_runs, run_rows, flat)
+        add_points(x, y, z, chunk_keys, run_rows, flat)
         if len(rows) > 0:
             spread_rows(chunk_keys, run_rows, rows[chunk])
     return num_rows
@@ -100,21 +94,6 @@ def add_points(x, y, z, chunk_keys, run_rows, flat):
         sy += np.float64(y[i])
         sz += np.float64(z[i])
         count += 1.0
-        flat[at], flat[at + U(1)], flat[at + U(2)], flat[at + U(3)] = sx, sy, sz, count
-
-
-@inlined()
-def add_runs(x, y, z, starts, num_runs, run_rows, flat):
-    """Add the runs of a chunk to the sums of their voxels, point by point in order."""
-    for run in range(U(num_runs)):
-        at = U(4) * U(np.uint32(run_rows[run]))
-        begin, end = U(np.uint32(starts[run])), U(np.uint32(starts[run + U(1)]))
-        sx, sy, sz, count = flat[at], flat[at + U(1)], flat[at + U(2)], flat[at + U(3)]
-        for i in range(begin, end):
-            sx += np.float64(x[i])
-            sy += np.float64(y[i])
-            sz += np.float64(z[i])
-        count += np.float64(end - begin)
         flat[at], flat[at + U(1)], flat[at + U(2)], flat[at + U(3)] = sx, sy, sz, count
 
 
