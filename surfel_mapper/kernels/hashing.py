@@ -140,19 +140,13 @@ def find_row(key, rows, table, depth):
         bucket = next_bucket(bucket)
 
 
-@inlined()
-def insert_row(hashed, row, table, depth):
-    """Insert the row of a voxel that is not in the table."""
-    directory, buckets, counts, _ = table
-    insert_entry(hashed, row, directory, buckets, counts, depth)
-
-
 @njit(cache=True, nogil=True, inline='always')
 def insert_entry(hashed, row, directory, buckets, counts, depth):
     """
-    Insert a row as ``insert_row`` does, for loops that unpacked the table before.
+    Insert the row of a voxel that is not in the table.
 
-    Unpacking it for each voxel counts references to four arrays, a quarter of an insertion.
+    It takes the arrays of the table one by one: unpacking the table for each voxel counts
+    references to four arrays, a quarter of an insertion.
     """
     bucket = first_bucket(hashed, directory, depth)
     counts[U(bucket) // U(SEGMENT)] += 1
@@ -163,16 +157,9 @@ def insert_entry(hashed, row, directory, buckets, counts, depth):
     buckets[U(bucket + offset)] = (hashed << 32) | (row + 1)
 
 
-@inlined()
-def remove_row(key, row, table, depth):
-    """Remove the row of a voxel from the table."""
-    directory, buckets, counts, _ = table
-    remove_entry(hash_key(key), row, directory, buckets, counts, depth)
-
-
 @njit(cache=True, nogil=True, inline='always')
 def remove_entry(hashed, row, directory, buckets, counts, depth):
-    """Remove a row by its hash, for loops that unpacked the table before; see ``insert_entry``."""
+    """Remove the row of a voxel by its hash; see ``insert_entry``."""
     bucket = first_bucket(hashed, directory, depth)
     counts[U(bucket) // U(SEGMENT)] -= 1
     offset = place_of_half(buckets, bucket, row + 1)

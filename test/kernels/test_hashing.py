@@ -16,10 +16,10 @@ from surfel_mapper.kernels.hashing import (
     find_row,
     FULLEST,
     hash_key,
-    insert_row,
+    insert_entry,
     is_full,
     NEXT_SEGMENT,
-    remove_row,
+    remove_entry,
     SEGMENT,
     split_segment,
     STATE,
@@ -58,12 +58,13 @@ class Owner:
                 self.directory = np.repeat(self.directory, 2)
                 self.state[DEPTH] += 1
         self.rows[row, KEY] = key
-        self.call(insert_row, hashed, row, self.table, self.state[DEPTH])
+        self.call(insert_entry, hashed, row, *self.table[:3], self.state[DEPTH])
         self.expected[key] = row
 
     def remove(self, key):
         row = self.expected.pop(key)
-        self.call(remove_row, np.int64(key), row, self.table, self.state[DEPTH])
+        hashed = self.call(hash_key, np.int64(key))
+        self.call(remove_entry, hashed, row, *self.table[:3], self.state[DEPTH])
         return row
 
     def check(self):

@@ -15,10 +15,10 @@ from surfel_mapper.kernels.hashing import (
     find_row,
     FREE_ROW,
     hash_key,
-    insert_row,
+    insert_entry,
     makes_room,
     NEXT_ROW,
-    remove_row,
+    remove_entry,
     SEGMENT,
     VOXELS,
 )
@@ -70,7 +70,7 @@ def place_blocks(keys, head, table, state, start, rows):
     Returns the number of blocks done; fewer than K if rows, segments or the directory are full:
     make room and continue from there.
     """
-    depth = state[DEPTH]
+    depth, (directory, buckets, counts, _) = state[DEPTH], table
     entries = np.empty(SEGMENT, np.int64)
     for i in range(start, len(keys)):
         key = keys[i]
@@ -90,7 +90,7 @@ def place_blocks(keys, head, table, state, start, rows):
             head[row, KEY] = key
             head[row, VERSION] = NEW
             head[row, STAMP:] = 0
-            insert_row(hashed, row, table, depth)
+            insert_entry(hashed, row, directory, buckets, counts, depth)
             state[VOXELS] += 1
         rows[i] = row
     return len(keys)
@@ -99,9 +99,10 @@ def place_blocks(keys, head, table, state, start, rows):
 @njit(cache=True, nogil=True)
 def remove_blocks(rows, head, table, state):
     """Remove the blocks of rows, (K,) int64, from the table and free the rows."""
+    directory, buckets, counts, _ = table
     for i in range(len(rows)):
         row = np.int64(rows[i])
-        remove_row(head[row, KEY], row, table, state[DEPTH])
+        remove_entry(hash_key(head[row, KEY]), row, directory, buckets, counts, state[DEPTH])
         head[row, KEY] = state[FREE_ROW]
         head[row, VERSION] = FREE
         state[FREE_ROW] = row
