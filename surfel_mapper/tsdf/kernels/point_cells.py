@@ -17,7 +17,8 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_MASK, INDEX_OFFSET
+from surfel_mapper.kernels.layout import INDEX_BITS
+from surfel_mapper.kernels.quantisation import pack, unpack
 from surfel_mapper.kernels.symmetric3 import decompose_one
 
 EMPTY = -1
@@ -46,20 +47,6 @@ COSINE = 7
 RANGE = 8
 """Distance of the mean from the sensor, voxels."""
 CELL = 9
-
-
-@njit(cache=True, nogil=True, inline='always')
-def packed(i, j, k):
-    """Return the key of an index, an int64."""
-    x, y, z = i + INDEX_OFFSET, j + INDEX_OFFSET, k + INDEX_OFFSET
-    return x << 2 * INDEX_BITS | y << INDEX_BITS | z
-
-
-@njit(cache=True, nogil=True, inline='always')
-def unpacked(key):
-    """Return the index that a key packs, three int64."""
-    i, j, k = key >> 2 * INDEX_BITS, key >> INDEX_BITS & INDEX_MASK, key & INDEX_MASK
-    return i - INDEX_OFFSET, j - INDEX_OFFSET, k - INDEX_OFFSET
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -122,7 +109,7 @@ def merge_points(points, pose, limits, table, keys, sums):
         y = pose[1, 0] * u + pose[1, 1] * v + pose[1, 2] * w + pose[1, 3]
         z = pose[2, 0] * u + pose[2, 1] * v + pose[2, 2] * w + pose[2, 3]
         i, j, k = math.floor(x), math.floor(y), math.floor(z)
-        key, last = packed(np.int64(i), np.int64(j), np.int64(k)), number
+        key, last = pack(np.int64(i), np.int64(j), np.int64(k)), number
         if key != last_key:
             last_key = key
             cell, number = number_of(key, table, keys, last)
@@ -158,10 +145,10 @@ def merge_cells(keys, sums, edge, table, planes, plane_keys, plane_sums):
     """
     number = 0
     for cell in range(len(keys)):
-        i, j, k = unpacked(keys[cell])
+        i, j, k = unpack(keys[cell])
         a, b, c = i // edge, j // edge, k // edge
         last = number
-        into, number = number_of(packed(a, b, c), table, plane_keys, last)
+        into, number = number_of(pack(a, b, c), table, plane_keys, last)
         planes[cell] = into
         if number > last:
             plane_sums[into] = 0.0
@@ -223,7 +210,7 @@ def describe_cells(origin, voxel_m, keys, sums, planes, normals, cells):
     cells       (K, CELL) float64, out; normals point to the sensor
     """
     for cell in range(len(keys)):
-        i, j, k = unpacked(keys[cell])
+        i, j, k = unpack(keys[cell])
         count, row = sums[cell, 0], cells[cell]
         x, y, z = sums[cell, 1] / count, sums[cell, 2] / count, sums[cell, 3] / count
         x, y, z = x + i + 0.5, y + j + 0.5, z + k + 0.5

@@ -28,6 +28,7 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.hashing import DEPTH
+from surfel_mapper.kernels.quantisation import pack
 from surfel_mapper.tsdf.kernels.block_marks import walk
 from surfel_mapper.tsdf.kernels.channels import vote
 from surfel_mapper.tsdf.kernels.integration import (
@@ -45,7 +46,6 @@ from surfel_mapper.tsdf.kernels.point_cells import (
     COSINE,
     entry_of,
     number_of,
-    packed,
     RANGE,
     WEIGHT,
 )
@@ -126,7 +126,7 @@ def list_pairs(cells, start, tau, bits, table, keys, number, pairs, num_pairs):
         for c in range(low[2] >> bits, (high[2] >> bits) + 1):
             for b in range(low[1] >> bits, (high[1] >> bits) + 1):
                 for a in range(low[0] >> bits, (high[0] >> bits) + 1):
-                    block, number = number_of(packed(a, b, c), table, keys, number)
+                    block, number = number_of(pack(a, b, c), table, keys, number)
                     pairs[num_pairs, 0], pairs[num_pairs, 1] = block, cell
                     num_pairs += 1
     return number, num_pairs, len(cells)
@@ -191,7 +191,7 @@ def free_rays(cells, start, origin, limits, bits, table, keys, number, freed):
         for _ in range(nx + ny + nz + 1):
             if i >> bits != a or j >> bits != b or k >> bits != c:
                 a, b, c = i >> bits, j >> bits, k >> bits
-                block, number = number_of(packed(a, b, c), table, keys, number)
+                block, number = number_of(pack(a, b, c), table, keys, number)
             voxel = (i & mask) | (j & mask) << bits | (k & mask) << 2 * bits
             word, bit = freed[block, voxel >> 6], np.int64(1) << (voxel & 63)
             num_freed = num_freed + 1 if word & bit else 0
