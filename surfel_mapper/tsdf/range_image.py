@@ -42,8 +42,6 @@ class RangeImage:
         Length of each ray, m; 0 means unknown, more than max_range_m free up to there.
     largest_m : float
         The largest range, at most max_range_m; 0 for an image without ranges.
-    num_used : int
-        Number of pixels or points used.
     color : (rows, columns, 3 or 4) uint8, optional
         Red, green, blue; a fourth channel of 0 means unknown.
     label : (rows, columns) int32, optional
@@ -56,7 +54,6 @@ class RangeImage:
     sensor: CameraModel
     range_m: Float32
     largest_m: float
-    num_used: int
     color: npt.NDArray[np.uint8] | None = None
     label: npt.NDArray[np.int32] | None = None
     mask: npt.NDArray[np.uint8] | None = None
@@ -153,10 +150,10 @@ def from_depth(
     native = np.ascontiguousarray(depth, native_type)
     absent = NO_DEPTH_MM if native_type == np.uint16 else np.nan
     absent = absent if unknown is None else float(unknown)
-    largest, used = kernels.from_depth(
+    largest = kernels.from_depth(
         native, np.float32(scale), absent, sensor.ray_length, limits(sensor), image
     )
-    return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
+    return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest))
 
 
 def from_points(
@@ -190,10 +187,10 @@ def from_points(
         raise CloudFormatError(f'points: {points.dtype} {points.shape}, expected (N, 3) float')
     image = np.zeros((sensor.rows, sensor.columns), np.float32)
     source = np.full((sensor.rows, sensor.columns), -1, np.int32)
-    largest, used = kernels.from_points(
+    largest = kernels.from_points(
         np.ascontiguousarray(points), sensor.projection, limits(sensor), image, source
     )
-    range_image = RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
+    range_image = RangeImage(sensor=sensor, range_m=image, largest_m=float(largest))
     more: dict[str, npt.NDArray[Any]] = {}
     if colors is not None:
         channels = 4 if colors.shape[-1:] == (4,) else 3

@@ -108,5 +108,5 @@ def image_of(sensor, range_m):
     image = np.empty((sensor.rows, sensor.columns), np.float32)
     ranges = np.ascontiguousarray(range_m, np.float32)
     one = np.float32(1.0), np.nan, np.ones_like(ranges), limits(sensor)
-    largest, used = kernels.from_depth(ranges, *one, image)
-    return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
+    largest = kernels.from_depth(ranges, *one, image)
+    return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest))

@@ -32,18 +32,17 @@ def range_value(range_m, limits):
 @njit(cache=True, nogil=True, error_model='numpy')
 def from_depth(depth, scale, unknown, ray_length, limits, image):
     """
-    Turn depths into ranges; return (largest, used).
+    Turn depths into ranges; return the largest range.
 
     depth       (rows, columns) float32, float64 or uint16; scale float32, metres of one unit
     unknown     float64, a depth that means unknown; nan if there is none
     ray_length  (rows, columns) float32, range at depth 1
     image       (rows, columns) float32 m, out
 
-    largest is the largest range, max_range if a pixel clears; used counts the pixels that are not
-    unknown.
+    The largest range is max_range if a pixel clears.
     """
     rows, columns = depth.shape
-    largest, used = np.float32(0.0), 0
+    largest = np.float32(0.0)
     for row in range(rows):
         for column in range(columns):
             measured = np.float32(depth[row, column]) * scale * ray_length[row, column]
@@ -51,28 +50,27 @@ def from_depth(depth, scale, unknown, ray_length, limits, image):
             if depth[row, column] == unknown:
                 value = np.float32(0.0)
             image[row, column] = value
-            used += value > np.float32(0.0)
             largest = value if value > largest else largest
-    return min(largest, limits[1]), used
+    return min(largest, limits[1])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def from_points(points, sensor, limits, image, index):
     """
-    Project points to their nearest pixels, which keep the closest; return (largest, used).
+    Project points to their nearest pixels, which keep the closest; return the largest range.
 
     points  (N, 3) float32 or float64 m, in the frame of the sensor; non-finite points are skipped
     sensor  (6,) float32, see tsdf/kernels/projection.py
     image   (rows, columns) float32 m, in: 0; out: ranges
     index   (rows, columns) int32, out: number of the point of each filled pixel
 
-    largest is the largest range, max_range if a pixel clears; used counts the points in view.
+    The largest range is max_range if a pixel clears.
     """
     rows, columns = np.int64(index.shape[0]), np.int64(index.shape[1])
     scratch = np.empty((6, CHUNK), np.float32)
     x, y, z = scratch[0], scratch[1], scratch[2]
     distance, u, v = scratch[3], scratch[4], scratch[5]
-    largest, used = np.float32(0.0), 0
+    largest = np.float32(0.0)
     for start in range(0, len(points), CHUNK):
         count = min(CHUNK, len(points) - start)
         for n in range(count):
@@ -89,9 +87,8 @@ def from_points(points, sensor, limits, image, index):
             column = np.int64(np.floor(u[n] + np.float32(0.5)))
             if row < 0 or row >= rows or column < 0 or column >= columns:
                 continue
-            used += 1
             largest = value if value > largest else largest
             if image[row, column] == 0.0 or value < image[row, column]:
                 image[row, column] = value
                 index[row, column] = start + n
-    return min(largest, limits[1]), used
+    return min(largest, limits[1])
