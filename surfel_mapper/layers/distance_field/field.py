@@ -39,6 +39,10 @@ class DistanceField:
         The settings.
     blocks : BlockMap
         The voxels.
+    point_integrator, image_integrator : PointIntegrator, Integrator
+        Fuse the points of lidars, and images.
+    mesher : Mesher
+        Keeps the mesh.
 
     Parameters
     ----------
@@ -68,8 +72,9 @@ class DistanceField:
             check_kind('blocks', blocks, BlockMap)
         self.blocks = BlockMap(config or TsdfConfig()) if blocks is None else blocks
         self.config = self.blocks.config
-        self._mesher = Mesher(self.blocks)
-        self._points, self._images = PointIntegrator(self.blocks), Integrator(self.blocks)
+        self.mesher = Mesher(self.blocks)
+        self.point_integrator = PointIntegrator(self.blocks)
+        self.image_integrator = Integrator(self.blocks)
 
     def __repr__(self) -> str:
         """Return voxel size and number of blocks."""
@@ -120,12 +125,12 @@ class DistanceField:
         labels = checked_column('labels', labels, np.integer, ((num,),))
         if sensor is None:
             stamp_ns = as_whole('stamp_ns', stamp_ns)
-            return self._points.integrate(
+            return self.point_integrator.integrate(
                 points, T_map_sensor, stamp_ns, colors=colors, labels=labels
             )
         check_kind('sensor', sensor, CameraModel, hint='nothing for the points of a lidar')
         image = from_points(sensor, points, colors=colors, labels=labels)
-        return self._images.integrate(image, T_map_sensor, as_whole('stamp_ns', stamp_ns))
+        return self.image_integrator.integrate(image, T_map_sensor, as_whole('stamp_ns', stamp_ns))
 
     def add_depth(
         self,
@@ -176,7 +181,7 @@ class DistanceField:
         check_kind('camera', camera, CameraModel)
         image = from_depth(camera, depth, scale=scale, unknown=unknown)
         image = image.with_images(color=color, label=label, mask=mask)
-        return self._images.integrate(
+        return self.image_integrator.integrate(
             image,
             T_map_camera,
             as_whole('stamp_ns', stamp_ns),
@@ -232,8 +237,8 @@ class DistanceField:
 
     def mesh(self) -> Mesh:
         """Return the surface as triangles; only changed blocks are meshed again."""
-        self._mesher.update()
-        return self._mesher.mesh()
+        self.mesher.update()
+        return self.mesher.mesh()
 
     def save(self, path: str | Path, *, compress: bool = False) -> None:
         """

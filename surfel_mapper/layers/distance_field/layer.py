@@ -51,10 +51,8 @@ from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.euclidean import EuclideanField
-from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.measurements import Integrated
-from surfel_mapper.tsdf.mesh import Mesh, Mesher
-from surfel_mapper.tsdf.point_integrator import PointIntegrator
+from surfel_mapper.tsdf.mesh import Mesh
 
 IMAGE_TOLERANCE_S = 0.02
 """An image belongs to a scan if their stamps differ by no more, s: less than half an image."""
@@ -79,7 +77,9 @@ class TsdfLayer(Layer):
     Attributes
     ----------
     blocks : BlockMap
-        The field.
+        The voxels.
+    field : DistanceField
+        The field, to query, save or fuse into; a new one after the layer was cleared.
 
     """
 
@@ -107,9 +107,7 @@ class TsdfLayer(Layer):
     def _begin(self, blocks: BlockMap) -> None:
         """Continue with a field."""
         self.blocks = blocks
-        self._integrator = Integrator(self.blocks)
-        self._point_integrator = PointIntegrator(self.blocks)
-        self._mesher = Mesher(self.blocks)
+        self.field = DistanceField(blocks=blocks)
         self._live_mesh = LiveMesh(self.blocks)
         self._whole_mesh = WholeMesh(self.blocks)
         esdf = self.config.esdf
@@ -163,12 +161,12 @@ class TsdfLayer(Layer):
         wanted = {'has_color': config.color, 'has_label': config.semantics != 'none'}
         if sensor is None:
             points, channels = measured_channels(scan, config.max_range_m, **wanted)
-            done = self._point_integrator.integrate(
+            done = self.field.point_integrator.integrate(
                 points, T_map_sensor, scan.stamp_ns, **channels
             )
         else:
             image = range_image(scan, sensor, **wanted)
-            done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
+            done = self.field.image_integrator.integrate(image, T_map_sensor, scan.stamp_ns)
         self._position = T_map_sensor[:3, 3].copy()
         self.blocks.evict(self._position)
         self._num_scans += 1
@@ -180,15 +178,10 @@ class TsdfLayer(Layer):
         if not limit:
             self.blocks.max_bytes = 0
             return
-        meshes = self._mesher.nbytes + self._live_mesh.nbytes + self._whole_mesh.nbytes
+        meshes = self.field.mesher.nbytes + self._live_mesh.nbytes + self._whole_mesh.nbytes
         used = self.around.surfel_map.nbytes + self.around.window.nbytes
         free = limit - used - meshes - self._esdf.nbytes
         self.blocks.max_bytes = max(free, LEAST_BYTES)
-
-    @property
-    def field(self) -> DistanceField:
-        """The field, to query, save or fuse into; valid until the layer is cleared."""
-        return DistanceField(blocks=self.blocks)
 
     @property
     def esdf(self) -> EuclideanField:
@@ -198,8 +191,7 @@ class TsdfLayer(Layer):
 
     def mesh(self) -> Mesh:
         """Return the surface; blocks that have not changed since the last call cost little."""
-        self._mesher.update()
-        return self._mesher.mesh()
+        return self.field.mesh()
 
     def _clear_voxels(self, voxel_index: npt.NDArray[np.int32]) -> None:
         """
