@@ -29,31 +29,9 @@ def slice_at(blocks: BlockMap, height_m: float) -> CostGrid:
         If the blocks span more than MAX_VOXELS.
 
     """
-    layer = int(np.floor(height_m / blocks.config.voxel_size_m))
-    rows = blocks.rows()
-    rows = rows[blocks.index(rows)[:, 2] == layer // blocks.config.voxels_per_side]
-    if not len(rows):
-        return no_cells(blocks)
-    occupied, observed = columns_between(blocks, rows, (layer, layer))
+    occupied, observed, origin = columns_between(blocks, (height_m, height_m))
     cost = np.where(occupied, OBSTACLE, np.where(observed, 0, UNSEEN)).astype(np.int8)
-    return CostGrid(
-        resolution_m=blocks.config.voxel_size_m, origin=lowest_corner(blocks, rows), cost=cost
-    )
-
-
-def no_cells(blocks: BlockMap) -> CostGrid:
-    """Return a grid without a cell."""
-    return CostGrid(
-        resolution_m=blocks.config.voxel_size_m,
-        origin=np.zeros(2),
-        cost=np.empty((0, 0), np.int8),
-    )
-
-
-def lowest_corner(blocks: BlockMap, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-    """Return the lowest corner of blocks, x y, m."""
-    lowest = blocks.index(rows)[:, :2].min(axis=0)
-    return np.asarray(lowest * blocks.config.block_size_m, np.float64)
+    return CostGrid(resolution_m=blocks.config.voxel_size_m, origin=origin, cost=cost)
 
 
 def clearance_slice(
@@ -91,6 +69,27 @@ def clearance_slice(
         If the blocks span more than MAX_VOXELS.
 
     """
+    size_m = blocks.config.voxel_size_m
+    occupied, observed, origin = columns_between(blocks, heights_m, center, radius_m)
+    distance = np.full(occupied.shape, max_m)
+    if occupied.any():
+        distance = np.minimum(distance_transform_edt(~occupied, sampling=size_m), max_m)
+    cost = np.minimum(np.rint(100.0 * (1.0 - distance / max_m)), OBSTACLE - 1)
+    cost = np.where(occupied, OBSTACLE, np.where(observed, cost, UNSEEN)).astype(np.int8)
+    return CostGrid(resolution_m=size_m, origin=origin, cost=cost)
+
+
+def columns_between(
+    blocks: BlockMap,
+    heights_m: tuple[float, float],
+    center: npt.ArrayLike = (0.0, 0.0),
+    radius_m: float = 0.0,
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
+    """
+    Return which columns of voxels, (ny, nx), are occupied and observed between two heights.
+
+    Third comes the lowest corner of the columns, x y, m.
+    """
     side, size_m = blocks.config.voxels_per_side, blocks.config.voxel_size_m
     layers = np.floor(np.asarray(heights_m) / size_m).astype(np.int64)
     rows = blocks.rows()
@@ -99,29 +98,13 @@ def clearance_slice(
     if radius_m > 0.0:
         offsets = (index[:, :2] + 0.5) * blocks.config.block_size_m - np.asarray(center)
         chosen &= np.linalg.norm(offsets, axis=1) <= radius_m
-    rows = rows[chosen]
-    if not len(rows):
-        return no_cells(blocks)
-    occupied, observed = columns_between(blocks, rows, (int(layers[0]), int(layers[1])))
-    distance = np.full(occupied.shape, max_m)
-    if occupied.any():
-        distance = np.minimum(distance_transform_edt(~occupied, sampling=size_m), max_m)
-    cost = np.minimum(np.rint(100.0 * (1.0 - distance / max_m)), OBSTACLE - 1)
-    cost = np.where(occupied, OBSTACLE, np.where(observed, cost, UNSEEN)).astype(np.int8)
-    return CostGrid(resolution_m=size_m, origin=lowest_corner(blocks, rows), cost=cost)
-
-
-def columns_between(
-    blocks: BlockMap, rows: npt.NDArray[np.int64], layers: tuple[int, int]
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Return which columns of voxels, (ny, nx), are occupied and observed between two layers."""
-    side, index = blocks.config.voxels_per_side, blocks.index(rows)
+    rows, index = rows[chosen], index[chosen]
     low, high = extent(blocks, index)
     columns, lines = checked_size((high - low)[:2]).tolist()
     layer = index[:, 2:] * side + np.arange(side)
     between = ((layer >= layers[0]) & (layer <= layers[1]))[:, :, None, None]
     observed = (blocks.weight[rows] > 0.0).reshape(-1, side, side, side) & between
-    near = blocks.distance[rows].reshape(observed.shape) <= 0.5 * blocks.config.voxel_size_m
+    near = blocks.distance[rows].reshape(observed.shape) <= 0.5 * size_m
     first = index[:, :2] * side - low[:2]
     masks = []
     for voxels in (observed & near, observed):
@@ -129,4 +112,4 @@ def columns_between(
         number, y, x = np.nonzero(voxels.any(axis=1))
         cells[first[number, 1] + y, first[number, 0] + x] = True
         masks.append(cells)
-    return masks[0], masks[1]
+    return masks[0], masks[1], np.asarray(low[:2] * size_m, np.float64)
