@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,52 +43,6 @@ class Evaluation:
     num_gaussians: int
     size_bytes: int
     compression: float
-
-
-def compare(
-    model: npt.NDArray[np.float64],
-    reference: npt.NDArray[Any],
-    *,
-    weight: npt.NDArray[np.float64],
-    near_m: float,
-    counts: tuple[int, int, int],
-    size_bytes: int,
-) -> Evaluation:
-    """
-    Compare points sampled from models with a cloud.
-
-    Parameters
-    ----------
-    model : (M, 3) float64, m
-        Points sampled from the models.
-    reference : (..., 3) float, m
-        The cloud as it came from the sensor, not thinned; points that are not finite are left out.
-    weight : (M,) float64
-        Points that each point of the models stands for.
-    near_m : float
-        Points of the cloud nearer than this are covered.
-    counts : (int, int, int)
-        Numbers of planes, surfaces and Gaussians.
-    size_bytes : int
-        Bytes of all parameters of the models.
-
-    """
-    cloud: npt.NDArray[np.float64] = np.asarray(reference, np.float64).reshape(-1, 3)
-    cloud = cloud[np.isfinite(cloud).all(axis=1)]
-    precise, complete = nearest(model, cloud), nearest(cloud, model)
-    num_planes, num_surfaces, num_gaussians = counts
-    return Evaluation(
-        precision_rms_m=rms(precise, weight),
-        precision_p95_m=p95(precise, weight),
-        completeness_rms_m=rms(complete),
-        completeness_p95_m=p95(complete),
-        coverage=float(np.mean(complete < near_m)) if complete.size else np.nan,
-        num_planes=num_planes,
-        num_surfaces=num_surfaces,
-        num_gaussians=num_gaussians,
-        size_bytes=size_bytes,
-        compression=POINT_BYTES * len(cloud) / size_bytes if size_bytes else np.nan,
-    )
 
 
 def nearest(

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from surfel_mapper.arguments import as_real
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.models.evaluation import compare, Evaluation
+from surfel_mapper.models.evaluation import Evaluation, nearest, p95, POINT_BYTES, rms
 from surfel_mapper.models.packing import ModelsHeader, pack, unpack, Unpacked
 from surfel_mapper.models.primitives import Gaussians, Plane, Surface
 
@@ -204,17 +204,25 @@ class MultiModel:
             Seed of the samples of Gaussians.
 
         """
+        cloud: Array = np.asarray(reference, np.float64).reshape(-1, 3)
+        cloud = cloud[np.isfinite(cloud).all(axis=1)]
         samples, points = self.resample(seed=seed), self.gaussians.num_points
         counts = self.gaussians.sample_counts(self.voxel_size_m)
         weight = np.ones(len(samples))
         weight[len(samples) - counts.sum() :] = np.repeat(points / np.maximum(counts, 1), counts)
-        return compare(
-            samples,
-            reference,
-            weight=weight,
-            near_m=self.voxel_size_m,
-            counts=(len(self.planes), len(self.surfaces), len(self.gaussians)),
-            size_bytes=self.size_bytes,
+        precise, complete = nearest(samples, cloud), nearest(cloud, samples)
+        is_near, size_bytes = complete < self.voxel_size_m, self.size_bytes
+        return Evaluation(
+            precision_rms_m=rms(precise, weight),
+            precision_p95_m=p95(precise, weight),
+            completeness_rms_m=rms(complete),
+            completeness_p95_m=p95(complete),
+            coverage=float(np.mean(is_near)) if is_near.size else np.nan,
+            num_planes=len(self.planes),
+            num_surfaces=len(self.surfaces),
+            num_gaussians=len(self.gaussians),
+            size_bytes=size_bytes,
+            compression=POINT_BYTES * len(cloud) / size_bytes if size_bytes else np.nan,
         )
 
 

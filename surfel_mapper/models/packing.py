@@ -15,7 +15,7 @@ is allocated.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 import math
 from pathlib import Path
 import struct
@@ -458,7 +458,8 @@ class Columns:
             header=header,
             planes=flat[:planes],
             surfaces=[
-                bent(plane, spline) for plane, spline in zip(flat[planes:], splines, strict=True)
+                plane.bent(spline, plane.rms_m)
+                for plane, spline in zip(flat[planes:], splines, strict=True)
             ],
             gaussians=Gaussians(
                 ids[patches:], number[patches:], means[patches:], covariances[patches:]
@@ -529,10 +530,3 @@ class Columns:
             splines.append(HeightField(pitches[k], origins[k], degrees[k], control))
             start += x * y
         return splines
-
-
-def bent(plane: Plane, spline: HeightField) -> Surface:
-    """Return a patch as a surface."""
-    return Surface(
-        **{field.name: getattr(plane, field.name) for field in fields(plane)}, spline=spline
-    )

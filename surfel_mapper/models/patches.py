@@ -226,16 +226,7 @@ def surface_of(plane: Plane, spline: HeightField, points: Array, far_m: float) -
     error = points[:, 2] - spline.heights(points[:, :2])
     if np.mean(np.abs(error) > far_m) > FAR_SHARE:
         return None
-    return Surface(
-        id=plane.id,
-        num_points=plane.num_points,
-        mean=plane.mean,
-        covariance=plane.covariance,
-        R_patch_map=plane.R_patch_map,
-        rms_m=float(np.sqrt(np.mean(error**2))),
-        grid=plane.grid,
-        spline=spline,
-    )
+    return plane.bent(spline, float(np.sqrt(np.mean(error**2))))
 
 
 def rms_across(covariances: Array, normals: Array, numbers: Indices) -> Array:

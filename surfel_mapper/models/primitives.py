@@ -9,7 +9,7 @@ viewpoint.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -90,6 +90,11 @@ class Plane:
     def samples(self, step_m: float) -> Array:
         """Return points (M, 3) on the patch at about this spacing."""
         return self.lifted(self.grid.samples(step_m))
+
+    def bent(self, spline: HeightField, rms_m: float) -> Surface:
+        """Return the surface of a spline over the plane."""
+        values = {field.name: getattr(self, field.name) for field in fields(Plane)}
+        return Surface(**{**values, 'rms_m': rms_m}, spline=spline)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
