@@ -268,20 +268,10 @@ class Surfels:
             return self.select(row)
         if not 0 <= row < len(self):
             raise IndexError(no_row(int(row), len(self)))
-        return OneSurfel(
-            position=self.position[row],
-            normal=self.normal[row],
-            planarity=float(self.planarity[row]),
-            curvature=float(self.curvature[row]),
-            eigenvalues=self.eigenvalues[row],
-            num_points=int(self.num_points[row]),
-            voxel_index=tuple(self.voxel_index[row].tolist()),
-            thickness=float(self.thickness[row]),
-            normal_sigma=float(self.normal_sigma[row]),
-            radius=float(self.radius[row]),
-            num_scans=int(self.num_scans[row]),
-            size=float(self.size[row]),
-        )
+        values = {name: getattr(self, name)[row] for name in OneSurfel._fields}
+        numbers = {name: value.item() for name, value in values.items() if value.ndim == 0}
+        index = tuple(values['voxel_index'].tolist())
+        return OneSurfel(**{**values, **numbers, 'voxel_index': index})
 
     def __iter__(self) -> Iterator[OneSurfel]:
         """Yield the surfels one by one."""
@@ -482,15 +472,9 @@ def surfel_columns(surfels: Surfels) -> Columns:
     If the map sums them, also the mean intensity, and the mean colour packed as RViz draws it;
     last the covariance, if the surfels have it.
     """
-    values = {
-        **dict(zip('xyz', surfels.position.T, strict=True)),
-        **dict(zip(('normal_x', 'normal_y', 'normal_z'), surfels.normal.T, strict=True)),
-        'curvature': surfels.curvature,
-        'planarity': surfels.planarity,
-    }
-    columns: Columns = {}
-    for name, column in values.items():
-        columns[name] = column.astype(np.float32)
+    values = surfels._columns()
+    names = ('x', 'y', 'z', 'normal_x', 'normal_y', 'normal_z', 'curvature', 'planarity')
+    columns: Columns = {name: values[name].astype(np.float32) for name in names}
     columns['num_points'] = surfels.num_points.astype(np.uint32)
     columns |= quality_columns(surfels)
     if 'intensity' in surfels.channels:
@@ -498,9 +482,7 @@ def surfel_columns(surfels: Surfels) -> Columns:
     if 'red' in surfels.channels:
         channels = (surfels.channels[name] for name in ('red', 'green', 'blue'))
         columns['rgb'] = packed_rgb(*channels)
-    if surfels.covariance is not None:
-        columns |= covariance_columns(surfels)
-    return columns
+    return columns | covariance_columns(surfels)
 
 
 def quality_columns(surfels: Surfels) -> Columns:
