@@ -37,7 +37,7 @@ from surfel_mapper.arguments import as_array, as_numbers, as_whole
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import hashing, layout
 from surfel_mapper.mapping.channels import channel_names
-from surfel_mapper.mapping.kernels.queries import keys_in_box, rows_held
+from surfel_mapper.mapping.kernels.queries import keys_in_box
 from surfel_mapper.mapping.kernels.rows import read_counts, read_rows
 from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
@@ -76,6 +76,9 @@ Arrays = tuple[npt.NDArray[Any], ...]
 
 LEAST = 1 << 18
 """Minimum capacity of the change log, rows; 1 MiB."""
+
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+"""2^64 over the golden ratio, odd."""
 
 
 class VoxelTable:
@@ -276,11 +279,20 @@ class VoxelTable:
         return np.asarray(keys_in_box(self.rows.array, used, low, high), np.int64)
 
     def thinned(self, min_points: int, at_most: int) -> npt.NDArray[np.int32]:
-        """Return at most at_most rows of at least min_points points, sorted."""
-        used = self._hash.rows_used
-        chosen, mixed = np.empty(used, np.int32), np.empty(used, np.uint64)
-        num = rows_held(self.rows.array, used, max(min_points, 1), chosen, mixed)
-        return np.asarray(chosen[smallest(mixed[:num], at_most)])
+        """
+        Return at most at_most rows of at least min_points points, sorted.
+
+        They are those of the smallest mixed keys, so the choice does not depend on the order of
+        insertion, and most rows stay chosen as the map grows.
+        """
+        rows = self.occupied(min_points)
+        if len(rows) <= at_most:
+            return rows
+        mixed = self.keys(rows).view(np.uint64)
+        for _ in range(2):  # afterwards neighbouring voxels differ in all bits
+            mixed = mixed * GOLDEN
+            mixed ^= mixed >> np.uint64(29)
+        return np.sort(rows[np.argpartition(mixed * GOLDEN, at_most)[:at_most]])
 
     def _subtract(
         self, moments: Arrays, rows: npt.NDArray[np.int32], min_points: int
@@ -386,13 +398,6 @@ def kernel_arrays(moments: ScanMoments) -> tuple[Arrays, Arrays]:
 def stamp_of(version: int) -> int:
     """Return the stamp of rows that a version changed; see kernels/layout.py."""
     return version << 1 & layout.STAMPS
-
-
-def smallest(mixed: npt.NDArray[np.uint64], number: int) -> npt.NDArray[np.int64]:
-    """Return the sorted indices of the ``number`` smallest values, or of all if fewer."""
-    if len(mixed) <= number:
-        return np.arange(len(mixed))
-    return np.sort(np.argpartition(mixed, number - 1)[:number])
 
 
 class MomentMap:
@@ -534,8 +539,7 @@ class MomentMap:
         self._check_lattice(moments)
         if moments.num_reduced is None:
             check_possible(moments)
-        if type(min_points) is not int:
-            min_points = as_whole('min_points', min_points)
+        min_points = as_whole('min_points', min_points)
         self.version += 1
         try:
             missing, rows, fallen = self._table.remove(moments, self.version, min_points)

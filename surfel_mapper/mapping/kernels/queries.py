@@ -1,13 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Select rows of the slab: by box, and by the hash of the voxel key.
+"""Keys of the voxels in a box, and the newest stamps of voxels."""
 
-By hash: a thinned selection holds the voxels whose mixed keys are below a limit, and no others. So
-the key alone tells whether a voxel may be selected, without a look-up.
-"""
-
-from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, U
@@ -15,9 +9,6 @@ from surfel_mapper.kernels.grouping import find_key, hash_shift
 from surfel_mapper.kernels.layout import KEY
 from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.mapping.kernels.rows import count_of, first_word
-
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-"""2^64 over the golden ratio, odd."""
 
 
 @kernel()
@@ -34,37 +25,6 @@ def keys_in_box(rows, used, low, high):
             kept[num] = key
             num += 1
     return kept[:num].copy()
-
-
-@njit(cache=True, nogil=True, inline='always')
-def mix(key):
-    """Return the mixed key of a voxel, uint64; neighbouring voxels differ in all bits."""
-    mixed = np.uint64(key) * _GOLDEN
-    mixed ^= mixed >> np.uint64(29)
-    mixed *= _GOLDEN
-    mixed ^= mixed >> np.uint64(29)
-    return mixed * _GOLDEN
-
-
-@kernel()
-def rows_held(rows, used, min_points, chosen, mixed):
-    """
-    List the rows of at least min_points points with their mixed keys; return their number.
-
-    rows    (R, 12) int64, the slab
-    used    number of rows ever used
-    chosen  (R,) int32, out
-    mixed   (R,) uint64, out
-    """
-    flat = rows.ravel()
-    num = 0
-    for row in range(used):
-        at = first_word(row)
-        if count_of(flat, at) >= min_points:
-            chosen[num] = row
-            mixed[num] = mix(flat[at + U(KEY)])
-            num += 1
-    return num
 
 
 @kernel()
