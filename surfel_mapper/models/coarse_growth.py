@@ -76,7 +76,9 @@ def grow_coarse(
     shape: Shape,
     size_m: float,
     rules: CoarseRules,
+    *,
     facets: ModelsConfig | None = None,
+    joins: bool = True,
 ) -> Shape:
     """
     Grow planes over free points, join patches, and return the normals and curvature of these.
@@ -95,53 +97,14 @@ def grow_coarse(
         The other rules.
     facets : ModelsConfig, optional
         Settings of facets, which are grown from free points if given.
+    joins : bool
+        Whether patches are joined. Single points far from a sensor are tens of metres apart, and
+        in voxels as large patches of all kinds touch, so that joins are wrong as often as not.
 
     """
     coarse = thin(points, size_m).by_voxel()
-    old_owner = owner[coarse.rows]
-    new_owner, (normals, curved) = extended(coarse, old_owner, shape, size_m, rules, facets)
-    pieces = pieces_of(coarse, owner_table(coarse, new_owner), len(normals))
-    view = beyond(pieces, normals) if rules.view is None else rules.view
-    index, normals, bent = join_patches(pieces, view, rules.noise, rules.finest_m)
-    # coarse voxels resolve less: a curved patch stays so, unless a larger plane takes it
-    counts = np.bincount(new_owner[new_owner >= 0], minlength=len(curved))
-    total = np.bincount(index, counts, len(normals))
-    curved = bent | (2.0 * np.bincount(index, counts * curved, len(normals)) > total)
-    owner[coarse.rows] = np.where(new_owner < 0, old_owner, np.append(index, 0)[new_owner])
-    return normals, curved
-
-
-def extend_coarse(
-    points: npt.NDArray[Any],
-    owner: Owners,
-    shape: Shape,
-    size_m: float,
-    rules: CoarseRules,
-    facets: ModelsConfig | None = None,
-) -> Shape:
-    """
-    Grow planes over free points; parameters and result are those of grow_coarse.
-
-    Joins no patches: single points far from a sensor are tens of metres apart, and in voxels as
-    large patches of all kinds touch, so that joins are wrong as often as not.
-    """
-    coarse = thin(points, size_m).by_voxel()
-    old_owner = owner[coarse.rows]
-    new_owner, shape = extended(coarse, old_owner, shape, size_m, rules, facets)
-    owner[coarse.rows] = np.where(new_owner < 0, old_owner, new_owner)
-    return shape
-
-
-def extended(
-    coarse: VoxelPoints,
-    owner: Owners,
-    shape: Shape,
-    size_m: float,
-    rules: CoarseRules,
-    facets: ModelsConfig | None,
-) -> tuple[Owners, Shape]:
-    """Return the patches of points by voxel, -1 for none, after growth; see grow_coarse."""
-    (normals, curved), new_owner = shape, np.maximum(owner, -1)
+    (normals, curved), old_owner = shape, owner[coarse.rows]
+    new_owner = np.maximum(old_owner, -1)
     if size_m > rules.finest_m:
         extend_planes(coarse, new_owner, curved, (size_m, rules.tolerance_m))
     if facets is not None:
@@ -149,7 +112,17 @@ def extended(
         facet_normals = add_facets(coarse, new_owner, len(normals), sizes, facets)
         normals = np.concatenate([normals, facet_normals])
         curved = np.append(curved, np.zeros(len(facet_normals), np.bool_))
-    return new_owner, (normals, curved)
+    index: Owners = np.arange(len(normals), dtype=np.int32)
+    if joins:
+        pieces = pieces_of(coarse, owner_table(coarse, new_owner), len(normals))
+        view = beyond(pieces, normals) if rules.view is None else rules.view
+        index, normals, bent = join_patches(pieces, view, rules.noise, rules.finest_m)
+        # coarse voxels resolve less: a curved patch stays so, unless a larger plane takes it
+        counts = np.bincount(new_owner[new_owner >= 0], minlength=len(curved))
+        total = np.bincount(index, counts, len(normals))
+        curved = bent | (2.0 * np.bincount(index, counts * curved, len(normals)) > total)
+    owner[coarse.rows] = np.where(new_owner < 0, old_owner, np.append(index, 0)[new_owner])
+    return normals, curved
 
 
 def facet_tolerance(

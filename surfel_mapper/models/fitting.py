@@ -30,7 +30,6 @@ from surfel_mapper.mapping.moments import are_far_apart, OTHER_UNIT
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.coarse_growth import (
     CoarseRules,
-    extend_coarse,
     grow_coarse,
     SPARSE_SHARE,
 )
@@ -212,9 +211,11 @@ def grow_sparse(
     for factor in SIZES if halves else SIZES[1:]:
         if (owner[voxels.rows] < 0).sum() < max(SPARSE_SHARE * len(growth.owner), 1.0):
             break
-        grown_over = grow_coarse if factor <= MOST_JOINED else extend_coarse
         size_m, joined = factor * config.voxel_size_m, True
-        shape = grown_over(thinned.points, owner, shape, size_m, rules, config)
+        joins = factor <= MOST_JOINED
+        shape = grow_coarse(
+            thinned.points, owner, shape, size_m, rules, facets=config, joins=joins
+        )
     if not joined:
         return growth
     owner = owner[voxels.rows]

@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from surfel_mapper.models.coarse_growth import (
     CoarseRules,
-    extend_coarse,
     grow_coarse,
     SPARSE_SHARE,
 )
@@ -64,7 +63,7 @@ def join_charts(graph: SurfelGraph, owner: Rows) -> Rows:
             break
         normals, curved = grow_coarse(points, patch, (normals, curved), factor * size_m, rules)
     else:
-        extend_coarse(points, patch, (normals, curved), FARTHEST * size_m, rules)
+        grow_coarse(points, patch, (normals, curved), FARTHEST * size_m, rules, joins=False)
     came = np.flatnonzero(was_free & (patch >= 0))
     patch[came[~graph.is_thin(rows[came], normals[patch[came]])]] = -1
     patches[rows] = patch

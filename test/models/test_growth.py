@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfel_mapper.models.coarse_growth import CoarseRules, extend_coarse
+from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse
 from surfel_mapper.models.growth import extend_planes
 from surfel_mapper.models.thinning import thin
 
@@ -49,7 +49,7 @@ def test_planes_grow_over_single_points_far_apart_and_are_not_joined():
     owner[: len(near)] = near[:, 0] > 16.0  # two pieces of one plane
     shape = np.tile([0.0, 0.0, 1.0], (2, 1)), np.zeros(2, np.bool_)
     rules = CoarseRules(COARSE_M, TOLERANCE_M, (NOISE_M, 0.0))
-    normals, curved = extend_coarse(points, owner, shape, 4.0 * COARSE_M, rules)
+    normals, curved = grow_coarse(points, owner, shape, 4.0 * COARSE_M, rules, joins=False)
     assert len(normals) == len(curved) == 2
     np.testing.assert_array_equal(owner[: len(near)], near[:, 0] > 16.0)
     assert (owner[len(near) : -len(above)] >= 0).mean() > 0.9
