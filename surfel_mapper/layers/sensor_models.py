@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,6 @@ class SensorModels:
     def __init__(self, config: TsdfConfig, transforms: TransformBuffer | None = None) -> None:
         self._config = config
         self._transforms = transforms
-        self._cameras: dict[tuple[float, ...], CameraModel] = {}
         self._centered: tuple[Scan, Scan, Transform | None] | None = None
 
     @classmethod
@@ -83,7 +83,8 @@ class SensorModels:
 
     def camera_of(self, scan: Scan) -> CameraModel | None:
         """Return the camera of a scan; None for a cloud of another sensor."""
-        return self._camera(scan.camera) if scan.camera else None
+        ranges = self._config.min_range_m, self._config.max_range_m
+        return camera_model(scan.camera, *ranges) if scan.camera else None
 
     def pose_in(self, scan: Scan) -> Transform | None:
         """
@@ -107,21 +108,21 @@ class SensorModels:
         except PoseError as error:
             raise PoseError(f'layers.tsdf.sensor_frame: {error}') from error
 
-    def _camera(self, numbers: tuple[float, ...]) -> CameraModel:
-        """Return the model of a camera, whose tables of rays are made once."""
-        if numbers not in self._cameras:
-            if len(self._cameras) >= MAX_CAMERAS:
-                del self._cameras[next(iter(self._cameras))]
-            width, height, *pinhole = numbers
-            angles = dict(zip(('fx', 'fy', 'cx', 'cy'), pinhole, strict=True))
-            self._cameras[numbers] = CameraModel(
-                columns=int(width), rows=int(height), **angles, **self._ranges
-            )
-        return self._cameras[numbers]
 
-    @property
-    def _ranges(self) -> dict[str, Any]:
-        return {'min_range_m': self._config.min_range_m, 'max_range_m': self._config.max_range_m}
+@lru_cache(MAX_CAMERAS)
+def camera_model(camera: tuple[float, ...], min_range_m: float, max_range_m: float) -> CameraModel:
+    """Return the model of a camera, whose tables of rays are made once."""
+    columns, rows, fx, fy, cx, cy = camera
+    return CameraModel(
+        columns=int(columns),
+        rows=int(rows),
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        min_range_m=min_range_m,
+        max_range_m=max_range_m,
+    )
 
 
 def seen_from(T_scan_sensor: Transform, scan: Scan) -> Scan:
