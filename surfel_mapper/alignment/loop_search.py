@@ -162,7 +162,8 @@ class LoopSearch:
 
         """
         recognises = self._recognise()
-        progress(f'{len(self._loops)} of {self._num_candidates} recognised places fit')
+        number = len(self._loops) + len(self._refusals)
+        progress(f'{len(self._loops)} of {number} recognised places fit')
         solution = self._solve()
         for _ in range(self._settings.max_rounds):
             num_before = len(self._loops)
@@ -191,10 +192,6 @@ class LoopSearch:
     @property
     def _ordered(self) -> list[Loop]:
         return list(self._loops.values())
-
-    @property
-    def _num_candidates(self) -> int:
-        return len(self._loops) + len(self._refusals)
 
     def _solve(self) -> LoopSolution:
         return solve_loops(self._initial[self.keys], self._ordered, self._settings.drift_ratio)

@@ -395,9 +395,8 @@ class SurfelMap(MomentMap):
             range of the indices.
 
         """
-        shifted = SurfelMap(
-            self.voxel_size_m, columns=self.columns, level=self.level, origin_m=origin_m
-        )
+        shifted = self.emptied()
+        shifted.origin_m = origin_m
         shifted.merge(self)
         return shifted
 
@@ -409,8 +408,9 @@ class SurfelMap(MomentMap):
 
     def copy(self) -> SurfelMap:
         """Return an independent copy."""
-        settings = {'columns': self.columns, 'level': self.level}
-        return _rebuilt(self.voxel_size_m, settings, self.origin_m, self.moments())
+        copied = self.emptied()
+        copied.insert(self.moments())
+        return copied
 
     @classmethod
     def load(cls, path: str | Path) -> SurfelMap:

@@ -252,8 +252,7 @@ class SlidingWindow:
         check_kind('scan', scan, WindowedScan)
         min_points = as_whole('min_points', min_points)
         self._map.insert(scan.moments)
-        self._scans.append((scan, self._travel.add(scan.frame_id, scan.T_map_sensor)))
-        self._nbytes += scan.nbytes
+        self._append(scan)
         evicted, limits = [], self._limits()
         while len(self._scans) > 1 and (limit := self._limit_reached(limits)):
             oldest, _ = self._scans[0]

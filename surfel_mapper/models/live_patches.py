@@ -147,7 +147,8 @@ class PatchFitter:
         normals = mean_normals(graph.flat_normals(every), starts)
         thickness = np.full(len(rows), graph.limit_m)
         samples = PatchPoints(self._points(every), len(STEPS) * starts, normals, thickness)
-        frames, curved = self._frames(samples)
+        rules = thickness, self._surface_pitch_m, True, True
+        _, _, frames, curved = described(samples, np.zeros(3), rules)
         axes = eigen(covariances[~curved])[1]
         frames[~curved] = oriented(axes, normals[~curved])
         positions = graph.position[every]
@@ -244,12 +245,6 @@ class PatchFitter:
         points = graph.position[rows][:, None] + away
         clipped: Array = np.clip(points, low[:, None], low[:, None] + self._size_m)
         return clipped.reshape(-1, 3)
-
-    def _frames(self, groups: PatchPoints) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Return the frames (K, 3, 3) of groups as surfaces, and whether they are curved."""
-        rules = groups.thickness, self._surface_pitch_m, True, True
-        _, _, frames, curved = described(groups, np.zeros(3), rules)
-        return frames, curved
 
     def _steadied(self, previous: list[Tracked | None], groups: Described) -> Array:
         """Return anchors; frames that turned little stay, and are changed in place."""
