@@ -159,8 +159,8 @@ def match(source: Samples, target: Samples, T_target_source: Floats, limits: Lim
         If angles are compared and a scan has no normals.
 
     """
-    moved = _moved(source.position, T_target_source)
-    distance, rows = target.tree.query(moved, distance_upper_bound=limits.max_distance_m)
+    positions = moved(source.position, T_target_source)
+    distance, rows = target.tree.query(positions, distance_upper_bound=limits.max_distance_m)
     chosen = np.flatnonzero(np.isfinite(distance))
     rows = rows[chosen]
     if limits.max_angle_deg < 180.0:
@@ -191,7 +191,7 @@ def surface_weights(
         raise AlignmentError('samples are not surfels: they have no normals')
     i, j = pairs.T
     normal = target.normal[j]
-    gap = _moved(source.position[i], T_target_source) - target.position[j]
+    gap = moved(source.position[i], T_target_source) - target.position[j]
     across_sq = (gap * normal).sum(axis=1) ** 2
     along_sq = (gap * gap).sum(axis=1) - across_sq
     variance = source.variance[i] + target.variance[j] + target.tilt_variance[j] * along_sq
@@ -262,7 +262,8 @@ def loop_candidates(
     return sorted(loops)
 
 
-def _moved(points: Floats, T: Floats) -> Floats:
+def moved(points: Floats, T: Floats) -> Floats:
+    """Return points (N, 3) moved by a transform (4, 4)."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 

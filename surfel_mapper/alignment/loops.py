@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.angles import poses_of, transforms
+from surfel_mapper.alignment.correspondences import moved
 from surfel_mapper.alignment.lum import LUM
 from surfel_mapper.alignment.window import ANCHORS
 from surfel_mapper.errors import AlignmentError
@@ -156,10 +157,10 @@ class _LoopGraph:
         self._rows = []
         for loop in loops:
             self._rows.append(size * len(points[loop.target]))
-            points[loop.target].append(moved(loop.T_target_source, ANCHORS))
+            points[loop.target].append(moved(ANCHORS, loop.T_target_source))
         steps = [compose(inverse(T_map_key[v]), T_map_key[v - 1]) for v in range(1, num)]
         for v, T_v_before in enumerate(steps, start=1):
-            points[v].append(moved(T_v_before, ANCHORS))
+            points[v].append(moved(ANCHORS, T_v_before))
         start = poses_of(inverse(self._T_map_first) @ T_map_key, np.zeros((num, 6)))
         self._lum = LUM(max_iterations=STEPS)
         for v in range(num):
@@ -190,14 +191,9 @@ class _LoopGraph:
         result = np.empty(len(self._loops))
         for row, loop in enumerate(self._loops):
             T_target_source = compose(inverse(T[loop.target]), T[loop.source])
-            gap = moved(T_target_source, ANCHORS) - moved(loop.T_target_source, ANCHORS)
+            gap = moved(ANCHORS, T_target_source) - moved(ANCHORS, loop.T_target_source)
             result[row] = (gap * gap).sum() / (len(ANCHORS) * LOOP_SIGMA_M**2)
         return result
-
-
-def moved(T: Transform, points: Floats) -> Floats:
-    """Return points (N, 3) moved by a transform."""
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 
 def _weights(sigma_m: float) -> Floats:

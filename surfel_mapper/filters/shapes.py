@@ -32,6 +32,7 @@ from surfel_mapper.filters.columns import (
     MEAN_DISTS,
     NORMALS,
 )
+from surfel_mapper.filters.descriptors import unit
 from surfel_mapper.filters.kernels.shapes import group_moments, neighbour_moments
 from surfel_mapper.filters.neighbours import (
     coordinates,
@@ -167,13 +168,6 @@ def eigen_by_size(matrices: Points) -> tuple[Points, Points]:
 def as_matrices(rows: Points) -> Points:
     """Return symmetric matrices (M, 3, 3) from their rows in the order of PAIRS, (6, M)."""
     return np.asarray(rows[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3))
-
-
-def unit(vectors: Points) -> Points:
-    """Return vectors (..., 3) scaled to unit length; those of length 0 become nan."""
-    lengths = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
-    units = np.divide(vectors, lengths, out=np.full_like(vectors, np.nan), where=lengths > 0.0)
-    return np.asarray(units, np.float64)
 
 
 def shares(values: Points) -> Points:
