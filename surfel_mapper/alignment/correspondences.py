@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -262,7 +263,7 @@ def loop_candidates(
     return sorted(loops)
 
 
-def moved(points: Floats, T: Floats) -> Floats:
+def moved(points: npt.NDArray[Any], T: Floats) -> Floats:
     """Return points (N, 3) moved by a transform (4, 4)."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.alignment.correspondences import moved
 from surfel_mapper.alignment.kernels.edges import (
-    fit_residual,
     NUM_MOMENTS,
     NUM_WEIGHTED,
     pair_moments,
@@ -151,8 +151,12 @@ class Graph:
         """Return the squared residual gaps after motions (E, 6) about centers, (E,) m^2."""
         result = np.zeros(len(self._edges))
         for row, ((s, t), edge) in enumerate(self._edges.items()):
-            about = (T_source[row], T_target[row], center[row], motion[row])
-            result[row] = fit_residual(self._points[s], self._points[t], edge.pairs, *about)
+            a = moved(self._points[s][edge.pairs[:, 0]], T_source[row])
+            b = moved(self._points[t][edge.pairs[:, 1]], T_target[row])
+            arms = 0.5 * (a + b) - center[row]
+            gaps = a - b - motion[row, :3] - np.cross(motion[row, 3:], arms)
+            squares = (gaps * gaps).sum(axis=1)
+            result[row] = squares[np.isfinite(squares)].sum()
         return result
 
     def _sum(self, ends: tuple[int, int], edge: Edge) -> Floats:

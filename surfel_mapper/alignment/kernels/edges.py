@@ -107,43 +107,6 @@ def pair_moments(source, target, pairs, moments):
 
 
 @njit(cache=True, nogil=True)
-def fit_residual(source, target, pairs, T_source, T_target, center, motion):
-    """
-    Return the sum of |z - t - w x (c - center)|^2 over the pairs; see alignment/edge_terms.py.
-
-    source   (N, 3) float32 or float64, m
-    target   (M, 3) float32 or float64, m
-    pairs    (K, 2) int32
-    T_source, T_target  (4, 4) float64, from the frames of source and target to that of the map
-    center   (3,) float64, m
-    motion   (6,) float64, t and w
-    """
-    total = 0.0
-    R, Q = T_source, T_target
-    t, w = motion[:3], motion[3:]
-    for k in range(len(pairs)):
-        p, q = source[pairs[k, 0]], target[pairs[k, 1]]
-        px, py, pz = float(p[0]), float(p[1]), float(p[2])
-        qx, qy, qz = float(q[0]), float(q[1]), float(q[2])
-        if not (math.isfinite(px + py + pz) and math.isfinite(qx + qy + qz)):
-            continue
-        ax = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + R[0, 3]
-        ay = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + R[1, 3]
-        az = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + R[2, 3]
-        bx = Q[0, 0] * qx + Q[0, 1] * qy + Q[0, 2] * qz + Q[0, 3]
-        by = Q[1, 0] * qx + Q[1, 1] * qy + Q[1, 2] * qz + Q[1, 3]
-        bz = Q[2, 0] * qx + Q[2, 1] * qy + Q[2, 2] * qz + Q[2, 3]
-        cx = 0.5 * (ax + bx) - center[0]
-        cy = 0.5 * (ay + by) - center[1]
-        cz = 0.5 * (az + bz) - center[2]
-        rx = ax - bx - t[0] - (w[1] * cz - w[2] * cy)
-        ry = ay - by - t[1] - (w[2] * cx - w[0] * cz)
-        rz = az - bz - t[2] - (w[0] * cy - w[1] * cx)
-        total += rx * rx + ry * ry + rz * rz
-    return total
-
-
-@njit(cache=True, nogil=True)
 def weighted_moments(source, target, pairs, weights, moments):
     """
     Sum the moments of weighted pairs of points; see ``pair_moments``.
