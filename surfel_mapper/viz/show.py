@@ -17,7 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.files.trajectory import Trajectory
+from surfel_mapper.mapping.channels import CHANNELS
 from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.contents import Content
 from surfel_mapper.viz.detail import DetailedMap
@@ -77,7 +79,8 @@ def show_contents(
     origin_m = shared_origin(contents)
     scene.set_origin(origin_m)
     looked_at = np.asarray(place_of(contents) if target is None else target, np.float64) - origin_m
-    tiles, about = all_discs(contents, origin_m, looked_at, most_discs, min_points)
+    with_ages = colouring == 'age'
+    tiles, about = all_discs(contents, origin_m, looked_at, (most_discs, min_points, with_ages))
     if any(map(len, tiles.values())):
         scene.colouring = Colouring.over(colouring, list(tiles.values()))
     positions = [discs.position for discs in tiles.values()]
@@ -107,9 +110,23 @@ def show_contents(
 
 
 def all_discs(
-    contents: Sequence[Content], origin_m: Array, target: Array, most_discs: int, min_points: int
+    contents: Sequence[Content], origin_m: Array, target: Array, limits: tuple[int, int, bool]
 ) -> tuple[dict[str, DrawnDiscs], dict[str, str]]:
-    """Return the discs of maps and surfels by path, and a sentence about each by name."""
+    """
+    Return the discs of maps and surfels by path, and a sentence about each by name.
+
+    Parameters
+    ----------
+    contents : sequence of Content
+        The maps and surfels; others are passed over.
+    origin_m, target : (3,) float64, m
+        Origin of the scene in the fixed frame, and the position looked at in the scene.
+    limits : (int, int, bool)
+        Limit of the discs of all maps, least points of a voxel, and whether ages are shown, which
+        voxels have and adaptive surfels do not.
+
+    """
+    most_discs, min_points, with_ages = limits
     num_maps = sum(isinstance(content.shape, ScanMoments) for content in contents)
     tiles: dict[str, DrawnDiscs] = {}
     about: dict[str, str] = {}
@@ -118,14 +135,31 @@ def all_discs(
         if isinstance(shape, ScanMoments):
             whole = DetailedMap(shape, min_points)
             level = whole.choose(target - shift_m, most_discs // num_maps)
-            tiles.update(map_tiles(content, whole, level, shift_m))
             about[content.name] = map_text(whole, level, shape.voxel_size_m)
+            if level.any() or with_ages or shape.level:
+                tiles.update(map_tiles(content, whole, level, shift_m))
+            else:
+                discs = adaptive_discs(shape, min_points)
+                tiles[f'map/{content.name}'] = moved(discs, shift_m)
+                about[content.name] += f', shown as {len(discs):,} adaptive ones'
         elif isinstance(shape, DrawnDiscs):
-            position = shape.position + shift_m
-            tiles[f'map/{content.name}'] = replace(shape, position=position, grid_m=shift_m)
+            tiles[f'map/{content.name}'] = moved(shape, shift_m)
             text = f'{len(shape):,} surfels, without their moments: at one level of detail'
             about[content.name] = text
     return tiles, about
+
+
+def adaptive_discs(moments: ScanMoments, min_points: int) -> DrawnDiscs:
+    """Return the adaptive surfels of the moments of a map as discs, in the frame of the map."""
+    has = [name for name, channels in CHANNELS.items() if channels[0] in moments.channel_names]
+    surfel_map = SurfelMap(moments.voxel_size_m, columns=tuple(has))
+    surfel_map.insert(moments)
+    return DrawnDiscs.of(surfel_map.adaptive(min_points), [])
+
+
+def moved(discs: DrawnDiscs, shift_m: Array) -> DrawnDiscs:
+    """Return discs in the frame of the scene, which is that of the map shifted."""
+    return replace(discs, position=discs.position + shift_m, grid_m=shift_m)
 
 
 def map_tiles(
@@ -137,9 +171,7 @@ def map_tiles(
         name = 'tile_{}_{}'.format(*whole.tiles[tile]).replace('-', 'm')
         discs = DrawnDiscs.of(surfels, [] if level[tile] else content.scans)
         values = {**discs.values, 'level': np.full(len(discs), level[tile])}
-        position = discs.position + shift_m
-        moved = replace(discs, position=position, values=values, grid_m=shift_m)
-        tiles[f'map/{content.name}/{name}'] = moved
+        tiles[f'map/{content.name}/{name}'] = moved(replace(discs, values=values), shift_m)
     return tiles
 
 

@@ -78,7 +78,7 @@ def in_order(rows):
 
 
 @pytest.mark.parametrize('name', ['map.npz', 'map.parquet', 'tiles'])
-def test_exact_maps_are_shown_by_all_their_surfels(tmp_path, name):
+def test_exact_maps_are_shown_by_their_adaptive_surfels(tmp_path, name):
     surfel_map = ground_map()
     if name == 'tiles':
         path = tmp_path / 'out'
@@ -88,7 +88,8 @@ def test_exact_maps_are_shown_by_all_their_surfels(tmp_path, name):
         surfel_map.save(path)
     found = shown(tmp_path, path)
 
-    surfels = surfel_map.surfels(5)
+    surfels = surfel_map.adaptive(5)
+    assert len(surfels) < surfel_map.num_surfels(5)
     places = together(found, '/map/', 'Points3D:positions')
     np.testing.assert_allclose(
         in_order(places), in_order(surfels.position.astype(np.float32)), atol=1e-6
@@ -132,7 +133,7 @@ def test_files_of_a_replay_share_the_frame_of_the_map_far_from_zero(tmp_path):
     fixed = np.stack(
         [together(found, '/map/surfels', f'fixed_{axis}_m') for axis in 'xyz'], axis=1
     )
-    expected = surfel_map.surfels(5).position + UTM
+    expected = surfel_map.adaptive(5).position + UTM
     np.testing.assert_allclose(in_order(fixed), in_order(expected), atol=1e-9, rtol=0)
     np.testing.assert_array_equal(found['/map']['origin_m'], UTM)
     corners = np.array(found['/map/mesh']['Mesh3D:vertex_positions'])
@@ -232,9 +233,9 @@ def test_several_maps_are_shown_by_the_names_of_their_directories(tmp_path):
         ground_map(columns=('intensity',)).save(tmp_path / name / 'map.npz')
     found = shown(tmp_path, tmp_path / 'monday', tmp_path / 'tuesday', '--color', 'intensity')
     for name in ('monday', 'tuesday'):
-        assert len(
-            together(found, f'/map/{name}/surfels', 'intensity')
-        ) == ground_map().num_surfels(5)
+        assert len(together(found, f'/map/{name}/surfels', 'intensity')) == len(
+            ground_map().adaptive(5)
+        )
 
 
 def test_a_bag_is_mapped_while_it_is_shown(tmp_path):
@@ -271,5 +272,5 @@ def test_a_colour_that_nothing_has_is_refused(tmp_path, capsys):
         str(tmp_path / 'a.rrd'),
     ]
     assert main(arguments) == 1
-    expected = 'nothing shown has it; its values: curvature, level, normal_sigma'
+    expected = 'nothing shown has it; its values: curvature, normal_sigma'
     assert f"colouring 'rgb': {expected}" in capsys.readouterr().err
