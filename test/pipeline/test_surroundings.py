@@ -37,10 +37,12 @@ def is_near(primitive, place):
     return away_m < LIDAR.max_range_m + 40.0
 
 
-def mapped(name, at_rest=False, num_scans=34):
+def mapped(name, at_rest=False, num_scans=34, rate_hz=10.0):
     """Return the mapper of the scans of a scenario by registration, and the errors of poses, m."""
     driven = scenarios_in_view()[name]
-    scenario = replace(driven, num_scans=num_scans, lidar=replace(LIDAR, columns=512))
+    scenario = replace(
+        driven, num_scans=num_scans, lidar=replace(LIDAR, columns=512, rate_hz=rate_hz)
+    )
     if at_rest:
         scenario = replace(scenario, course=lambda time_s: driven.course(0.0))
     mapper = Mapper(Config.from_mapping({'pose.source': 'registration'}))
@@ -78,3 +80,9 @@ def test_trucks_that_come_do_not_pull_the_poses_along():
     spent = summary['registration']['tracking']['surrounded']
     assert spent['scans'] >= 20
     assert f'{spent["first_s"]:.3f} to {spent["last_s"]:.3f} s' in uncertain_text(summary)
+
+
+def test_trucks_that_come_between_a_few_scans_are_reported():
+    mapper, errors_m = mapped('9 trucks that come', num_scans=27, rate_hz=10.0 / 3.0)
+    assert max(errors_m) > 10.0  # they are taken for a sudden stop
+    assert 'most surfaces seem to move with the sensor' in uncertain_text(mapper.summary())
