@@ -48,7 +48,7 @@ GENERAL_NAMES = re.compile(
 )
 """Names that say nothing of the value."""
 
-MOST_GENERAL = 20.0
+MOST_GENERAL = 5.0
 """General names allowed in 1,000 lines of code; 1 to 10 in rosbags, KISS-ICP, httpx and attrs."""
 
 NO_CODE = {
