@@ -165,44 +165,51 @@ def eigenvectors(matrices, values, smallest, vectors):
     smallest  (3, M) float64, unit eigenvectors of values[0]
     vectors   (M, 3, 3) float64, out: vectors[:, k] belong to values[k], are of unit length, and
               their component of largest magnitude is positive; nan where all values are 0
+    """
+    for i in range(matrices.shape[1]):
+        if values[2, i] > 0.0:
+            write_frame(matrices[:, i], smallest[:, i], vectors[i])
+        else:
+            vectors[i, :, :] = math.nan
+
+
+@inlined(error_model='numpy')
+def write_frame(matrix, smallest, vectors):
+    """
+    Write the three eigenvectors of a matrix, given the one of its smallest eigenvalue.
 
     In the plane across the smallest, the matrix is 2 by 2; its larger eigenvector follows from a
     square root. The third is the cross product of both.
     """
-    for i in range(matrices.shape[1]):
-        if not values[2, i] > 0.0:
-            vectors[i, :, :] = math.nan
-            continue
-        xx, xy, xz = matrices[0, i], matrices[1, i], matrices[2, i]
-        yy, yz, zz = matrices[3, i], matrices[4, i], matrices[5, i]
-        nx, ny, nz = smallest[0, i], smallest[1, i], smallest[2, i]
-        # u and w: a basis across n (Duff et al. 2017)
-        sign = 1.0 if nz >= 0.0 else -1.0
-        a = -1.0 / (sign + nz)
-        b = nx * ny * a
-        ux, uy, uz = 1.0 + sign * nx * nx * a, sign * b, -sign * nx
-        wx, wy, wz = b, sign + ny * ny * a, -ny
-        pux, puy = (xx * ux + xy * uy) + xz * uz, (xy * ux + yy * uy) + yz * uz
-        puz = (xz * ux + yz * uy) + zz * uz
-        pwx, pwy = (xx * wx + xy * wy) + xz * wz, (xy * wx + yy * wy) + yz * wz
-        pwz = (xz * wx + yz * wy) + zz * wz
-        uu, uw = (ux * pux + uy * puy) + uz * puz, (wx * pux + wy * puy) + wz * puz
-        ww = (wx * pwx + wy * pwy) + wz * pwz
-        half = 0.5 * (uu - ww)
-        scale = max(abs(half), abs(uw))  # the squares of tiny values underflow
-        equal = scale == 0.0  # any direction will do
-        half, uw = (1.0, 0.0) if equal else (half / scale, uw / scale)
-        spread = math.sqrt(half * half + uw * uw)
-        cosine, sine = half / spread, uw / spread
-        # cosine and sine of half of the angle, scaled
-        first = 1.0 + cosine if cosine >= 0.0 else sine
-        second = sine if cosine >= 0.0 else 1.0 - cosine
-        length = math.sqrt(first * first + second * second)
-        first, second = first / length, second / length
-        lx, ly, lz = first * ux + second * wx, first * uy + second * wy, first * uz + second * wz
-        store(vectors, i, 0, nx, ny, nz)
-        store(vectors, i, 1, ny * lz - nz * ly, nz * lx - nx * lz, nx * ly - ny * lx)
-        store(vectors, i, 2, lx, ly, lz)
+    xx, xy, xz, yy, yz, zz = matrix[0], matrix[1], matrix[2], matrix[3], matrix[4], matrix[5]
+    nx, ny, nz = smallest[0], smallest[1], smallest[2]
+    # u and w: a basis across n (Duff et al. 2017)
+    sign = 1.0 if nz >= 0.0 else -1.0
+    a = -1.0 / (sign + nz)
+    b = nx * ny * a
+    ux, uy, uz = 1.0 + sign * nx * nx * a, sign * b, -sign * nx
+    wx, wy, wz = b, sign + ny * ny * a, -ny
+    pux, puy = (xx * ux + xy * uy) + xz * uz, (xy * ux + yy * uy) + yz * uz
+    puz = (xz * ux + yz * uy) + zz * uz
+    pwx, pwy = (xx * wx + xy * wy) + xz * wz, (xy * wx + yy * wy) + yz * wz
+    pwz = (xz * wx + yz * wy) + zz * wz
+    uu, uw = (ux * pux + uy * puy) + uz * puz, (wx * pux + wy * puy) + wz * puz
+    ww = (wx * pwx + wy * pwy) + wz * pwz
+    half = 0.5 * (uu - ww)
+    scale = max(abs(half), abs(uw))  # the squares of tiny values underflow
+    equal = scale == 0.0  # any direction will do
+    half, uw = (1.0, 0.0) if equal else (half / scale, uw / scale)
+    spread = math.sqrt(half * half + uw * uw)
+    cosine, sine = half / spread, uw / spread
+    # cosine and sine of half of the angle, scaled
+    first = 1.0 + cosine if cosine >= 0.0 else sine
+    second = sine if cosine >= 0.0 else 1.0 - cosine
+    length = math.sqrt(first * first + second * second)
+    first, second = first / length, second / length
+    lx, ly, lz = first * ux + second * wx, first * uy + second * wy, first * uz + second * wz
+    store(vectors[0], nx, ny, nz)
+    store(vectors[1], ny * lz - nz * ly, nz * lx - nx * lz, nx * ly - ny * lx)
+    store(vectors[2], lx, ly, lz)
 
 
 @kernel()
@@ -215,13 +222,13 @@ def smallest_vectors(values, smallest, vectors):
     """
     for i in range(len(vectors)):
         if values[2, i] > 0.0:
-            store(vectors, i, 0, smallest[0, i], smallest[1, i], smallest[2, i])
+            store(vectors[i, 0], smallest[0, i], smallest[1, i], smallest[2, i])
         else:
             vectors[i, :, :] = math.nan
 
 
 @njit(cache=True, nogil=True, inline='always')
-def store(vectors, i, k, x, y, z):
+def store(vector, x, y, z):
     """Store a vector with its component of largest magnitude, the first of equal ones, > 0."""
     leading = x
     if abs(y) > abs(leading):
@@ -229,4 +236,4 @@ def store(vectors, i, k, x, y, z):
     if abs(z) > abs(leading):
         leading = z
     side = -1.0 if leading < 0.0 else 1.0
-    vectors[i, k, 0], vectors[i, k, 1], vectors[i, k, 2] = side * x, side * y, side * z
+    vector[0], vector[1], vector[2] = side * x, side * y, side * z

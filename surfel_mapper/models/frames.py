@@ -54,7 +54,7 @@ def means_and_scatters(
 def eigen(matrices: Array) -> tuple[Array, Array]:
     """Return eigenvalues (K, 3), ascending, and their vectors as rows of (K, 3, 3)."""
     values, vectors = np.empty((len(matrices), 3)), np.empty((len(matrices), 3, 3))
-    eigen_frames(matrices.copy(), values, vectors)
+    eigen_frames(matrices, values, vectors)
     return values, vectors
 
 

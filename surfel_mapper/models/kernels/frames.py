@@ -1,87 +1,30 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Moments of points, and the frames of clusters, facets and surfels from their eigenvectors.
-
-Source: Golub and Van Loan, Matrix Computations, section 8.5 (Jacobi's method).
-"""
-
-import math
+"""Moments of points, and the frames of clusters, facets and surfels from their eigenvectors."""
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import inlined, kernel
-
-NOISE = 1e-15
-"""Eigenvalues below this share of the trace are rounding errors, and become 0."""
-
-MOST_SWEEPS = 8
-"""Jacobi rotations of each pair of axes; the error is squared with each, so five suffice."""
+from surfel_mapper.kernels.compiling import kernel
+from surfel_mapper.kernels.symmetric3 import decompose_one, write_frame
 
 LEAST_WIDTH = 0.04
 """A surfel with a smaller ratio of the tangential variances is a line: no reliable normal."""
 
 
-@inlined(error_model='numpy')
-def rotate_axes(matrix, vectors, p, q):
-    """Turn two axes so that element p, q of a matrix becomes 0; vectors are turned alike."""
-    theta = 0.5 * (matrix[q, q] - matrix[p, p]) / matrix[p, q]
-    tangent = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
-    tangent = -tangent if theta < 0.0 else tangent
-    cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
-    sine = tangent * cosine
-    matrix[p, p] -= tangent * matrix[p, q]
-    matrix[q, q] += tangent * matrix[p, q]
-    r = 3 - p - q
-    a, b = matrix[r, p], matrix[r, q]
-    matrix[p, q] = matrix[q, p] = 0.0
-    matrix[r, p] = matrix[p, r] = cosine * a - sine * b
-    matrix[r, q] = matrix[q, r] = sine * a + cosine * b
-    for j in range(3):
-        a, b = vectors[p, j], vectors[q, j]
-        vectors[p, j], vectors[q, j] = cosine * a - sine * b, sine * a + cosine * b
-
-
 @kernel(error_model='numpy')
 def eigen_frame(matrix, values, vectors):
     """
-    Decompose one matrix by Jacobi rotations.
+    Decompose a symmetric positive semidefinite matrix.
 
-    matrix   (3, 3) float64, symmetric, positive semidefinite; is overwritten
-    values   (3,) float64, out: ascending, none negative
-    vectors  (3, 3) float64, out: row k is the unit eigenvector of values[k], its component of
-             largest magnitude positive; the identity if all values are 0
-
-    kernels/symmetric3.py is faster for many matrices, but compiles five times as long, and each
-    kernel that calls this compiles it.
+    matrix   (3, 3) float64
+    values   (3,) float64, out: ascending, 0 below the rounding of the trace
+    vectors  (3, 3) float64, out: unit vectors in rows; the component of largest magnitude positive
     """
-    for i in range(3):
-        for j in range(3):
-            vectors[i, j] = 1.0 if i == j else 0.0
-    noise = NOISE * (matrix[0, 0] + matrix[1, 1] + matrix[2, 2])
-    zeros = 0
-    for turn in range(3 * MOST_SWEEPS):
-        p, q = turn % 3, (turn + 1) % 3
-        if abs(matrix[p, q]) > 1e-3 * noise:
-            rotate_axes(matrix, vectors, p, q)
-            zeros = 0
-        zeros += 1
-        if zeros == 3:
-            break
-    for i in range(3):
-        values[i] = matrix[i, i] if matrix[i, i] >= noise else 0.0
-    for turn in range(3):
-        i = turn % 2
-        if values[i] > values[i + 1]:
-            values[i], values[i + 1] = values[i + 1], values[i]
-            for j in range(3):
-                vectors[i, j], vectors[i + 1, j] = vectors[i + 1, j], vectors[i, j]
-    for i in range(3):
-        leading = 0.0
-        for j in range(3):
-            leading = vectors[i, j] if abs(vectors[i, j]) > abs(leading) else leading
-        for j in range(3):
-            vectors[i, j] = -vectors[i, j] if leading < 0.0 else vectors[i, j]
+    xx, xy, xz = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    yy, yz, zz = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    eigenvalues, normal = decompose_one(xx, xy, xz, yy, yz, zz)
+    values[0], values[1], values[2] = eigenvalues
+    write_frame((xx, xy, xz, yy, yz, zz), normal, vectors)
 
 
 @kernel(error_model='numpy')

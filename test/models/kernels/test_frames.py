@@ -27,7 +27,7 @@ def test_a_frame_holds_all_eigenvectors_of_one_matrix(call, axes, scale):
     matrices = with_spectrum(spectrum, seed=9)
     for matrix in matrices:
         values, vectors = np.empty(3), np.empty((3, 3))
-        call(eigen_frame, matrix.copy(), values, vectors)
+        call(eigen_frame, matrix, values, vectors)
         np.testing.assert_allclose(values, np.linalg.eigvalsh(matrix), atol=1e-12 * values[2])
         np.testing.assert_allclose(vectors @ vectors.T, np.eye(3), atol=1e-12)
         np.testing.assert_allclose((vectors.T * values) @ vectors, matrix, atol=1e-12 * values[2])
