@@ -539,7 +539,8 @@ class MomentMap:
         self._check_lattice(moments)
         if moments.num_reduced is None:
             check_possible(moments)
-        min_points = as_whole('min_points', min_points)
+        if type(min_points) is not int:
+            min_points = as_whole('min_points', min_points)
         self.version += 1
         try:
             missing, rows, fallen = self._table.remove(moments, self.version, min_points)

@@ -274,10 +274,13 @@ class SurfelMap(MomentMap):
             With the covariances of the points.
 
         """
-        least = max(as_whole('min_points', min_points), 1)
+        if type(min_points) is not int:
+            min_points = as_whole('min_points', min_points)
         if since is None:
             since, self._reported = max(self._reported, self.cleared_at), self.version
-        since = as_whole('since', since)
+        elif type(since) is not int:
+            since = as_whole('since', since)
+        least = max(min_points, 1)
         changed = self._changes.since(since, self._table, least)
         if changed is None:
             changed = self._table.changed_after(since, least)

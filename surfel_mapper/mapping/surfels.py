@@ -472,9 +472,15 @@ def surfel_columns(surfels: Surfels) -> Columns:
     If the map sums them, also the mean intensity, and the mean colour packed as RViz draws it;
     last the covariance, if the surfels have it.
     """
-    values = surfels._columns()
-    names = ('x', 'y', 'z', 'normal_x', 'normal_y', 'normal_z', 'curvature', 'planarity')
-    columns: Columns = {name: values[name].astype(np.float32) for name in names}
+    values = {
+        **dict(zip('xyz', surfels.position.T, strict=True)),
+        **dict(zip(('normal_x', 'normal_y', 'normal_z'), surfels.normal.T, strict=True)),
+        'curvature': surfels.curvature,
+        'planarity': surfels.planarity,
+    }
+    columns: Columns = {}
+    for name, column in values.items():
+        columns[name] = column.astype(np.float32)
     columns['num_points'] = surfels.num_points.astype(np.uint32)
     columns |= quality_columns(surfels)
     if 'intensity' in surfels.channels:
@@ -482,7 +488,9 @@ def surfel_columns(surfels: Surfels) -> Columns:
     if 'red' in surfels.channels:
         channels = (surfels.channels[name] for name in ('red', 'green', 'blue'))
         columns['rgb'] = packed_rgb(*channels)
-    return columns | covariance_columns(surfels)
+    if surfels.covariance is not None:
+        columns |= covariance_columns(surfels)
+    return columns
 
 
 def quality_columns(surfels: Surfels) -> Columns:

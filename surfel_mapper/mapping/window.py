@@ -59,7 +59,8 @@ class WindowedScan:
 
     def __post_init__(self) -> None:
         """Refuse what would fail only after the map has the scan."""
-        check_kind('moments', self.moments, ScanMoments)
+        if not isinstance(self.moments, ScanMoments):
+            check_kind('moments', self.moments, ScanMoments)
         if isinstance(self.stamp_ns, bool) or not isinstance(self.stamp_ns, (int, np.integer)):
             raise ValueError(f'stamp_ns: {self.stamp_ns!r}, expected whole nanoseconds as an int')
         if np.shape(self.T_map_sensor) != (4, 4):
@@ -249,8 +250,10 @@ class SlidingWindow:
             If the map refuses the scan; nothing is changed.
 
         """
-        check_kind('scan', scan, WindowedScan)
-        min_points = as_whole('min_points', min_points)
+        if not isinstance(scan, WindowedScan):
+            check_kind('scan', scan, WindowedScan)
+        if type(min_points) is not int:
+            min_points = as_whole('min_points', min_points)
         self._map.insert(scan.moments)
         self._append(scan)
         evicted, limits = [], self._limits()

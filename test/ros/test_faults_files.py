@@ -222,7 +222,7 @@ def test_kernels_load_without_a_cache_directory(disk, tmp_path):
     )
     subprocess.run(['mount', '-o', 'remount,ro', str(disk.folder)], check=True)
     unwritable = {'HOME': '/proc/nowhere', 'NUMBA_CACHE_DIR': '/proc/nowhere'}
-    code = 'from surfel_mapper.kernels import selection; print(selection.__file__)'
+    code = 'from surfel_mapper.kernels import grouping; print(grouping.__file__)'
     done = subprocess.run(
         [sys.executable, '-c', code],
         cwd=tmp_path,
@@ -232,6 +232,6 @@ def test_kernels_load_without_a_cache_directory(disk, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == str(package / 'kernels' / 'selection.py')
+    assert done.stdout.strip() == str(package / 'kernels' / 'grouping.py')
     assert 'set NUMBA_CACHE_DIR' in done.stderr
     assert not list(tmp_path.glob('surfel_mapper-kernels-*'))
