@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
 
-PAIRS, LEAST_PAIRS = 48, 12
+PAIRS, LEAST_PAIRS = 24, 12
 """Number of pairs of scans that are aligned, 10 ms each, and the least that tell an offset."""
 
 APART_NS = 950_000_000
