@@ -25,6 +25,9 @@ MOST_SPREAD = 0.3
 HINTS = ((37.0, 1.0, 'TAI is ahead of UTC by 37 s'), (1e8, 1e30, 'one counts from its start'))
 """Usual offsets: the least, the width, and their cause."""
 
+MOST_DELAY_S = 10.0
+"""Messages that come later than this have another clock, not a delay."""
+
 ZONE_S = 1800.0
 """Clocks of other time zones differ by multiples of this, s."""
 
@@ -74,6 +77,9 @@ class ClockOffset:
         causes = [text for least, width, text in HINTS if least - 0.5 <= size < least + width]
         if size < HINTS[1][0] and size > 1.0 and abs(size / ZONE_S - round(size / ZONE_S)) < 1e-3:
             causes = ['another time zone']
+        if not causes and size < MOST_DELAY_S and self.measured_by.endswith('times'):
+            late = self.reference if self.seconds > 0.0 else self.clouds
+            causes = [f'or {late} comes late, and its stamps are right']
         return f' ({causes[0]})' if causes else ''
 
 
