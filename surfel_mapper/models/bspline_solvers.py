@@ -112,8 +112,8 @@ def equations(samples: FieldSamples, width: int, number: int) -> tuple[Array, Ar
     right = np.bincount(rows.ravel(), (weighted * samples.z[:, None]).ravel(), number)
     i, j = np.triu_indices(rows.shape[1])
     row, column = rows[:, j], rows[:, i]  # element k, c of the band is that of row c + k, column c
-    place, products = (row - column) * number + column, weighted[:, i] * samples.weights[:, j]
-    band = np.bincount(place.ravel(), products.ravel(), width * number)
+    band_index, products = (row - column) * number + column, weighted[:, i] * samples.weights[:, j]
+    band = np.bincount(band_index.ravel(), products.ravel(), width * number)
     return band.reshape(width, number).astype(np.float64), right.astype(np.float64)
 
 

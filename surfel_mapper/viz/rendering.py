@@ -169,17 +169,17 @@ def hollow_shade(depth: Image, unit_m: Any) -> Image:
 
     """
     most = HOLLOW_STEPS[-1]
-    known = np.where(np.isfinite(depth), depth, np.float32(np.nan))
-    wide = np.pad(known, most, constant_values=np.nan)
+    finite_depth = np.where(np.isfinite(depth), depth, np.float32(np.nan))
+    wide = np.pad(finite_depth, most, constant_values=np.nan)
     height, width = depth.shape
-    hollow = np.zeros_like(known)
+    hollow = np.zeros_like(finite_depth)
     for step in HOLLOW_STEPS:
         steps_m = np.float32(step) * unit_m
         for down, right in step * np.array([(0, 1), (1, 0), (1, 1), (1, -1)]):
-            total = np.zeros_like(known)
+            total = np.zeros_like(finite_depth)
             for sign in (-1, 1):
                 top, left = most + sign * down, most + sign * right
-                rise = known - wide[top : top + height, left : left + width]
+                rise = finite_depth - wide[top : top + height, left : left + width]
                 total += np.maximum(rise / steps_m, -4.0)
             hollow += np.fmin(np.fmax(total - 0.25, 0.0), 2.0)  # 0 for nan
     shade: Image = np.maximum(np.exp(hollow * np.float32(-STRENGTH / 12.0)), np.float32(0.4))
@@ -195,26 +195,26 @@ def facing_discs(camera: Camera, discs: DrawnDiscs) -> tuple[npt.NDArray[np.int6
     facing = (discs.normal * near).sum(axis=1)
     ahead = position @ R[2] < -NEAREST_M
     rows = np.flatnonzero((facing > 0.0) & (ahead | (camera.eye_m is None)))
-    seen, normal = position[rows] @ R.T, discs.normal[rows] @ R.T
+    in_camera, normal = position[rows] @ R.T, discs.normal[rows] @ R.T
     scale = np.full((len(rows), 1), FINER * camera.px_per_m)
     ray = np.tile(-R[2], (len(rows), 1))  # for each metre of depth
     if camera.eye_m is not None:
-        scale /= -seen[:, 2:]
-        normal[:, 2] = facing[rows] / -seen[:, 2]
-        ray = position[rows] / -seen[:, 2:]
+        scale /= -in_camera[:, 2:]
+        normal[:, 2] = facing[rows] / -in_camera[:, 2]
+        ray = position[rows] / -in_camera[:, 2:]
     normal[:, 2] = np.maximum(normal[:, 2], EDGE_ON)
     normal /= np.sqrt((normal * normal).sum(axis=1))[:, None]
     radius_m = discs.radius_m[rows, None]
     larger = radius_m + CLOSING * np.minimum(radius_m, np.median(radius_m) if len(rows) else 0.0)
     radius_m = np.maximum(larger, FINER * THINNEST_PX / scale)
     middle = 0.5 * FINER * np.array([camera.width, camera.height]) - 0.5
-    centre = middle + (seen[:, :2] - camera.centre_m) * scale * [1.0, -1.0]
+    centre = middle + (in_camera[:, :2] - camera.centre_m) * scale * [1.0, -1.0]
     steps_m = normal[:, :2] / normal[:, 2:] * [1.0, -1.0] / scale  # of depth, right and down
     across = [sign * R[k] / scale + steps_m[:, k, None] * ray for k, sign in ((0, 1), (1, -1))]
     columns = [
         centre,
         pixel_box(centre, radius_m * scale * np.sqrt(1.0 - normal[:, :2] ** 2), camera),
-        -seen[:, 2:],
+        -in_camera[:, 2:],
         steps_m,
         0.5 * radius_m,
         *(values / radius_m for values in (*across, *discs.select(rows).cells())),

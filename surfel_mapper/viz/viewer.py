@@ -101,13 +101,13 @@ class Viewer:
     def _show(self, update: Update, *, whole: bool) -> None:
         """Show a scan, its changes of the map, and the whole map if it is due."""
         scene, rerun = self._scene, self._scene.rerun
-        place = update.T_map_sensor[:3, 3]
+        position = update.T_map_sensor[:3, 3]
         if not self._is_placed:
             self._is_placed = True
             scene.set_origin(self._mapper.map.origin_m)
-            scene.look(place - AROUND_M, place + AROUND_M, place)
+            scene.look(position - AROUND_M, position + AROUND_M, position)
         scene.set_stamp(update.stamp_ns)
-        pose = rerun.Transform3D(translation=place, mat3x3=update.T_map_sensor[:3, :3])
+        pose = rerun.Transform3D(translation=position, mat3x3=update.T_map_sensor[:3, :3])
         scene.log('map/sensor', pose)
         scan = rerun.Points3D(picked(update.scan.points), radii=POINT_RADIUS_M)
         scene.log('map/sensor/scan', scan)

@@ -53,18 +53,18 @@ def look_through(
     (range_m, *cells), (distance_m, row, column) = direction_cells(points), direction_cells(places)
     nearest: Float32 = np.full((round(180 / FINEST_DEG), round(360 / FINEST_DEG)), np.inf)
     np.minimum.at(nearest, tuple(cells), range_m)
-    through, seen = np.zeros((2, len(places)), bool)
+    through, is_hit = np.zeros((2, len(places)), bool)
     for _ in range(NUM_GRIDS):
         modes = ('constant', 'wrap')
         lowest = minimum_filter(nearest, (5, 3), mode=modes, cval=np.inf)
         share = uniform_filter((nearest < np.inf).astype(np.float32), 3, mode=modes)
         enough = share[row, column] > (LEAST_CELLS - 0.5) / 9.0
         through |= enough & (lowest[row, column] > distance_m + margin_m)
-        seen |= np.abs(nearest[row, column] - distance_m) <= margin_m
+        is_hit |= np.abs(nearest[row, column] - distance_m) <= margin_m
         rows, columns = nearest.shape
         nearest = nearest.reshape(rows // 2, 2, columns // 2, 2).min(axis=(1, 3))
         row, column = row // 2, column // 2
-    return np.where(through, THROUGH, np.where(seen, SEEN, UNKNOWN)).astype(np.int8)
+    return np.where(through, THROUGH, np.where(is_hit, SEEN, UNKNOWN)).astype(np.int8)
 
 
 def direction_cells(

@@ -228,7 +228,7 @@ def sum_cells(grouped, cells, corner, tau, bits, sums, touched):
     """
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     most, per_square = DISC * DISC, EDGE / (DISC * DISC)
-    number, side, before = 0, 1 << bits, 1.0 / tau
+    number, side, per_front = 0, 1 << bits, 1.0 / tau
     for n in range(len(grouped)):
         cell = cells[grouped[n]]
         behind = cylinder(cell, tau, low, high)
@@ -239,7 +239,7 @@ def sum_cells(grouped, cells, corner, tau, bits, sums, touched):
         first_x = corner[0] + 0.5 - cell[0]
         first_y = corner[1] + 0.5 - cell[1]
         first_z = corner[2] + 0.5 - cell[2]
-        after = 1.0 / behind
+        per_behind = 1.0 / behind
         for k in range(low[2], high[2] + 1):
             z = first_z + k
             for j in range(low[1], high[1] + 1):
@@ -252,7 +252,7 @@ def sum_cells(grouped, cells, corner, tau, bits, sums, touched):
                     aside = x * x + square - signed * signed
                     if aside > most or signed > tau or signed < -behind:
                         continue
-                    share = 1.0 - (signed * before if signed > 0.0 else -signed * after)
+                    share = 1.0 - (signed * per_front if signed > 0.0 else -signed * per_behind)
                     weight = full * max(share, LEAST_SHARE) * (1.0 - aside * per_square)
                     if sums[row + i, 1] == 0.0:
                         touched[number] = row + i
