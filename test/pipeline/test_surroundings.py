@@ -14,8 +14,10 @@ import numpy as np
 
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import inverse
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.offline.summary import MOST_DOUBTFUL, uncertain_text
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.surroundings import SurroundingMotion
 from surfel_mapper.simulation import World
 from test.pipeline.scenarios import LIDAR, scenarios
 
@@ -70,6 +72,28 @@ def test_some_trucks_that_move_along_or_pass_are_not():
         summary = mapped('3 trucks', at_rest=at_rest)[0].summary()
         assert summary['registration']['tracking']['surrounded']['scans'] < MOST_DOUBTFUL
         assert uncertain_text(summary) == ''
+
+
+def is_in_doubt(shares):
+    """Return which scans seem to move along with what is around, by shares of new voxels."""
+    surroundings, surfel_map = SurroundingMotion(), SurfelMap(1.0)
+    standing = np.arange(1000)[:, None] * [1.0, 0.0, 0.0] + 0.5
+    surfel_map.add(standing)
+    doubts = []
+    for share in shares:
+        cells = standing + [0.0, 1.0, 0.0] * (np.arange(1000)[:, None] < 1000 * share)
+        doubts.append(surroundings.move_along(cells, np.eye(4), surfel_map))
+    return doubts
+
+
+def test_a_steady_share_of_new_voxels_at_rest_is_in_doubt():
+    assert is_in_doubt([0.03] * 40) == [False] * 40
+    assert is_in_doubt([0.08] * 40) == [False] * 19 + [True] * 21
+
+
+def test_a_new_area_that_comes_into_view_is_not_in_doubt():
+    new_area = [0.63, 0.39, 0.38, 0.51, 0.31, 0.26, 0.3]  # of a hall, by every second beam
+    assert not any(is_in_doubt([0.02] * 20 + new_area + [0.02] * 10))
 
 
 def test_trucks_that_come_do_not_pull_the_poses_along():
