@@ -71,7 +71,7 @@ With 5 voxels instead of 3 at 0.1 m the angles between faces in a hall are 12.4 
 13.5; at 0.2 m the median error would rise by 0.3 mm.
 """
 
-FIRST_BLOCKS = 16384
+FIRST_BLOCKS = 4096
 """Blocks for which there is room at first."""
 
 BLOCK_BYTES = 40
@@ -247,12 +247,14 @@ class PointIntegrator:
     def _cells(self, points: Float64, solid: npt.NDArray[np.bool_], pose: Float64) -> ScanCells:
         """Return the points by voxel; free rays end at the range up to which they free."""
         near, far = self.blocks.config.min_range_m, self.blocks.config.max_range_m
+        surfaces = self._described(points if solid.all() else points[solid], pose, (near, far))
+        if not self._carve_m:
+            return ScanCells(surfaces=surfaces, free=np.empty((0, CELL)))
         with np.errstate(invalid='ignore', over='ignore'):
             ranges = np.sqrt(np.einsum('ij,ij->i', points, points))
             ends = (~solid | (ranges > far)) & (ranges < np.inf) & (ranges > near)
         lengths = np.minimum(ranges[ends], self._carve_m)
         short = points[ends] * (lengths / ranges[ends])[:, None]
-        surfaces = self._described(points if solid.all() else points[solid], pose, (near, far))
         return ScanCells(surfaces=surfaces, free=self._described(short, pose, (near, 1.001 * far)))
 
     def _described(self, points: Float64, pose: Float64, limits: tuple[float, float]) -> Float64:

@@ -57,7 +57,7 @@ DISC = 0.85
 EDGE = 0.8
 """Share of its weight that a measurement has lost at the edge of the disc."""
 
-LEAST_SHARE = 0.02
+LEAST_SHARE = np.float32(0.02)
 """Least share of the weight of a cell at the ends of its cylinder."""
 
 MOST_FREED = 2
@@ -67,8 +67,11 @@ FADING = 4
 """Ratio of the rates at which the weight in front of a surface fades and its distance moves. A
 weight of MEMORY scans at 1 m falls to the least weight within forget_s."""
 
-MEMORY = 16.0
+MEMORY = np.float32(16.0)
 """Largest weight of a voxel, in scans like the last, if surfaces are forgotten."""
+
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
 
 
 @njit(cache=True, nogil=True)
@@ -213,53 +216,48 @@ def free_rays(cells, start, origin, limits, bits, table, keys, number, freed):
     return number, len(cells)
 
 
-@njit(cache=True, nogil=True)
-def sum_cells(grouped, cells, corner, tau, bits, sums, touched):
+@njit(cache=True, nogil=True, error_model='numpy')
+def sum_cells(grouped, cells, corner, tau, places, sums):
     """
     Sum the distances that cells give to the voxels of a block.
 
     grouped  (P,) int32, the cells that observe the block
     cells    (K, CELL) float64
     corner   (3,) int64, index of the block's first voxel
-    sums     (N, 2) float32, in: 0; out: weighted distances, voxels, and weights
-    touched  (N,) int64, out: voxels that have sums
+    places   (2, M^2) float32, index along x and y of the voxels of a layer
+    sums     (2, M, M^2) float32, in: 0; out: weighted distances, voxels, and weights, by layer
 
-    Returns the number of these.
+    All voxels of a layer between two lines are computed without branches, which is vectorised:
+    half of them are in the cylinder, so branches would be mispredicted.
     """
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
-    most, per_square = DISC * DISC, EDGE / (DISC * DISC)
-    number, side, per_front = 0, 1 << bits, 1.0 / tau
+    most, per_square = np.float32(DISC * DISC), np.float32(EDGE / (DISC * DISC))
+    side, tau = sums.shape[1], np.float32(tau)
+    per_front = _ONE / tau
     for n in range(len(grouped)):
         cell = cells[grouped[n]]
-        behind = cylinder(cell, tau, low, high)
-        for axis in range(3):
-            low[axis] = max(low[axis] - corner[axis], 0)
-            high[axis] = min(high[axis] - corner[axis], side - 1)
-        nx, ny, nz, full = cell[3], cell[4], cell[5], cell[WEIGHT]
-        first_x = corner[0] + 0.5 - cell[0]
-        first_y = corner[1] + 0.5 - cell[1]
-        first_z = corner[2] + 0.5 - cell[2]
-        per_behind = 1.0 / behind
-        for k in range(low[2], high[2] + 1):
-            z = first_z + k
-            for j in range(low[1], high[1] + 1):
-                y = first_y + j
-                row = (j << bits) + (k << 2 * bits)
-                level, square = ny * y + nz * z, y * y + z * z
-                for i in range(low[0], high[0] + 1):
-                    x = first_x + i
-                    signed = nx * x + level
-                    aside = x * x + square - signed * signed
-                    if aside > most or signed > tau or signed < -behind:
-                        continue
-                    share = 1.0 - (signed * per_front if signed > 0.0 else -signed * per_behind)
-                    weight = full * max(share, LEAST_SHARE) * (1.0 - aside * per_square)
-                    if sums[row + i, 1] == 0.0:
-                        touched[number] = row + i
-                        number += 1
-                    sums[row + i, 0] += np.float32(weight * signed)
-                    sums[row + i, 1] += np.float32(weight)
-    return number
+        behind = -np.float32(cylinder(cell, tau, low, high))
+        nx, ny, nz = np.float32(cell[3]), np.float32(cell[4]), np.float32(cell[5])
+        first_x = np.float32(corner[0] + 0.5 - cell[0])
+        first_y = np.float32(corner[1] + 0.5 - cell[1])
+        first_z = np.float32(corner[2] + 0.5 - cell[2])
+        full, per_behind = np.float32(cell[WEIGHT]), _ONE / behind
+        first = max(low[1] - corner[1], 0) * side
+        last = (min(high[1] - corner[1], side - 1) + 1) * side
+        across, along = places[0, first:last], places[1, first:last]
+        for k in range(max(low[2] - corner[2], 0), min(high[2] - corner[2], side - 1) + 1):
+            distances, weights = sums[0, k, first:last], sums[1, k, first:last]
+            z = first_z + np.float32(k)
+            for i in range(len(distances)):
+                x, y = first_x + across[i], first_y + along[i]
+                signed = nx * x + ny * y + nz * z
+                aside = x * x + y * y + z * z - signed * signed
+                share = _ONE - max(signed * per_front, signed * per_behind)
+                weight = full * max(share, LEAST_SHARE) * (_ONE - aside * per_square)
+                observed = (aside <= most) & (signed <= tau) & (signed >= behind)
+                weight = weight if observed else _ZERO
+                distances[i] += weight * signed
+                weights[i] += weight
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -281,35 +279,54 @@ def fuse_blocks(blocks, cells, origin, settings, voxel_m, bits, field, figures):
     rows, corners, rates, ends, freed = blocks
     grouped, cells = cells
     num_voxels, tau = field.shape[2], settings[TAU] / voxel_m
-    sums, touched = np.zeros((num_voxels, 2), np.float32), np.empty(num_voxels, np.int64)
+    side = 1 << bits
+    layer = np.arange(side * side)
+    places = np.stack((layer & (side - 1), layer >> bits)).astype(np.float32)
+    by_layer = np.zeros((2, side, side * side), np.float32)
+    sums = by_layer.reshape(2, num_voxels)
+    observed = np.empty(num_voxels + 1, np.int64)
     flat, block_size = field.ravel(), 2 * num_voxels
     for b in range(len(rows)):
         if b + 1 < len(rows):
             prefetch_block(flat, block_size * rows[b + 1], block_size)
-        mean, total = field[rows[b], 0], field[rows[b], 1]
+        content = field[rows[b], 0], field[rows[b], 1], figures[b]
+        figures[b, OBSERVED] = figures[b, MOVED] = figures[b, SOLID] = figures[b, NEAR] = 0
         near = grouped[ends[b, 0] : ends[b, 1]]
-        number = sum_cells(near, cells, corners[b], tau, bits, sums, touched)
-        figures[b, OBSERVED], figures[b, MOVED], figures[b, SOLID] = number, 0, number
-        figures[b, NEAR] = number
-        for voxel in touched[:number]:
-            freed[b, voxel >> 6] &= ~(np.int64(1) << (voxel & 63))
-            value, weight = sums[voxel, 0] / sums[voxel, 1] * np.float32(voxel_m), sums[voxel, 1]
-            sums[voxel] = 0.0
-            most = max(total[voxel], np.float32(MEMORY) * weight)
-            most = min(settings[MAX_WEIGHT], most if rates[b] > 0.0 else np.float32(np.inf))
-            weight = max(weight, settings[MIN_WEIGHT])
-            last, so_far = mean[voxel], total[voxel]
-            opposed = (value < 0.0) != (last < 0.0) and last < settings[TAU] and so_far > 0.0
-            if opposed and abs(value) > abs(last) and abs(value - last) > settings[CONTRADICTS]:
-                figures[b, OPPOSED] += 1
-                total[voxel] = max(so_far * (np.float32(1.0) - rates[b]), settings[MIN_WEIGHT])
-                if total[voxel] > np.float32(0.25) * weight:
-                    continue
-            moved = mean[voxel] + (value - mean[voxel]) * (weight / (total[voxel] + weight))
-            weight = min(total[voxel] + weight, most)
-            replace(voxel, moved, weight, settings[MIN_WEIGHT], mean, total, figures[b])
-        content = mean, total, figures[b]
+        if len(near):
+            sums[:] = 0.0
+            sum_cells(near, cells, corners[b], tau, places, by_layer)
+            fuse_sums(sums, observed, settings, voxel_m, rates[b], freed[b], content)
         free_voxels(freed[b], corners[b], origin, settings, voxel_m, bits, rates[b], content)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def fuse_sums(sums, observed, settings, voxel_m, rate, freed, content):
+    """Fuse the distances of a scan into the voxels of a block; observed has room for N + 1."""
+    mean, total, figures = content
+    least, tau, contradicts = settings[MIN_WEIGHT], settings[TAU], settings[CONTRADICTS]
+    voxel_m, keeps = np.float32(voxel_m), _ONE - rate
+    number = largest = inside = 0
+    for n in range(len(mean)):  # without branches
+        observed[number] = n
+        number += sums[1, n] > _ZERO
+    for n in observed[:number]:
+        freed[n >> 6] &= ~(np.int64(1) << (n & 63))
+        weight, last, so_far = sums[1, n], mean[n], total[n]
+        value = sums[0, n] / weight * voxel_m
+        most = max(so_far, MEMORY * weight) if rate > _ZERO else settings[MAX_WEIGHT]
+        weight = max(weight, least)
+        opposed = ((value < _ZERO) != (last < _ZERO)) & (last < tau) & (so_far > _ZERO)
+        if opposed & (abs(value) > abs(last)) & (abs(value - last) > contradicts):
+            figures[OPPOSED] += 1
+            so_far = total[n] = max(so_far * keeps, least)
+            if so_far > np.float32(0.25) * weight:
+                continue
+        moved = last + (value - last) * (weight / (so_far + weight))
+        together = min(so_far + weight, most, settings[MAX_WEIGHT])
+        step, change = replace(n, moved, together, least, mean, total)
+        largest, inside = max(largest, step), inside + change
+    figures[NEAR] = figures[OBSERVED] = figures[SOLID] = number
+    figures[MOVED], figures[INSIDE] = largest, figures[INSIDE] + inside
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -364,19 +381,19 @@ def fade(word, start, corner, origin, settings, voxel_m, bits, rate, content):
             moved += (tau_m - moved) * max(new / (weight + new), rate)
         elif faded == least and rate > 0.0:
             moved = tau_m
-        replace(voxel, moved, faded, least, mean, total, figures)
+        step, change = replace(voxel, moved, faded, least, mean, total)
+        figures[MOVED], figures[SOLID] = max(figures[MOVED], step), 1
+        figures[INSIDE] += change
 
 
 @njit(cache=True, nogil=True, inline='always')
-def replace(voxel, moved, weight, least, mean, total, figures):
-    """Write distance and weight of a voxel; note whether triangles change."""
+def replace(voxel, moved, weight, least, mean, total):
+    """Write distance and weight of a voxel; return its step, see MOVED, and change of INSIDE."""
     last = mean[voxel]
-    flips = (moved < 0.0) != (last < 0.0) or total[voxel] < least <= weight
+    flips = ((moved < 0.0) != (last < 0.0)) | ((total[voxel] < least) & (least <= weight))
     step = np.int64(JUMP) if flips else np.int64(abs(moved - last) * 1e6)
-    figures[MOVED] = max(figures[MOVED], step)
-    figures[SOLID] = 1
-    figures[INSIDE] += np.int64(moved < 0.0) - np.int64(last < 0.0)
     mean[voxel], total[voxel] = moved, weight
+    return step, np.int64(moved < 0.0) - np.int64(last < 0.0)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
