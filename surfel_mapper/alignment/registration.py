@@ -74,6 +74,9 @@ SEARCH_CELLS = 3000
 SEARCH_STARTS = 4
 """Number of best places of the search from which the whole scan is aligned."""
 
+STEPS_ALONG = (-3, -2, -1, 1, 2, 3)
+"""Starts along an undetermined direction, in halves of the largest voxel from the prediction."""
+
 RELOCATED = 8
 """Number of best places in the whole map from which the whole scan is aligned."""
 
@@ -230,6 +233,8 @@ class Registration:
         """
         levels = PlaneLevels(self.config, surfel_map, cells, starts)
         result = self._descend(cells, levels, starts[0], deviation_m)
+        if len(result.degenerate) and not is_lost:
+            result = self._determined(result, cells, levels, starts)
         is_usual = result.converged and result.support >= expected_support and self.fits(result)
         is_predicted = deviation_m <= self._voxel_size_m and not is_lost
         if is_usual and is_predicted and self._is_near(result, starts[0]):
@@ -416,6 +421,41 @@ class Registration:
             degenerate=degenerate,
             radius_m=radius_m,
         )
+
+    def _determined(
+        self,
+        result: RegistrationResult,
+        cells: npt.NDArray[np.float64],
+        levels: PlaneLevels,
+        starts: Sequence[Transform],
+    ) -> RegistrationResult:
+        """
+        Return a degenerate result, or one nearby at which more directions are determined.
+
+        The end of a corridor determines the motion along it, but no cell of it meets a surfel if
+        the prediction is off by more than a voxel. So starts along the undetermined directions are
+        aligned to the largest voxels, and the whole scan from the best of those.
+        """
+        level, num = self.config.coarse_levels, len(result.degenerate)
+        planes, some = levels.planes(level), thinned(cells, SEARCH_CELLS)
+        size_m = planes.voxel_size_m
+        steps = result.degenerate / np.repeat([1.0, result.radius_m], 3)
+        rough = [
+            self._converge(
+                *(some, planes, moved(result.T_map_sensor, number * 0.5 * size_m * step)),
+                *(size_m, COARSE_TOLERANCE * size_m, self.config.max_iterations),
+            )
+            for step in steps
+            for number in STEPS_ALONG
+        ]
+        places = [other for other in rough if len(other.degenerate) < num]
+        view, results = ScanView(cells), []
+        for pose in self._distinct_poses(places, SEARCH_STARTS):
+            other = self._viewed(self._descend(cells, levels, pose, size_m), view, levels)
+            fits = other.converged and other.support >= AMBIGUOUS * result.support
+            if fits and len(other.degenerate) < num and other.seen_through <= MAX_SEEN_THROUGH:
+                results.append(other)
+        return self._chosen(results, starts, is_lost=False) if results else result
 
     def _searched_poses(
         self, cells: npt.NDArray[np.float64], levels: PlaneLevels, starts: Sequence[Transform]

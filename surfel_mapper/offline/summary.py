@@ -21,12 +21,12 @@ STATES = {
 """Statements about the scans in a state of tracking."""
 
 DOUBTFUL = {
-    'surrounded': 'most surfaces seem to move with the sensor',
-    'ambiguous': 'two places fit about equally well',
+    'surrounded': (5, 'most surfaces seem to move with the sensor'),
+    'ambiguous': (5, 'two places fit about equally well'),
+    'degenerate': (2, 'surfaces do not determine every direction of motion'),
 }
-MOST_DOUBTFUL = 5
-"""Scans in one of these states before a replay says so: right maps of halls and streets have up to
-one ambiguous scan."""
+"""States that put poses in doubt: the least number of scans, as right maps of halls and streets
+have up to one ambiguous scan, and the statement."""
 
 
 def as_text(summary: Mapping[str, Any], written: Sequence[str]) -> str:
@@ -141,8 +141,8 @@ def tracking_doubt(summary: Mapping[str, Any]) -> str:
     return '\n'.join(
         f'in {spent["scans"]} of {received} scans ({spent["first_s"]:.3f} to '
         f'{spent["last_s"]:.3f} s) {statement}: their poses may be wrong'
-        for state, statement in DOUBTFUL.items()
-        if (spent := states.get(state)) and spent['scans'] >= MOST_DOUBTFUL
+        for state, (least, statement) in DOUBTFUL.items()
+        if (spent := states.get(state)) and spent['scans'] >= least
     )
 
 

@@ -159,6 +159,22 @@ def test_the_prediction_is_kept_along_a_corridor():
     assert abs(found.degenerate[0, 0]) > 0.99
 
 
+@pytest.mark.parametrize('ahead_m', [-2.5, -1.5, 1.5])
+def test_the_end_of_a_corridor_determines_the_motion_if_the_prediction_misses_it(ahead_m):
+    end = (((20.0, -1.5, 0.0), (0.0, 3.0, 0.0), (0.0, 0.0, 2.5)),)
+    corridor = (
+        *[((-60.0, *corner[1:]), (80.0, *along[1:]), up) for corner, along, up in CORRIDOR],
+        *end,
+    )
+    start = started(ahead_m, 0.1, 0.1, (0.0, 0.0, 1.0))
+    points = scan_of(corridor, reach_m=25.0)
+
+    found = align(corridor, start, 0.3, points=points)
+
+    assert len(found.degenerate) == 0
+    assert off(found.T_map_sensor)[0] < 3e-3
+
+
 def test_on_a_plain_height_and_tilt_alone_are_known():
     plain = (((-40.0, -40.0, 0.0), (80.0, 0.0, 0.0), (0.0, 80.0, 0.0)),)
     start = started(0.2, -0.2, 0.1, (0.5, -0.5, 1.0))

@@ -399,19 +399,24 @@ def test_the_text_names_scans_by_their_state_of_tracking():
     )
 
 
-@pytest.mark.parametrize('num_ambiguous', [4, 5])
-def test_a_map_of_many_ambiguous_scans_is_in_doubt(num_ambiguous):
-    states = StateTimes()
-    for number in range(20):
-        states.add(number * STEP_NS, ['ambiguous'] if number < num_ambiguous else [])
+@pytest.mark.parametrize(
+    ('state', 'least', 'statement'),
+    [
+        ('ambiguous', 5, 'two places fit about equally well'),
+        ('degenerate', 2, 'surfaces do not determine every direction of motion'),
+    ],
+)
+def test_a_map_of_many_doubtful_scans_is_in_doubt(state, least, statement):
+    doubts = []
+    for num_scans in (least - 1, least):
+        states = StateTimes()
+        for number in range(20):
+            states.add(number * STEP_NS, [state] if number < num_scans else [])
+        tracking = {'tracking': states.summary()}
+        doubts.append(tracking_doubt({'registration': tracking, 'scans': {'received': 20}}))
 
-    doubt = tracking_doubt(
-        {'registration': {'tracking': states.summary()}, 'scans': {'received': 20}}
-    )
-
-    assert doubt == (
-        ''
-        if num_ambiguous == 4
-        else 'in 5 of 20 scans (0.000 to 0.400 s) two places fit about equally well: '
-        'their poses may be wrong'
-    )
+    last_s = (least - 1) * STEP_NS / 1e9
+    assert doubts == [
+        '',
+        f'in {least} of 20 scans (0.000 to {last_s:.3f} s) {statement}: their poses may be wrong',
+    ]

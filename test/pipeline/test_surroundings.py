@@ -15,7 +15,7 @@ import numpy as np
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import inverse
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.offline.summary import MOST_DOUBTFUL, uncertain_text
+from surfel_mapper.offline.summary import DOUBTFUL, uncertain_text
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.surroundings import SurroundingMotion
 from surfel_mapper.simulation import World
@@ -63,14 +63,15 @@ def mapped(name, at_rest=False, num_scans=34, rate_hz=10.0):
 def test_trucks_that_move_along_on_all_sides_are_reported():
     summary = mapped('9 trucks')[0].summary()
     found = summary['registration']['tracking']['surrounded']
-    assert found['scans'] >= MOST_DOUBTFUL
+    assert found['scans'] >= DOUBTFUL['surrounded'][0]
     assert f'in {found["scans"]} of 34 scans' in uncertain_text(summary)
 
 
 def test_some_trucks_that_move_along_or_pass_are_not():
     for at_rest in (False, True):
         summary = mapped('3 trucks', at_rest=at_rest)[0].summary()
-        assert summary['registration']['tracking']['surrounded']['scans'] < MOST_DOUBTFUL
+        tracking = summary['registration']['tracking']
+        assert tracking['surrounded']['scans'] < DOUBTFUL['surrounded'][0]
         assert uncertain_text(summary) == ''
 
 
