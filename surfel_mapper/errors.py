@@ -50,6 +50,11 @@ def one_line(text: object) -> str:
     return escaped(string)
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: 1 scan, 1,000 scans."""
+    return f'{number:,} {noun}' if number == 1 else f'{number:,} {noun}s'
+
+
 def escaped(text: str) -> str:
     """Return text of any length with control characters escaped."""
     if text.isprintable():

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_array, as_numbers, check_kind, check_rows
+from surfel_mapper.errors import counted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,7 +251,8 @@ class Scan:
 
     def __repr__(self) -> str:
         """Return the number of points, stamp, frame and columns."""
-        about = [f'{len(self)} points', f'{self.stamp_ns / 1e9:.3f} s', f'frame {self.frame_id!r}']
+        about = [counted(len(self), 'point'), f'{self.stamp_ns / 1e9:.3f} s']
+        about.append(f'frame {self.frame_id!r}')
         return f'Scan({", ".join([*about, *self.columns])})'
 
     def __len__(self) -> int:

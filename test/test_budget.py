@@ -15,7 +15,14 @@ from surfel_mapper.budget import (
     read_small_file,
     VARIABLE,
 )
-from surfel_mapper.errors import BagError, CloudFormatError, ConfigError, LineFormatter, one_line
+from surfel_mapper.errors import (
+    BagError,
+    CloudFormatError,
+    ConfigError,
+    counted,
+    LineFormatter,
+    one_line,
+)
 from surfel_mapper.memory import machine_bytes
 
 
@@ -85,3 +92,8 @@ def test_log_lines_are_one_line_and_tracebacks_stay():
     assert LineFormatter('%(message)s').format(record) == 'x\\n[ERROR] forged'
     record.exc_text = 'Traceback\n  line'
     assert LineFormatter('%(message)s').format(record).splitlines()[1:] == ['Traceback', '  line']
+
+
+def test_a_number_of_one_has_its_noun_in_the_singular():
+    texts = [counted(number, 'surfel') for number in (0, 1, 2, 12345)]
+    assert texts == ['0 surfels', '1 surfel', '2 surfels', '12,345 surfels']

@@ -30,7 +30,7 @@ from surfel_mapper.alignment.registration import Registration, RegistrationResul
 from surfel_mapper.alignment.surfel_planes import means, PlaneLevels
 from surfel_mapper.alignment.window import carried
 from surfel_mapper.config import LoopsConfig, RegistrationConfig
-from surfel_mapper.errors import DependencyError
+from surfel_mapper.errors import counted, DependencyError
 from surfel_mapper.geometry import compose, inverse
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
@@ -172,7 +172,7 @@ class LoopSearch:
             if len(self._loops) == num_before:
                 break
             solution = self._solve()
-            progress(f'{len(self._loops)} loops')
+            progress(counted(len(self._loops), 'loop'))
         self._refuse_unconfirmed()
         solution = self._solve()
         verified = list(zip(self._ordered, solution.is_kept.tolist(), strict=True))

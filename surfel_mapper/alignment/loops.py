@@ -25,7 +25,7 @@ from surfel_mapper.alignment.angles import poses_of, transforms
 from surfel_mapper.alignment.correspondences import moved
 from surfel_mapper.alignment.lum import LUM
 from surfel_mapper.alignment.window import ANCHORS
-from surfel_mapper.errors import AlignmentError
+from surfel_mapper.errors import AlignmentError, counted
 from surfel_mapper.geometry import compose, inverse, Transform
 
 Floats = npt.NDArray[np.float64]
@@ -117,7 +117,7 @@ def solve_loops(T_map_key: Floats, loops: Sequence[Loop], drift_ratio: float) ->
     """
     poses = np.asarray(T_map_key, np.float64)
     if len(poses) < 2:
-        raise AlignmentError(f'{len(poses)} keyframes, expected two or more')
+        raise AlignmentError(f'{counted(len(poses), "keyframe")}, expected two or more')
     for loop in loops:
         if not 0 <= loop.target < loop.source < len(poses):
             raise AlignmentError(

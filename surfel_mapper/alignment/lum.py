@@ -246,7 +246,7 @@ class LUM:
         self._check_settings()
         num_others = self.num_vertices - 1
         if num_others < 1:
-            raise AlignmentError(f'{self.num_vertices} vertices, expected two or more')
+            raise AlignmentError(f'vertices: {self.num_vertices}, expected two or more')
         ends, poses = self.graph.ends, self.graph.poses
         step = exact_step if self.jacobian == 'exact' else pcl_step
         converged, iterations = False, 0
@@ -280,7 +280,7 @@ class LUM:
 
         """
         if self.num_vertices < 2:
-            raise AlignmentError(f'{self.num_vertices} vertices, expected two or more')
+            raise AlignmentError(f'vertices: {self.num_vertices}, expected two or more')
         if self.jacobian == 'pcl':
             raise AlignmentError("covariances need jacobian='exact'")
         ends, poses = self.graph.ends, self.graph.poses

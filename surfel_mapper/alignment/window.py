@@ -36,7 +36,7 @@ from surfel_mapper.alignment.edge_terms import MIN_PAIRS
 from surfel_mapper.alignment.lum import LUM, LumResult
 from surfel_mapper.alignment.solver import components
 from surfel_mapper.config import AlignConfig
-from surfel_mapper.errors import AlignmentError
+from surfel_mapper.errors import AlignmentError, counted
 from surfel_mapper.geometry import compose, interpolate, inverse, rotation_angle, Transform
 
 Floats = npt.NDArray[np.float64]
@@ -129,11 +129,11 @@ def align_scans(
     frames = [''] * len(scans) if frame_ids is None else list(frame_ids)
     if len(scans) < 2 or poses.shape != (len(scans), 4, 4) or not np.isfinite(poses).all():
         raise AlignmentError(
-            f'{len(scans)} scans and poses of shape {poses.shape}, expected two scans or more '
-            'and a finite (4, 4) pose for each'
+            f'{counted(len(scans), "scan")} and poses of shape {poses.shape}, expected two '
+            'scans or more and a finite (4, 4) pose for each'
         )
     if len(frames) != len(scans):
-        raise AlignmentError(f'{len(frames)} frames of {len(scans)} scans, expected one for each')
+        raise AlignmentError(f'{len(frames)} frames, expected one for each of {len(scans)} scans')
     usable = [number for number, scan in enumerate(scans) if len(scan) >= MIN_PAIRS]
     if len(usable) < 2:
         raise AlignmentError(

@@ -21,7 +21,7 @@ from typing import Any, TYPE_CHECKING
 from surfel_mapper.cli._arguments import add_bin_columns, CUT
 from surfel_mapper.cli._output import printable, show_lines
 from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
-from surfel_mapper.errors import escaped
+from surfel_mapper.errors import counted, escaped
 
 if TYPE_CHECKING:
     from surfel_mapper.bags.reader import BagReader
@@ -119,12 +119,12 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
     messages = sum(topic['messages'] for topic in content['topics'])
     lines = [
         f'{content["bag"]}: {content["format"]}, from {start:%Y-%m-%d %H:%M:%S} UTC, '
-        f'{content["seconds"]:.1f} s, {messages} messages',
+        f'{content["seconds"]:.1f} s, {counted(messages, "message")}',
         *table(content['topics']),
     ]
     lines += [f'damaged: {cut}' for cut in content['cut']]
     if content['undecodable']:
-        lines.append(f'{content["undecodable"]} messages of clouds or poses are damaged')
+        lines.append(f'damaged: {counted(content["undecodable"], "message")} of clouds or poses')
     lines += [f'clocks: {clock["text"]}' for clock in content['clock_offsets']]
     is_choice = len({offer.clouds for offer in made}) > 1
     for clouds in dict.fromkeys(offer.clouds for offer in made):
@@ -197,10 +197,9 @@ def folder_report(content: dict[str, Any]) -> str:
     read = 'first scan that can be read' if damaged else 'first scan'
     times = content['times_from'].replace('none: ', 'none in the files, taken as ')
     return (
-        f'{content["bag"]}: {content["format"]}, {content["scans"]} '
-        f'{"scan" if content["scans"] == 1 else "scans"}, '
+        f'{content["bag"]}: {content["format"]}, {counted(content["scans"], "scan")}, '
         f'{content["seconds"]:.1f} s; times: {times}\n'
-        f'  {read}: {content["points"]} points; further columns: {columns}\n{damaged}\n'
+        f'  {read}: {counted(content["points"], "point")}; further columns: {columns}\n{damaged}\n'
         f'{replay_line(content["replay"], Path(content["bag"]))}'
     )
 

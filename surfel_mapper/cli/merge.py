@@ -20,7 +20,7 @@ from surfel_mapper.cli._display import add_open, open_file
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._verbosity import add_verbosity
 from surfel_mapper.compilation import clock
-from surfel_mapper.errors import escaped
+from surfel_mapper.errors import counted, escaped
 from surfel_mapper.offline.summary import rounded
 
 _log = logging.getLogger(__name__)
@@ -88,7 +88,8 @@ def run(args: argparse.Namespace) -> int:
         'seconds': clock() - began,
     }
     picture = args.output / 'map.png'
-    title = f'{len(args.maps)} maps: {rounded(total.num_points)} points, {len(surfels):,} surfels'
+    title = f'{counted(len(args.maps), "map")}: {rounded(total.num_points)} points, '
+    title += counted(len(surfels), 'surfel')
     draw_map(surfels, picture, title, origin_m=summary['origin_m'])
     write_json(args.output / 'summary.json', summary)
     show_lines(json.dumps(summary) if args.json else report(summary, output, picture))
@@ -100,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
 def report(summary: dict[str, Any], output: Path, picture: Path) -> str:
     """Return the summary as lines of text."""
     return (
-        f'{len(summary["maps"])} maps   points {rounded(summary["points"])}   '
+        f'{counted(len(summary["maps"]), "map")}   points {rounded(summary["points"])}   '
         f'surfels {summary["surfels"]}   tiles {summary["tiles"]}   {summary["seconds"]:.1f} s\n'
         f'digest {summary["digest"]}\n{escaped(f"{output}   {picture}")}'
     )

@@ -22,7 +22,7 @@ from surfel_mapper.cli._display import has_display
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._settings import add_settings, configured
 from surfel_mapper.cli._verbosity import add_verbosity, shown_progress
-from surfel_mapper.errors import escaped
+from surfel_mapper.errors import counted, escaped
 
 if TYPE_CHECKING:
     from surfel_mapper.viz.contents import Content
@@ -234,5 +234,6 @@ def show_recording(path: Path, args: argparse.Namespace, scene: Scene) -> None:
                 viewer.add(update)
                 report(number, recording.num_scans)
         viewer.finish()
-        counted = mapper.summary()
-    print(f'{counted["scans"]["mapped"]} scans, {counted["surfels"]:,} surfels of the window')
+        summary = mapper.summary()
+    mapped, surfels = summary['scans']['mapped'], summary['surfels']
+    print(f'{counted(mapped, "scan")}, {counted(surfels, "surfel")} of the window')

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_array, as_numbers, as_path, as_whole, made_array
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import counted, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.pose_rows import matrix_rows, quaternion_rows, warn_of_skew
 from surfel_mapper.files.stamps import column_ns, read_times, unit_by_digits, UNITS_NS
@@ -169,9 +169,9 @@ class Trajectory:
     def __repr__(self) -> str:
         """Return the number of poses and their duration."""
         if self.stamp_ns is None or not len(self):
-            return f'Trajectory({len(self)} poses)'
+            return f'Trajectory({counted(len(self), "pose")})'
         lasts_s = (self.stamp_ns[-1] - self.stamp_ns[0]) / 1e9
-        return f'Trajectory({len(self)} poses in {lasts_s:.3f} s)'
+        return f'Trajectory({counted(len(self), "pose")} in {lasts_s:.3f} s)'
 
     @classmethod
     def from_matrices(

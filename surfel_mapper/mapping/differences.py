@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfel_mapper.arguments import as_real
-from surfel_mapper.errors import MapError
+from surfel_mapper.errors import counted, MapError
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
@@ -49,8 +49,8 @@ class MapDifferences:
         if self.equal:
             return 'equal to the bit'
         return (
-            f'{len(self.came)} surfels came, {len(self.went)} went, {len(self.turned)} turned; '
-            f'{self.num_same} voxels have one in both'
+            f'{counted(len(self.came), "surfel")} came, {len(self.went)} went, '
+            f'{len(self.turned)} turned; {self.num_same} voxels have one in both'
         )
 
 

@@ -34,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_array, as_numbers, as_whole
-from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
+from surfel_mapper.errors import counted, MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import hashing, layout
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.kernels.queries import keys_in_box
@@ -711,8 +711,8 @@ class MomentMap:
         """Return size and counts of the map."""
         level = f', level {self.level}' if self.level else ''
         return (
-            f'SurfelMap({self.voxel_size_m:g} m{level}: {self.num_points} points in '
-            f'{self.num_voxels} voxels)'
+            f'SurfelMap({self.voxel_size_m:g} m{level}: {counted(self.num_points, "point")} in '
+            f'{counted(self.num_voxels, "voxel")})'
         )
 
     def _check_lattice(self, moments: ScanMoments) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_array, check_rows
-from surfel_mapper.errors import MapError, MapLimitError
+from surfel_mapper.errors import counted, MapError, MapLimitError
 from surfel_mapper.kernels.layout import (
     BITS,
     HALF,
@@ -117,7 +117,8 @@ class ScanMoments:
     def __repr__(self) -> str:
         """Return the numbers of points and voxels."""
         size = f'{self.voxel_size_m:g} m'
-        return f'ScanMoments({self.num_points} points in {len(self)} voxels of {size})'
+        points, voxels = counted(self.num_points, 'point'), counted(len(self), 'voxel')
+        return f'ScanMoments({points} in {voxels} of {size})'
 
     def __len__(self) -> int:
         """Return the number of voxels."""

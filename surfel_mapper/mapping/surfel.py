@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_array, as_whole
+from surfel_mapper.errors import counted
 from surfel_mapper.mapping.point_sums import COLUMNS, NO_POINTS, PointSums, ROUNDING, ROWS
 
 Array = npt.NDArray[np.float64]
@@ -207,7 +208,7 @@ class Surfel:
         )
 
     def __repr__(self) -> str:
-        return f'<Surfel of {self.num_points} points, mean {self.mean().tolist()}>'
+        return f'<Surfel of {counted(self.num_points, "point")}, mean {self.mean().tolist()}>'
 
     def mean(self) -> Array:
         """Return the mean of the points, (3,), m; nan if empty."""

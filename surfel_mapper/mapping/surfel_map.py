@@ -92,7 +92,7 @@ class SurfelMap(MomentMap):
     >>> surfel_map = SurfelMap(0.5)
     >>> moments = surfel_map.add(floor, origin=[1, 1, 2])
     >>> surfel_map
-    SurfelMap(0.5 m: 1000 points in 16 voxels)
+    SurfelMap(0.5 m: 1,000 points in 16 voxels)
     >>> bool(np.allclose(surfel_map.surfels(min_points=5).normal, [0, 0, 1]))
     True
     >>> _ = surfel_map.remove(moments)  # the exact inverse

@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from surfel_mapper.arguments import as_whole, check_kind
 from surfel_mapper.config import settings_of, WindowConfig
+from surfel_mapper.errors import counted
 from surfel_mapper.mapping.moments import point_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
@@ -194,7 +195,7 @@ class SlidingWindow:
 
     def __repr__(self) -> str:
         """Return the number of scans."""
-        return f'SlidingWindow({len(self)} scans)'
+        return f'SlidingWindow({counted(len(self), "scan")})'
 
     def _reset(self) -> None:
         self._scans.clear()

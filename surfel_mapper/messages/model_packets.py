@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import CloudFormatError, FileFormatError
+from surfel_mapper.errors import CloudFormatError, counted, FileFormatError
 from surfel_mapper.messages.cdr import MessageWriter
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.packing import unpack
@@ -175,7 +175,7 @@ class ModelsMirror:
     def __repr__(self) -> str:
         """Return the number of primitives, and whether the copy is complete."""
         state = '' if self.is_complete else 'not '
-        return f'ModelsMirror({len(self.versions)} primitives, {state}complete)'
+        return f'ModelsMirror({counted(len(self.versions), "primitive")}, {state}complete)'
 
     def update(self, msg: Any) -> None:
         """

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.counters import STAGES
-from surfel_mapper.errors import ConfigError, FileFormatError, one_line
+from surfel_mapper.errors import ConfigError, counted, FileFormatError, one_line
 from surfel_mapper.files import parquet, pcd, ply
 from surfel_mapper.files.atomic import (
     make_directory,
@@ -281,9 +281,9 @@ def write_files(
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     title = (
-        f'{Path(summary["bag"]).resolve().name}: {summary["scans"]["mapped"]} scans, '
+        f'{Path(summary["bag"]).resolve().name}: {counted(summary["scans"]["mapped"], "scan")}, '
         f'{rounded(summary["points"])} points, '
-        f'{len(surfels):,} surfels in voxels of {mapper.map.voxel_size_m:g} m'
+        f'{counted(len(surfels), "surfel")} in voxels of {mapper.map.voxel_size_m:g} m'
     )
     origin_m, drawn = mapper.map.origin_m, mapper.map.adaptive(mapper.config.map.min_points)
     draw_map(drawn, picture, title, trajectory=trajectory.positions, origin_m=origin_m)

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from surfel_mapper.counters import decimals
+from surfel_mapper.errors import counted
 
 LEAST_MAPPED = 0.95
 """Share of the scans that came which a map needs; with fewer, something is wrong."""
@@ -152,10 +153,10 @@ def apart_text(summary: Mapping[str, Any]) -> str:
     maps = tracking.get('apart', [])
     if not maps:
         return ''
-    counted = summary['scans']['dropped'].get('apart', 0)
-    num_scans = max(counted, sum(entry['scans'] for entry in maps))
+    num_dropped = summary['scans']['dropped'].get('apart', 0)
+    num_scans = max(num_dropped, sum(entry['scans'] for entry in maps))
     spans = ', '.join(
-        f'apart_{number} ({entry["scans"]} scans from '
+        f'apart_{number} ({counted(entry["scans"], "scan")} from '
         f'{entry["first_s"]:.3f} to {entry["last_s"]:.3f} s: {entry["reason"]})'
         for number, entry in enumerate(maps, start=1)
     )
@@ -174,7 +175,7 @@ def errors_text(errors: Mapping[str, Any]) -> str:
     )
     drift_m, drift_deg = errors['drift_m_per_100m'], errors['drift_deg_per_100m']
     return (
-        f'errors of {errors["num_poses"]} poses   absolute {absolute} (rmse)   '
+        f'errors of {counted(errors["num_poses"], "pose")}   absolute {absolute} (rmse)   '
         f'from scan to scan {relative}   '
         f'drift {decimals(drift_m)} m, {decimals(drift_deg)} deg in 100 m'
     )

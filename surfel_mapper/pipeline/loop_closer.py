@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from surfel_mapper.alignment.loop_search import LoopClosure, LoopSearch, Refusal
 from surfel_mapper.config import Config
-from surfel_mapper.errors import AlignmentError
+from surfel_mapper.errors import AlignmentError, counted
 from surfel_mapper.files.scan_spool import ScanSpool
 from surfel_mapper.geometry import compose, inverse, Transform
 from surfel_mapper.mapping.channels import summed_columns
@@ -96,9 +96,10 @@ class LoopMove:
             return 'no loops found'
         recognised = sum(loop.votes > 0 for loop in closure.loops)
         return (
-            f'{len(closure.loops)} loops accepted ({recognised} found by place recognition), '
-            f'{len(closure.refusals)} refused; {self.num_moved} of {len(self.stamps_ns)} scans '
-            f'moved, by at most {self.largest_m:.3f} m and {self.largest_deg:.3f} deg'
+            f'{counted(len(closure.loops), "loop")} accepted ({recognised} found by place '
+            f'recognition), {len(closure.refusals)} refused; '
+            f'{self.num_moved} of {len(self.stamps_ns)} scans moved, '
+            f'by at most {self.largest_m:.3f} m and {self.largest_deg:.3f} deg'
         )
 
 
@@ -199,7 +200,8 @@ class LoopCloser:
             )
         if len(self) < 2:
             raise AlignmentError(
-                f'{len(self)} scans since the map was cleared or loaded, expected two or more'
+                f'{counted(len(self), "scan")} since the map was cleared or loaded, '
+                'expected two or more'
             )
         poses = self.T_map_sensor
         search = LoopSearch(

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from surfel_mapper.arguments import as_whole, check_kind
 from surfel_mapper.compilation import CompileStage, run_stages
 from surfel_mapper.config import Config, declarations
-from surfel_mapper.errors import ConfigError, MapError
+from surfel_mapper.errors import ConfigError, counted, MapError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.layers import names as layer_names
@@ -99,7 +99,7 @@ class Mapper:
 
     def __repr__(self) -> str:
         """Return the map and the number of scans of the window."""
-        return f'Mapper({self.map!r}, {len(self.window)} scans in the window)'
+        return f'Mapper({self.map!r}, {counted(len(self.window), "scan")} in the window)'
 
     @property
     def config(self) -> Config:

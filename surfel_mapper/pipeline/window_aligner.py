@@ -22,7 +22,7 @@ import numpy.typing as npt
 from surfel_mapper.alignment import align_scans, Samples, WindowAlignment
 from surfel_mapper.alignment.window import extent
 from surfel_mapper.config import AlignConfig, Config
-from surfel_mapper.errors import AlignmentError
+from surfel_mapper.errors import AlignmentError, counted
 from surfel_mapper.geometry import compose, inverse, Transform
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -89,7 +89,7 @@ class Alignment:
         return (
             f'{self.num_moved} of {len(self.stamps_ns)} scans moved, by at most '
             f'{self.largest_m:.3f} m and {self.largest_deg:.3f} deg; {settled} after '
-            f'{self.solution.rounds} rounds'
+            f'{counted(self.solution.rounds, "round")}'
         )
 
 
@@ -197,7 +197,7 @@ class WindowAligner:
                 'alignment needs: set window.keep_points from the start'
             )
         if num_scans < 2:
-            raise AlignmentError(f'{num_scans} scans in the map, expected two or more to align')
+            raise AlignmentError(f'{counted(num_scans, "scan")} in the map, expected two or more')
 
     def _samples_of(self, scans: list[WindowedScan], voxel_size_m: float) -> list[Samples]:
         """Return the surfels of each scan in its own frame, made once per scan."""

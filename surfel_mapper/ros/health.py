@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from surfel_mapper.config import DiagnosticsConfig
+from surfel_mapper.errors import counted
 from surfel_mapper.pipeline.drops import REMEDIES
 
 OK, WARN, ERROR = 0, 1, 2
@@ -110,7 +111,7 @@ def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[in
     drops = list(_drops(interval, limits))
     yield from drops
     if interval.never_mapped and not (drops or interval.paused or interval.poses):
-        yield WARN, f'none of {interval.never_mapped} clouds is mapped yet: {NO_POSE}'
+        yield WARN, f'no cloud of {interval.never_mapped} is mapped yet: {NO_POSE}'
     yield from _latency(interval, limits)
 
 
@@ -143,7 +144,7 @@ def _drops(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int,
     level = ERROR if share > limits.error_dropped_ratio else WARN
     causes = ', '.join(f'{cause} {number}' for cause, number in dropped.most_common())
     remedy = REMEDIES.get(dropped.most_common(1)[0][0], 'the log says why')
-    yield level, f'{dropped.total()} scans dropped just now ({causes}): {remedy}'
+    yield level, f'{counted(dropped.total(), "scan")} dropped just now ({causes}): {remedy}'
 
 
 def _latency(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:

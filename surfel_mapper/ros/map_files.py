@@ -16,7 +16,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from surfel_mapper.config import OutputConfig
-from surfel_mapper.errors import ConfigError
+from surfel_mapper.errors import ConfigError, counted
 from surfel_mapper.files.atomic import make_directory
 from surfel_mapper.files.ply import write_surfels
 from surfel_mapper.pipeline import Mapper
@@ -110,7 +110,7 @@ def copied_map(mapper: Mapper) -> Callable[[], str]:
             raise ConfigError(f'{file}: a link that leads out of output.directory, {directory}')
     copied = CopiedMapper(state, mapper)
     min_points, is_adaptive = mapper.config.map.min_points, mapper.config.publish.adaptive
-    scans = f'{len(mapper.window)} scans ({mapper.counters.received} received)'
+    scans = f'{counted(len(mapper.window), "scan")} ({mapper.counters.received} received)'
     layers = ''.join(f', {file.name}' for file in beside)
 
     def write() -> str:
@@ -118,7 +118,8 @@ def copied_map(mapper: Mapper) -> Callable[[], str]:
         surfels = (surfel_map.adaptive if is_adaptive else surfel_map.surfels)(min_points)
         write_surfels(path, surfels, surfel_map.origin_m)
         digest = copied.write()
-        return f'{path} and .npz{layers}: {len(surfels)} surfels of {scans}, digest {digest}'
+        content = f'{counted(len(surfels), "surfel")} of {scans}, digest {digest}'
+        return f'{path} and .npz{layers}: {content}'
 
     return write
 
@@ -156,7 +157,8 @@ def load_map(mapper: Mapper, url: str) -> str:
     num_scans = load_mapper(path, mapper, any_voxel_size=True)
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     return (
-        f'loaded {path}: {len(surfels)} surfels of {num_scans} scans, digest {mapper.map.digest()}'
+        f'loaded {path}: {counted(len(surfels), "surfel")} of {counted(num_scans, "scan")}, '
+        f'digest {mapper.map.digest()}'
     )
 
 

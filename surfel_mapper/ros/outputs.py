@@ -26,6 +26,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from surfel_mapper.config import Config
+from surfel_mapper.errors import counted
 from surfel_mapper.filters.columns import as_fields
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import surfel_columns, Surfels
@@ -196,7 +197,7 @@ class Outputs:
     ) -> Trigger.Response:
         try:
             number = await result_of(self._thread.call(self._publish_normals), self._node.executor)
-            response.success, response.message = True, f'{number} surfels published'
+            response.success, response.message = True, f'{counted(number, "surfel")} published'
         except CancelledError:
             response.message = 'the node is about to end'
         return response

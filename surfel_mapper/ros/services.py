@@ -25,6 +25,7 @@ from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from surfel_mapper.errors import (
+    counted,
     FileFormatError,
     MapError,
     one_line,
@@ -197,7 +198,8 @@ class Services:
     def _clear(self) -> str:
         """Remove all voxels and scans; return their numbers."""
         mapper = self._mapper
-        answer = f'cleared {mapper.map.num_voxels} voxels of {len(mapper.window)} scans'
+        scans = counted(len(mapper.window), 'scan')
+        answer = f'cleared {counted(mapper.map.num_voxels, "voxel")} of {scans}'
         mapper.clear()
         self._outputs.expire()
         return answer
@@ -240,7 +242,8 @@ class Services:
         num_voxels = self._mapper.map.num_voxels
         self._mapper.clear_region(region)
         self._outputs.expire()
-        return f'cleared {num_voxels - self._mapper.map.num_voxels} voxels in {where}'
+        num_cleared = num_voxels - self._mapper.map.num_voxels
+        return f'cleared {counted(num_cleared, "voxel")} in {where}'
 
     def _load(self, url: str) -> str:
         """Replace the map by the one in a file."""

@@ -13,7 +13,7 @@ import time
 
 from surfel_mapper.compilation import CompileStage, run_stages
 from surfel_mapper.config import Config
-from surfel_mapper.errors import ConfigError, SurfelMapperError
+from surfel_mapper.errors import ConfigError, counted, SurfelMapperError
 from surfel_mapper.files.atomic import remove_abandoned
 from surfel_mapper.memory import lasting_objects
 from surfel_mapper.pipeline import Mapper, Update
@@ -147,10 +147,10 @@ class Session:
     def _on_update(self, update: Update) -> None:
         """Publish the changes of a scan; called in the mapping thread."""
         if not self.latencies_s:
+            points = counted(len(update.filtered), 'point')
             self._node.get_logger().info(
-                f'first scan {update.outcome.outcome}: {len(update.filtered)} points of frame '
-                f'{update.scan.frame_id}, '
-                f'{self.mapper.map.num_voxels} voxels'
+                f'first scan {update.outcome.outcome}: {points} of frame {update.scan.frame_id}, '
+                f'{counted(self.mapper.map.num_voxels, "voxel")}'
             )
         self.outputs.publish_update(update)
         with self.mapper.guarded('publishing of the pose'):

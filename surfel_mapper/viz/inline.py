@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_numbers
+from surfel_mapper.errors import counted
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.viz.detail import drawn_surfels
@@ -98,4 +99,4 @@ def show(
     summary['surfels'] = len(surfels)
     valid = drawn.select(np.isfinite(drawn.planarity))
     body = turning_view(valid, np.empty((0, 3)), np.empty(0), summary, {})
-    return InlineView(page('map', body), f'{len(surfels)} surfels')
+    return InlineView(page('map', body), counted(len(surfels), 'surfel'))

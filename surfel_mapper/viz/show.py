@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.errors import counted
 from surfel_mapper.files.trajectory import Trajectory
 from surfel_mapper.mapping.channels import CHANNELS
 from surfel_mapper.mapping.moments import ScanMoments
@@ -97,10 +98,10 @@ def show_contents(
         if isinstance(shape, np.ndarray):
             points = scene.rerun.Points3D(shape - origin_m, radii=POINT_RADIUS_M)
             scene.log(path, points, static=True)
-            about[content.name] = f'{len(shape):,} points'
+            about[content.name] = counted(len(shape), 'point')
         elif isinstance(shape, Mesh):
             scene.mesh(path, replace(shape, vertices=shape.vertices - origin_m), static=True)
-            about[content.name] = f'{len(shape):,} triangles'
+            about[content.name] = counted(len(shape), 'triangle')
             if path in hidden:  # it would flicker through the discs on the same surfaces
                 about[content.name] += ', hidden: its eye in the panel of the viewer shows them'
         elif isinstance(shape, Trajectory):
@@ -144,8 +145,8 @@ def all_discs(
                 about[content.name] += f', shown as {len(discs):,} adaptive ones'
         elif isinstance(shape, DrawnDiscs):
             tiles[f'map/{content.name}'] = moved(shape, shift_m)
-            text = f'{len(shape):,} surfels, without their moments: at one level of detail'
-            about[content.name] = text
+            text = 'without their moments: at one level of detail'
+            about[content.name] = f'{counted(len(shape), "surfel")}, {text}'
     return tiles, about
 
 
@@ -177,7 +178,7 @@ def map_tiles(
 
 def map_text(whole: DetailedMap, level: npt.NDArray[np.int64], voxel_size_m: float) -> str:
     """Return a sentence about a map and the levels that are shown."""
-    text = f'{whole.counts[0].sum():,} surfels in voxels of {voxel_size_m:g} m'
+    text = f'{counted(whole.counts[0].sum(), "surfel")} in voxels of {voxel_size_m:g} m'
     if level.any():
         drawn = whole.counts[level, np.arange(len(whole))].sum()
         text += f', shown as {drawn:,} on levels {level.min()} to {level.max()}'
@@ -190,11 +191,12 @@ def show_way(scene: Scene, path: str, poses: Trajectory, origin_m: Array) -> str
     line = scene.rerun.LineStrips3D([xyz], colors=[RED])
     scene.log(path, line, static=True)
     if poses.stamp_ns is None or not len(poses):
-        return f'{len(poses)} poses without stamps'
+        return f'{counted(len(poses), "pose")} without stamps'
     scene.poses(f'{path}/sensor', poses.stamp_ns, xyz, poses.q_xyzw)
     sensor = scene.rerun.Points3D(np.zeros((1, 3)), radii=0.3, colors=[ORANGE])
     scene.log(f'{path}/sensor', sensor, static=True)
-    return f'{len(poses)} poses over {(poses.stamp_ns[-1] - poses.stamp_ns[0]) / 1e9:.1f} s'
+    lasts_s = (poses.stamp_ns[-1] - poses.stamp_ns[0]) / 1e9
+    return f'{counted(len(poses), "pose")} over {lasts_s:.1f} s'
 
 
 def shared_origin(contents: Sequence[Content]) -> Array:

@@ -110,5 +110,5 @@ def test_loops_between_missing_keyframes_are_refused(source, target):
 
 
 def test_one_keyframe_is_refused():
-    with pytest.raises(AlignmentError, match='1 keyframes, expected two'):
+    with pytest.raises(AlignmentError, match='1 keyframe, expected two'):
         solve_loops(square(1), [], 0.01)

@@ -61,7 +61,7 @@ def pair():
             'weight 0 has a negative eigenvalue',
         ),
         (lambda _: LUM(jacobian='numeric'), "jacobian 'numeric'"),
-        (lambda _: LUM().compute(), '0 vertices'),
+        (lambda _: LUM().compute(), 'vertices: 0'),
     ],
 )
 def test_bad_input_is_refused_and_changes_nothing(pair, refused, message):

@@ -157,7 +157,7 @@ def test_warnings_of_pcl_are_reported(golden, cases):
 
 
 def test_one_vertex_is_refused(golden, cases):
-    with pytest.raises(AlignmentError, match='1 vertices, expected two or more'):
+    with pytest.raises(AlignmentError, match='vertices: 1, expected two or more'):
         lum_of(golden, cases, 'one_vertex', 'exact').compute()
 
 

@@ -178,7 +178,7 @@ def test_scans_that_share_nothing_go_by_odometry_and_are_reported():
 @pytest.mark.parametrize(
     ('num_scans', 'poses', 'message'),
     [
-        (1, np.eye(4)[None], '1 scans'),
+        (1, np.eye(4)[None], '1 scan and'),
         (2, np.eye(4)[None], 'poses of shape'),
         (2, np.full((2, 4, 4), np.nan), 'finite'),
     ],
@@ -198,5 +198,5 @@ def test_scans_with_nothing_to_match_are_refused():
 
 
 def test_frames_that_are_not_one_for_each_scan_are_refused():
-    with pytest.raises(AlignmentError, match='1 frames of 2 scans'):
+    with pytest.raises(AlignmentError, match='1 frames, expected one for each of 2 scans'):
         align_scans([NOTHING] * 2, np.array([np.eye(4)] * 2), frame_ids=['front'])

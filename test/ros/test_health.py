@@ -59,7 +59,7 @@ def test_other_topics_of_clouds_are_the_remedy_if_the_default_has_no_publisher()
 def test_clouds_of_which_none_was_ever_mapped_are_a_warning():
     ((level, text),) = found(received=20, never_mapped=40)
     assert level == WARN
-    assert text.startswith('none of 40 clouds is mapped yet: they wait for poses or were dropped')
+    assert text.startswith('no cloud of 40 is mapped yet: they wait for poses or were dropped')
     ((_, text),) = found(received=20, never_mapped=40, dropped=Counter(no_pose=20))
     assert text.startswith('20 scans dropped just now')
     ((_, text),) = found(received=20, never_mapped=40, paused=True)

@@ -134,7 +134,7 @@ def test_the_full_map_is_published_on_request(start, peer):
     answer = peer.call('publish_normals')
 
     number = len(mapped(messages)[1].map.surfels(5))
-    assert (answer.success, answer.message) == (True, f'{number} surfels published')
+    assert (answer.success, answer.message) == (True, f'{number:,} surfels published')
     peer.spin_until(lambda: normals)
     assert normals[0].width == number
     again = peer.collect(PointCloud2, f'{BASE}/normals', late)

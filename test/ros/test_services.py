@@ -81,7 +81,7 @@ def test_clear_box_removes_voxels_and_later_evictions_stay_exact(peer, node):
     gone = before - twin.map.num_voxels
     assert gone > 10
     assert answer.message == (
-        f'cleared {gone} voxels in clear.box from (-1.0, -1.0, -2.0) to (2.0, 1.5, 0.0)'
+        f'cleared {gone:,} voxels in clear.box from (-1.0, -1.0, -2.0) to (2.0, 1.5, 0.0)'
     )
     assert digest(peer) == twin.map.digest()
     _, values = send_more(peer, twin, 3, 2)  # evicts two scans that have lost voxels
@@ -103,7 +103,8 @@ def test_clear_radius_removes_voxels_about_the_sensor(peer, node):
 
     gone = before - twin.map.num_voxels
     assert gone > 10
-    assert answer.message == f'cleared {gone} voxels in 2 m about the sensor at (0.30, 0.00, 0.50)'
+    where = '2 m about the sensor at (0.30, 0.00, 0.50)'
+    assert answer.message == f'cleared {gone:,} voxels in {where}'
     assert digest(peer) == twin.map.digest()
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config
+from surfel_mapper.errors import counted
 from surfel_mapper.files.model_files import PACKED, TRIANGLES, write_models, write_packed
 from surfel_mapper.files.triangles import import_trimesh
 from surfel_mapper.layers.drawings import Drawing, Section
@@ -155,7 +156,7 @@ class ModelsLayer(Layer):
         """Return figures, a picture, and a table of the largest patches."""
         model, surfels = self.models.model, self.models.surfels
         points = surfel_points(surfels, model.voxel_size_m)
-        picture = picture_of(points, model, above(surfels), f'{len(surfels)} voxels')
+        picture = picture_of(points, model, above(surfels), counted(len(surfels), 'voxel'))
         return section_of(model, self._current_shapes(), picture)
 
     def _make_shapes(self) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.errors import counted
 from surfel_mapper.layers.drawings import (
     Drawing,
     EllipsoidsDrawing,
@@ -99,13 +100,13 @@ def picture_of(
 
     """
     cloud = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-    kinds = f'{len(model.planes)} planes, {len(model.surfaces)} surfaces'
-    kinds += f', {len(model.gaussians)} Gaussians (2 sigma)'
+    kinds = f'{counted(len(model.planes), "plane")}, {counted(len(model.surfaces), "surface")}'
+    kinds += f', {counted(len(model.gaussians), "Gaussian")} (2 sigma)'
     return PointsPicture(
         file_name=PICTURE,
         points=cloud[:: -(-len(cloud) // MOST_POINTS) or 1],
         drawings=drawings_of([shape_of(patch) for patch in model.patches], model.gaussians),
-        titles=(title or f'{len(points):,} points', f'{kinds}: {model.size_bytes:,} bytes'),
+        titles=(title or counted(len(points), 'point'), f'{kinds}: {model.size_bytes:,} bytes'),
         viewpoint=viewpoint,
     )
 
