@@ -22,8 +22,14 @@ from surfel_mapper.files.atomic import check_free, finite_or_none
 from surfel_mapper.offline.options import BAG, MAP_FORMATS, ReplayOptions
 from surfel_mapper.offline.outputs import check_formats, ScanTrajectory, write_files, write_maps
 from surfel_mapper.offline.recording import open_recording
-from surfel_mapper.offline.replay import pose_errors, ReplayResult
+from surfel_mapper.offline.replay import (
+    all_scans,
+    changed_settings,
+    pose_errors,
+    ReplayResult,
+)
 from surfel_mapper.offline.request import Request
+from surfel_mapper.viz.history import History
 
 
 def replay_bags(
@@ -115,6 +121,7 @@ def replay_bags(
         'shards_repeated': mapped.repeated,
         'core_s': round(mapped.core_s, 1),
         'settings': config.to_mapping(),
+        'settings_set': [name for name in changed_settings(config) if name not in all_scans()],
     }
     return written(output, options, mapped, summary)
 
@@ -156,7 +163,8 @@ def written(
     if options.poses_out is not None:
         trajectory.write(options.poses_out)
     summary = finite_or_none({**summary, **pose_errors(options.truth, trajectory)})
-    files = write_files(output, options.formats, mapper, trajectory, summary)
+    history = History(mapped.stamps_ns, trajectory.positions)
+    files = write_files(output, options.formats, mapper, trajectory, summary, history)
     return ReplayResult(mapper, trajectory, summary, files)
 
 

@@ -9,6 +9,7 @@ The figures are flat arrays, about 100 bytes a scan: 4 MB an hour at 10 Hz.
 from __future__ import annotations
 
 from array import array
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +26,12 @@ class History:
     """
     Figures of every scan that was mapped.
 
+    Parameters
+    ----------
+    stamps_ns : sequence of int
+    positions : (S, 3) float64, m
+        Scans that other processes mapped, without their times by stage and numbers of voxels.
+
     Attributes
     ----------
     milliseconds : dict of str to array
@@ -32,10 +39,16 @@ class History:
 
     """
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        stamps_ns: Sequence[int] = (),
+        positions: Iterable[npt.NDArray[np.float64]] = (),
+    ) -> None:
         self.milliseconds: dict[str, array[float]] = {}
-        self._first_ns = 0
+        self._first_ns = stamps_ns[0] if stamps_ns else 0
         self._figures: array[float] = array('d')
+        for stamp_ns, position in zip(stamps_ns, positions, strict=True):
+            self._figures.extend([(stamp_ns - self._first_ns) / 1e9, np.nan, 0.0, *position])
 
     def __len__(self) -> int:
         """Return the number of scans."""

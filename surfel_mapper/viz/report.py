@@ -24,10 +24,11 @@ import numpy as np
 
 from surfel_mapper.config import Config
 from surfel_mapper.counters import decimals, STAGES
+from surfel_mapper.errors import counted
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.charts import histogram, lines, short
+from surfel_mapper.viz.charts import histogram, lines, NO_DATA, short
 from surfel_mapper.viz.history import History
 from surfel_mapper.viz.markup import as_html, html_figures, html_table
 from surfel_mapper.viz.turning_view import turning_view
@@ -168,7 +169,7 @@ def figures(summary: Mapping[str, Any], history: History, surfels: Surfels) -> s
     origin_m = summary.get('origin_m', [0.0, 0.0, 0.0])
     if any(origin_m):
         shown['origin of the map'] = ', '.join(f'{value:.12g}' for value in origin_m) + ' m'
-    if len(history) > 1:
+    if len(history) > 1 and len(summary.get('bags', ())) < 2:  # not the way between bags
         steps = np.diff(history.trajectory, axis=0)
         shown['distance driven'] = f'{np.sqrt((steps * steps).sum(axis=1)).sum():.1f} m'
     if 'recorded_s' in summary:
@@ -188,7 +189,7 @@ def tracking_table(registration: Mapping[str, Any]) -> str:
         if spent['scans']
     ]
     paragraphs = ''.join(
-        f'<p>apart_{number}: {track["scans"]} scans from {track["first_s"]:.3f} to '
+        f'<p>apart_{number}: {counted(track["scans"], "scan")} from {track["first_s"]:.3f} to '
         f'{track["last_s"]:.3f} s have no certain place on the map: {as_html(track["reason"])}</p>'
         for number, track in enumerate(registration['apart'], start=1)
     )
@@ -222,7 +223,7 @@ def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str
     shown = ''.join(
         f'<figure><figcaption>{name}</figcaption>{chart}</figure>'
         for name, chart in charts.items()
-        if chart
+        if chart != NO_DATA
     )
     counts_by_name = {**fates(summary), **points_left_out(summary)}
     table = html_table((), [(name, f'{count:,}') for name, count in counts_by_name.items()])
@@ -261,7 +262,7 @@ def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
             rows.append([f'{kind}, {unit}', *numbers])
     drift_m, drift_deg = errors['drift_m_per_100m'], errors['drift_deg_per_100m']
     drift = (
-        f'{errors["num_poses"]} poses compared; drift {decimals(drift_m)} m and '
+        f'{counted(errors["num_poses"], "pose")} compared; drift {decimals(drift_m)} m and '
         f'{decimals(drift_deg)} deg in 100 m.'
     )
     table = html_table(('', *kinds), rows)
@@ -295,5 +296,5 @@ def settings_table(settings: Mapping[str, Any], chosen: Sequence[str] | None = N
     changed = table(ours) if ours else '<p class="none">No setting was changed.</p>'
     return (
         f'<h2>Settings</h2>{changed}'
-        f'<details><summary>{len(usual)} others</summary>{table(usual)}</details>'
+        f'<details><summary>{counted(len(usual), "other")}</summary>{table(usual)}</details>'
     )

@@ -3,6 +3,7 @@
 """``replay`` of several bags or with workers, and ``merge``, make the map of one process."""
 
 import json
+import re
 import signal
 
 import numpy as np
@@ -68,6 +69,12 @@ def test_several_bags_become_one_map(bags, both, alone, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert f'digest {both}' in printed
     assert str(tmp_path / 'report.html') in printed
+    page = (tmp_path / 'report.html').read_text(encoding='utf-8')
+    view = json.loads(re.search(r'<script [^>]*id="map">(.*?)</script>', page)[1])
+    assert len(view['seconds']) == summary['scans']['mapped']  # the trajectory of all scans
+    assert 'distance driven' not in page  # which has the way between the bags
+    assert 'Voxels over time' not in page  # which no process knows
+    assert 'window.max_scans' not in page.partition('<details>')[0]  # nobody set it
 
 
 @pytest.mark.drawn

@@ -54,6 +54,18 @@ def test_no_scan_at_all_is_an_empty_history():
     assert history.trajectory.shape == (0, 3)
 
 
+def test_scans_of_workers_have_times_and_positions_alone():
+    positions = np.arange(9.0).reshape(3, 3)
+
+    history = History([10**9, 11 * 10**8, 2 * 10**9], positions)
+
+    np.testing.assert_allclose(history.seconds, [0.0, 0.1, 1.0])
+    np.testing.assert_array_equal(history.trajectory, positions)
+    assert np.isnan(history.voxels).all()
+    assert not history.dropped.any()
+    assert history.milliseconds == {}
+
+
 def test_an_alignment_moves_the_positions():
     _, history = mapped(3)
     positions = np.arange(9.0).reshape(3, 3)
