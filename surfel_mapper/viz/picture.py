@@ -17,7 +17,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import escaped
+from surfel_mapper.errors import counted, escaped
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.viz.discs import as_bytes, DrawnDiscs, shaded
@@ -182,10 +182,10 @@ def draw_map(
     draw_key(page, scene, oblique)
     # a name of a file may be no text, or hold dollar signs
     write: dict[str, Any] = {'parse_math': False, 'color': INK}
-    points = 72.0 * (width - 40) / DPI / (LETTER * max(len(escaped(title)), 1))
-    size = min(TITLE_PT, points)
-    page.text(BORDER, height - 20, escaped(title), fontsize=size, va='top', **write)
-    page.text(BORDER, 20, left_out(scene, oblique, plan), fontsize=TEXT_PT, va='bottom', **write)
+    note = left_out(scene, oblique, plan)
+    for text, y, largest_pt in ((escaped(title), height - 20, TITLE_PT), (note, 36, TEXT_PT)):
+        fitting_pt = 72.0 * (width - 40) / DPI / (LETTER * max(len(text), 1))
+        page.text(BORDER, y, text, fontsize=min(largest_pt, fitting_pt), va='top', **write)
     with replace_file(path) as file:
         figure.savefig(file, format='png', dpi=DPI, pil_kwargs={'compress_level': 3})
 
@@ -194,14 +194,13 @@ def left_out(scene: MapScene, oblique: Camera, plan: Camera) -> str:
     """Return the sentence about surfels that the views do not show."""
     total = len(scene.discs) + scene.hidden
     outside = [scene.left_out(camera) for camera in (oblique, plan)]
-    text = f'Drawn as {total:,} surfels, large where the map is flat. Outside the views are '
+    text = f'Drawn as {counted(total, "surfel")}, large where the map is flat. Not in the views: '
     text += f'{outside[0]:,} on the left, {outside[1]:,} on the right'
     if not all(camera.contains(scene.trajectory).all() for camera in (oblique, plan)):
-        text += ', with a part of the trajectory'
+        text += ', part of the trajectory'
     if scene.hidden:
-        text += f'. The ceiling is cut away at {scene.top_m - scene.ground_m:.1f} m above the '
-        text += f'ground, with {scene.hidden:,}'
-    return text + '. Surfels that face away are not drawn.'
+        text += f', {scene.hidden:,} of the ceiling, above {scene.top_m - scene.ground_m:.1f} m'
+    return text + ', and all that face away.'
 
 
 def draw_oblique(page: Axes, scene: MapScene, camera: Camera) -> None:

@@ -41,7 +41,7 @@ MOST_POSES = 2000
 UNLIMITED_M = 1e9
 """Edge of cells at which no disc ends."""
 
-LOGARITHMIC = 20.0
+LOGARITHMIC = 8.0
 """Values are coded by their logarithm if the largest is more than this times the median."""
 
 

@@ -71,7 +71,7 @@ def test_a_lamp_below_the_ceiling_is_cut_away_with_it():
     assert scene.discs.position[:, 2].max() == 0.0
     text = left_out(scene, scene.oblique(), scene.plan(800))
     assert text.startswith('Drawn as 1,604 surfels, ')
-    assert 'ceiling is cut away at 4.9 m above the ground, with 804' in text
+    assert ', 804 of the ceiling, above 4.9 m, ' in text
 
 
 def test_level_ground_is_of_one_colour_whatever_its_planarity(tmp_path):
@@ -123,7 +123,7 @@ def test_most_of_a_picture_is_the_map_although_a_few_surfels_are_far(tmp_path):
 
     outside = scene.left_out(oblique)
     assert scene.left_out(plan) == 1 <= outside < 0.05 * len(near)
-    assert f'are {outside} on the left, 1 on the right' in left_out(scene, oblique, plan)
+    assert f': {outside} on the left, 1 on the right' in left_out(scene, oblique, plan)
     image = drawn(tmp_path, concatenated([near, far]))
     assert num_pixels(image, GROUND) > 0.25 * image[..., 0].size
 

@@ -333,7 +333,7 @@ def test_every_column_has_a_legend(room, column):
     least, most = (float(page.locator(f'#{end}').inner_text()) for end in ('least', 'most'))
     assert least <= most
     page.locator('#colouring').select_option('normal')
-    assert not page.locator('.scale').is_visible()
+    assert page.locator('.scale').inner_text().strip() == 'normal: red x, green y, blue z'
 
 
 def test_the_slider_hides_what_the_sensor_passes_later(room):

@@ -485,9 +485,14 @@
     return column.whole ? Math.round(value) : value;
   }
 
-  const worded = (column, value) => (
-    `${column.whole ? value : +value.toPrecision(3)}${column.unit ? ` ${column.unit}` : ''}`
-  );
+  // No more digits than the step of the codes, which is a share of the value if they are log.
+  function worded(column, value) {
+    const step = (column.high - column.low) / column.steps;
+    const digits = Math.min(Math.max(Math.ceil(-Math.log10(step)), 0), 9);
+    const text = column.log || !step ? value.toPrecision(2) : value.toFixed(digits);
+    return `${column.whole || column.name === 'size' ? value : +text}`
+      + `${column.unit ? ` ${column.unit}` : ''}`;
+  }
   const slopeOf = (row) => Math.acos(Math.min(Math.abs(normalOf(row)[2]), 1)) * 180 / Math.PI;
 
   function valuesOf(row) {
@@ -504,7 +509,7 @@
   const heights = box[2].map((value) => value + data.middle[2]);
   const colourings = [
     {
-      name: 'normal',
+      name: 'normal', legend: 'normal: red x, green y, blue z',
       paint: (row) => normalOf(row).map((value) => 255 * (0.484 + 0.45 * (0.5 + 0.5 * value))),
     },
     {
@@ -687,13 +692,11 @@
     }
     gl.bindBuffer(gl.ARRAY_BUFFER, paintBuffer);
     gl.bufferData(gl.ARRAY_BUFFER, paints, gl.DYNAMIC_DRAW);
-    document.querySelector('.scale').hidden = !chosen.shown;
-    if (chosen.shown) {
-      const unitText = chosen.unit ? ` (${chosen.unit})` : '';
-      document.getElementById('unit').textContent = chosen.name + unitText;
-      [document.getElementById('least').textContent, document.getElementById('most').textContent] =
-        chosen.shown.map((value) => +value.toPrecision(3));
-    }
+    const unitText = chosen.unit ? ` (${chosen.unit})` : '';
+    document.getElementById('unit').textContent = chosen.legend || chosen.name + unitText;
+    document.querySelector('.scale .ramp').hidden = !chosen.shown;
+    [document.getElementById('least').textContent, document.getElementById('most').textContent] =
+      (chosen.shown || ['', '']).map((value) => value && `${+value.toPrecision(3)}`);
     redraw();
   }
 
