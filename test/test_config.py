@@ -26,7 +26,7 @@ DECLARATIONS = {declared.name: declared for declared in declarations()}
 BOUNDED = [declared for declared in declarations() if declared.is_number]
 QUARTER_TURN = [1.0, 2.0, 3.0, 0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 
-UNITS = {'m', 's', 'deg', 'hz', 'voxels', 'weight', 'ratio', 'overlap'}
+UNITS = {'m', 's', 'deg', 'hz', 'voxels', 'weight', 'ratio', 'overlap', 'confidence'}
 
 # A stage may refuse a combination of values within bounds; these companions avoid that.
 COMPANIONS = {

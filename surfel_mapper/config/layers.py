@@ -15,6 +15,7 @@ method, so that one number suits a table and a hall.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import ClassVar
 
 from surfel_mapper.config.settings import setting, Stage
@@ -27,6 +28,16 @@ LIDAR_NOISE_M = 0.02
 
 MAX_LABEL = (1 << 24) - 1
 """Labels are kept as float32, which holds whole numbers up to here."""
+
+LEAST_WEIGHT, MAX_WEIGHT = 1e-4, 1e5
+"""
+Least weight of a measurement, and of a voxel in the mesh; largest weight of a voxel.
+
+At 1 m a measurement has 1.
+"""
+
+LABEL_ODDS = 9.0
+"""A voxel has a label that is 9 times as likely as another: one measurement of Hydra's default."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,11 +103,24 @@ class TsdfConfig(Stage):
     )
     semantics: str = setting(
         'none',
-        'Labels of voxels: none; single, one for each voxel by weighted majority vote.',
+        'Labels of voxels: none; single, one for each voxel by majority vote of measurements.',
         choices=SEMANTICS,
+    )
+    label_confidence: float = setting(
+        0.9,
+        'Probability that a measured label is right. A voxel has a label once it is 9 times as '
+        'likely as any other: from 0.9 on one measurement ahead of all others, at 0.75 two, at '
+        '0.6 six. Else it has none.',
+        low=0.6,
+        high=1.0,
     )
     dynamic_labels: tuple[float, ...] = setting(
         (), 'Labels of moving objects: they free space and leave no surface.'
+    )
+    max_weight_by_label: tuple[float, ...] = setting(
+        (),
+        'Label, weight, label, weight, ...: voxels of these labels keep at most that weight, 1e-4 '
+        'to 1e5, and fade the sooner. A measurement has 1 / distance^2: 1 at 1 m, 0.01 at 10 m.',
     )
     mesh_rate_hz: float = setting(
         1.0,
@@ -121,7 +145,7 @@ class TsdfConfig(Stage):
 
     def check(self, stage: str) -> None:
         """Check conditions on several settings."""
-        side = self.voxels_per_side
+        side, caps = self.voxels_per_side, self.max_weight_by_label
         checks = (
             ('voxels_per_side', side & (side - 1) == 0, 'a power of two'),
             (
@@ -137,18 +161,26 @@ class TsdfConfig(Stage):
             ('color', self.color or not self.color_topic, 'true where color_topic is given'),
             (
                 'semantics',
-                self.semantics != 'none' or not self.label_topic,
-                'another where label_topic is given',
+                self.semantics != 'none' or not (self.label_topic or caps),
+                'another where label_topic or max_weight_by_label is given',
+            ),
+            (
+                'max_weight_by_label',
+                2 * len(self.label_caps) == len(caps)
+                and all(LEAST_WEIGHT <= weight <= MAX_WEIGHT for weight in caps[1::2])
+                and not set(caps[::2]) & set(self.dynamic_labels),
+                f'pairs of a label, once and not in dynamic_labels, and a weight from '
+                f'{LEAST_WEIGHT} to {MAX_WEIGHT}',
             ),
         )
         for name, holds, expected in checks:
             if not holds:
                 raise ConfigError(f'{stage}.{name}: {getattr(self, name)}, expected {expected}')
-        for label in self.dynamic_labels:
+        labels = [('dynamic_labels', label) for label in self.dynamic_labels]
+        for name, label in labels + [('max_weight_by_label', label) for label in caps[::2]]:
             if not (label.is_integer() and 0 <= label <= MAX_LABEL):
                 raise ConfigError(
-                    f'{stage}.dynamic_labels: {label}, expected whole numbers from 0 to '
-                    f'{MAX_LABEL}'
+                    f'{stage}.{name}: {label}, expected whole numbers from 0 to {MAX_LABEL}'
                 )
 
     @property
@@ -156,6 +188,18 @@ class TsdfConfig(Stage):
         """Topics of the images joined with the scans, by kind: color, label."""
         topics = {'color': self.color_topic, 'label': self.label_topic}
         return {kind: topic for kind, topic in topics.items() if topic and self.enabled}
+
+    @property
+    def label_lead(self) -> int:
+        """Measurements by which a label has to be ahead of all others, at least."""
+        odds = self.label_confidence / max(1.0 - self.label_confidence, 1e-9)
+        return math.ceil(math.log(LABEL_ODDS) / math.log(odds) - 1e-9)
+
+    @property
+    def label_caps(self) -> dict[float, float]:
+        """Largest weight of the voxels of some labels."""
+        pairs = self.max_weight_by_label
+        return dict(zip(pairs[::2], pairs[1::2], strict=False))
 
     @property
     def block_size_m(self) -> float:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from surfel_mapper.arguments import as_array, as_numbers
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.config.layers import MAX_LABEL
+from surfel_mapper.config.layers import LEAST_WEIGHT, MAX_LABEL, MAX_WEIGHT
 from surfel_mapper.errors import CloudFormatError, PoseError
 from surfel_mapper.tsdf.kernels import lookup as kernels
 
@@ -29,12 +29,6 @@ Largest entries of R R^T - I: of rotations taken as they are, and of those taken
 
 Rotations in text files of public datasets have determinants down to 0.9995.
 """
-
-LEAST_WEIGHT = 1e-4
-"""Least weight of a measurement, and of a voxel in the mesh; at 1 m a measurement has 1."""
-
-MAX_WEIGHT = 1e5
-"""Largest weight of a voxel."""
 
 
 def warn_of_short_truncation(config: TsdfConfig) -> None:

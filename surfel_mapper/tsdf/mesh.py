@@ -20,11 +20,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.config.layers import LEAST_WEIGHT
 from surfel_mapper.kernels.layout import KEY
 from surfel_mapper.tsdf.blocks import block_index, BlockMap, copied_rows, UPPER
 from surfel_mapper.tsdf.kernels.blocks import INSIDE
 from surfel_mapper.tsdf.kernels.marching_cubes import describe, find_cases, march
-from surfel_mapper.tsdf.measurements import LEAST_WEIGHT
 from surfel_mapper.tsdf.queries import labels_of
 
 Float32 = npt.NDArray[np.float32]
@@ -332,7 +332,7 @@ class Mesher:
         if config.semantics == 'none':
             return np.empty(0, np.int32)
         votes = np.moveaxis(changes.votes[ends[0], :, ends[1]], -1, 0)
-        labels, _ = labels_of(votes)
+        labels, _ = labels_of(votes, config.label_lead)
         second = along > 0.5
         near = np.where(second, labels[:, 1], labels[:, 0])
         return np.where(near >= 0, near, np.where(second, labels[:, 0], labels[:, 1]))

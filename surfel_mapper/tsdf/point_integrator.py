@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.config.layers import LEAST_WEIGHT, MAX_WEIGHT
 from surfel_mapper.errors import CloudFormatError, MapLimitError
 from surfel_mapper.kernels.layout import INDEX_OFFSET
 from surfel_mapper.threads import share, usable_cores
@@ -41,8 +42,6 @@ from surfel_mapper.tsdf.measurements import (
     checked_labels,
     checked_pose,
     Integrated,
-    LEAST_WEIGHT,
-    MAX_WEIGHT,
     settings,
     warn_of_short_truncation,
 )

@@ -132,7 +132,7 @@ def checked_size(size: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.int32], Float32]:
     """
-    Return the label of the voxel at each point, and its lead.
+    Return the label of the voxel at each point, and its lead over all others, measurements.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.i
     Returns
     -------
     (P,) int32 and (P,) float32
-        As ``labels_of``; -1 and 0 for points outside of the map.
+        As ``labels_of``; -1 and 0 for points outside of the map, and for uncertain labels.
 
     Raises
     ------
@@ -161,13 +161,14 @@ def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.i
     x, y, z = (voxel & ((1 << bits) - 1)).T
     votes = blocks.votes[rows, :, x + ((y + (z << bits)) << bits)]
     votes[rows < 0] = 0.0  # as in a voxel without labels
-    return labels_of(votes.T)
+    return labels_of(votes.T, blocks.config.label_lead)
 
 
-def labels_of(votes: Float32) -> tuple[npt.NDArray[np.int32], Float32]:
+def labels_of(votes: Float32, least_lead: float) -> tuple[npt.NDArray[np.int32], Float32]:
     """
-    Return the label of each voxel, -1 for none, and its lead, from votes (2, ...).
+    Return the label of each voxel and its lead, from votes (2, ...); -1 and 0 for none.
 
-    See tsdf/kernels/channels.py for the votes.
+    A smaller lead than ``least_lead`` is none. See tsdf/kernels/channels.py for the votes.
     """
+    votes = np.where(votes[1] >= least_lead, votes, np.float32(0.0))
     return votes[0].astype(np.int32) - 1, votes[1]

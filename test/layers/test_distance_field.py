@@ -167,7 +167,7 @@ def test_colours_and_labels_of_points_enter():
     mesh = mapper.tsdf.mesh()
     assert set(map(tuple, mesh.colors.tolist())) == {(200, 100, 50)}
     blocks = mapper.tsdf.blocks
-    labels, _ = labels_of(blocks.votes[blocks.rows()].swapaxes(0, 1))
+    labels, _ = labels_of(blocks.votes[blocks.rows()].swapaxes(0, 1), 1)
     assert set(np.unique(labels)) == {-1, 7}
 
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """DistanceField: fused, queried, meshed, saved and loaded by one class."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from surfel_mapper.tsdf.sensors import CameraModel
 from test.tsdf.scenes import lidar_rays
 
 CONFIG = TsdfConfig(voxel_size_m=0.1, truncation_m=0.3, color=True, semantics='single')
+CAMERA = CameraModel(columns=80, rows=60, fx=70.0, fy=70.0, cx=40.0, cy=30.0)
 SPHERE = 2.0 * lidar_rays(64, 360, 60.0).reshape(-1, 3)
 
 
@@ -40,6 +43,18 @@ def test_field_of_a_sphere_has_its_distances_gradients_colours_and_labels():
     assert field.esdf(max_m=3.0).sample([(1.0, 0.0, 0.0)]) == pytest.approx(1.0, abs=0.2)
 
 
+def test_labels_are_unknown_until_they_are_nine_times_as_likely_as_others():
+    field = DistanceField(replace(CONFIG, label_confidence=0.75))
+    leads = []
+    for label in (3, 3, 4, 4, 4):  # 3:1 each: two ahead are 9:1
+        image = np.full((60, 80), label)
+        field.add_depth(np.full((60, 80), 1.55), CAMERA, np.eye(4), label=image)
+        label, lead = field.labels_at([[0.0, 0.0, 1.55]])
+        leads.append((label[0], lead[0]))
+        assert set(field.mesh().labels) == {label[0]}
+    assert leads == [(-1, 0.0), (3, 2.0), (-1, 0.0), (-1, 0.0), (-1, 0.0)]
+
+
 def test_labels_beyond_the_largest_are_refused_and_the_field_unchanged():
     field = DistanceField(CONFIG)
     with pytest.raises(CloudFormatError, match=r'labels: .* to 16777216, expected .* to 16777215'):
@@ -50,10 +65,9 @@ def test_labels_beyond_the_largest_are_refused_and_the_field_unchanged():
 
 
 def test_depth_image_is_fused_with_its_colours():
-    camera = CameraModel(columns=80, rows=60, fx=70.0, fy=70.0, cx=40.0, cy=30.0)
     field = DistanceField(CONFIG)
     color = np.full((60, 80, 3), 77, np.uint8)
-    field.add_depth(np.full((60, 80), 1.55, np.float32), camera, np.eye(4), color=color)
+    field.add_depth(np.full((60, 80), 1.55, np.float32), CAMERA, np.eye(4), color=color)
     mesh = field.mesh()
     assert np.abs(mesh.vertices[:, 2] - 1.55).max() < 1e-3
     assert (mesh.colors == 77).all()

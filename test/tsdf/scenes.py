@@ -5,10 +5,10 @@
 import numpy as np
 
 from surfel_mapper.config import TsdfConfig
+from surfel_mapper.config.layers import LEAST_WEIGHT
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.kernels import range_image as kernels
-from surfel_mapper.tsdf.measurements import LEAST_WEIGHT
 from surfel_mapper.tsdf.range_image import limits, RangeImage
 from surfel_mapper.tsdf.sensors import CameraModel
 

@@ -75,36 +75,45 @@ def test_points_of_another_shape_are_refused():
     assert len(sample(linear_field(), np.empty((0, 3))).distance) == 0
 
 
-RNG = np.random.default_rng(2)
-SEEN = RNG.integers(-1, 6, (40, 50))
-WEIGHTS = RNG.uniform(0.5, 2.0, (40, 50)).astype(np.float32)
-
-
-def votes_after(seen, weights):
-    """Return the votes of voxels, (2, N), after rows of labels and weights."""
-    votes, signed = np.zeros((2, seen.shape[1]), np.float32), np.zeros(seen.shape[1], np.float32)
+def votes_after(measured):
+    """Return the votes of voxels, (2, N), after rows of labels, -1 for unknown."""
+    votes, signed = np.zeros((2, measured.shape[1]), np.float32), np.zeros(measured.shape[1])
     tau, most, rate = np.float32(1.0), np.float32(1e5), np.float32(0.0)
-    for label, weight in zip(seen.astype(np.int32), weights.astype(np.float32), strict=True):
-        fuse_labels(tau, most, rate, label, signed, weight, votes)
+    for label in measured.astype(np.int32):
+        weight = np.full(len(label), 0.01, np.float32)
+        fuse_labels(tau, most, rate, label, signed.astype(np.float32), weight, votes)
     return votes
 
 
-def test_a_single_label_follows_the_weighted_majority_vote():
-    seen = np.array([[3, 3], [4, 4], [4, 5], [5, 5], [5, -1]])
-    weights = np.array([[2, 1], [1, 1], [3, 1], [1, 1], [1, 9]], np.float32)
-    # 3: 2; 3: 1; 4: 2 (takes it with 3 - 1); 4: 1; 5: 0 (equal: takes it).
+def test_a_single_label_follows_the_majority_vote():
+    measured = np.array([[3, 3], [4, 4], [4, 5], [5, 5], [5, -1]])
+    # 3: 1; 4: 0 (equal: takes it); 4: 1; 5: 0; 5: 1.
     # 3: 1; 4: 0; 5: 1; 5: 2; unknown: nothing.
-    votes = votes_after(seen, weights)
-    labels, lead = labels_of(votes)
+    labels, lead = labels_of(votes_after(measured), 1)
     assert labels.tolist() == [5, 5]
-    assert lead.tolist() == [0.0, 2.0]
+    assert lead.tolist() == [1.0, 2.0]
+    assert labels_of(votes_after(measured), 2)[0].tolist() == [-1, 5]
     majority = np.array([[1], [2], [1], [3], [1], [1], [2], [1]])  # 5 of 8
-    votes = votes_after(majority, np.ones((8, 1)))
-    assert labels_of(votes)[0].tolist() == [1]
+    assert labels_of(votes_after(majority), 1)[0].tolist() == [1]
+    tie = np.array([[1], [2], [2], [1]])
+    assert [values.tolist() for values in labels_of(votes_after(tie), 1)] == [[-1], [0.0]]
+
+
+@pytest.mark.parametrize('confidence', [0.6, 0.7, 0.75, 0.8, 0.9, 0.99])
+def test_a_voxel_has_the_label_of_nine_tenths_of_the_posterior(confidence):
+    measured = np.random.default_rng(2).choice([2, 8], (15, 400), p=[0.35, 0.65])
+    likelihood = [
+        np.where(measured == label, confidence, 1.0 - confidence).prod(axis=0) for label in (2, 8)
+    ]
+    posterior = likelihood / np.sum(likelihood, axis=0)
+    expected = np.where(posterior[0] > 0.9 - 1e-9, 2, np.where(posterior[1] > 0.9 - 1e-9, 8, -1))
+    least_lead = TsdfConfig(label_confidence=confidence).label_lead
+    labels, _ = labels_of(votes_after(measured), least_lead)
+    np.testing.assert_array_equal(labels, expected)
 
 
 def test_a_voxel_never_labelled_has_no_label():
-    assert labels_of(np.zeros((2, 5), np.float32))[0].tolist() == [-1] * 5
+    assert labels_of(np.zeros((2, 5), np.float32), 1)[0].tolist() == [-1] * 5
 
 
 def test_labels_at_points_are_those_of_the_wall_that_was_seen():

@@ -200,7 +200,9 @@ class DistanceField:
         self, points: npt.ArrayLike
     ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
         """
-        Return the labels at (P, 3) points, map frame, and their weights; -1 and 0 if unknown.
+        Return the labels at (P, 3) points, map frame, and their leads; -1 and 0 if uncertain.
+
+        A lead is the number of measurements by which a label is ahead of all others.
 
         Raises
         ------

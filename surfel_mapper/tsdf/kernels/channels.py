@@ -8,8 +8,11 @@ weights, or the nearest one. Colours are interpolated; masks and labels are vote
 inside the band if its signed distance is below the truncation tau, which stands for free space.
 
 The label of a voxel is kept as two numbers, ``votes`` (2, N) float32: label + 1, 0 for none, and
-its lead over all other labels by Boyer and Moore's majority vote, weighted. A lead obeys the cap
-of the map, ``max_weight``. A label is stored as float32, exact up to 2^24. Label -1 means unknown.
+its lead over all other labels by Boyer and Moore's majority vote, in measurements. Each counts as
+one, near or far, as in Hydra's MLE: n of them that are right with probability c tell that a label
+is (c / (1 - c))^n times as likely as another. Among two labels the lead is the difference of
+their counts; with more it is exact only for one that has the majority. A lead obeys the cap of
+the map, ``max_weight``. A label is stored as float32, exact up to 2^24. Label -1 means unknown.
 """
 
 from numba import njit
@@ -141,17 +144,17 @@ def fuse_labels(tau, max_weight, rate, label, signed, weight, votes):
     """
     for n in range(len(label)):
         if label[n] >= 0 and weight[n] > _ZERO and signed[n] < tau:
-            vote(label[n], weight[n], max_weight, rate, votes, n)
+            vote(label[n], max_weight, rate, votes, n)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def vote(label, weight, max_weight, rate, votes, n):
-    """Add weight to the stored label, or reduce its lead; a larger weight replaces it."""
-    most = min(max_weight, weight / rate if rate > _ZERO else max_weight)
+def vote(label, max_weight, rate, votes, n):
+    """Add one to the lead of a stored label, or take one from it; a lead below one is replaced."""
+    most = min(max_weight, _ONE / rate if rate > _ZERO else max_weight)
     name = np.float32(label + 1)
     if votes[0, n] == name:
-        votes[1, n] = min(votes[1, n] + weight, most)
-    elif weight >= votes[1, n]:
-        votes[0, n], votes[1, n] = name, weight - votes[1, n]
+        votes[1, n] = min(votes[1, n] + _ONE, most)
+    elif votes[1, n] <= _ONE:
+        votes[0, n], votes[1, n] = name, _ONE - votes[1, n]
     else:
-        votes[1, n] = min(votes[1, n], most) - weight
+        votes[1, n] = min(votes[1, n], most) - _ONE

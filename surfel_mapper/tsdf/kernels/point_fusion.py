@@ -437,4 +437,4 @@ def fuse_point_channels(points, weights, rates, max_weight, bits, lookup, slots,
                     color[row, channel, voxel] += change * gain
                 color[row, 3, voxel] = min(together, max_weight)
             if has_label:
-                vote(labels[p], w, max_weight, rate, votes[row], voxel)
+                vote(labels[p], max_weight, rate, votes[row], voxel)
