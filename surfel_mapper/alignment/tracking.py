@@ -23,7 +23,6 @@ import numpy.typing as npt
 
 from surfel_mapper.alignment.companions import companions, LEAST_ACROSS_M, LEAST_SHARE
 from surfel_mapper.alignment.registration import (
-    is_near,
     Registration,
     RegistrationResult,
     thinned,
@@ -228,7 +227,8 @@ class Tracker:
             better = 0.0 if self._has_companions else BETTER
             if rival.converged and share + rival.support > result.support + better:
                 return rival
-        if not is_near(result.T_map_sensor, starts[0], LEAST_ACROSS_M):
+        off = compose(inverse(starts[0]), result.T_map_sensor)
+        if math.hypot(*off[:3, 3], result.radius_m * rotation_angle(off)) >= LEAST_ACROSS_M:
             share = float(self._companions(some, starts, result.T_map_sensor, size_m).mean())
         return replace(result, companions=share)
 

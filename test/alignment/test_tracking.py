@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 
+from surfel_mapper.alignment.companions import LEAST_SHARE
 from surfel_mapper.alignment.registration import Registration
 from surfel_mapper.alignment.tracking import Tracker
 from surfel_mapper.config import RegistrationConfig
@@ -117,3 +118,15 @@ def test_a_scan_that_two_places_fit_equally_well_is_refused(turn_deg, is_ambiguo
         assert found.rival == 0.0
         np.testing.assert_allclose(found.T_map_sensor[:3, :3], heading(turn_deg), atol=2e-3)
     assert tracker.num_ambiguous == is_ambiguous
+
+
+def test_a_turn_that_stops_does_not_make_the_surroundings_companions():
+    tracker, surfel_map = tracker_at(TRUE), map_of(ROOM)
+    shares = []
+    for number in range(6):
+        turn = np.array([0.0, 0.0, 0.0, 0.0, 0.0, math.radians(2.0 * (number // 2))])
+        cells = cells_at(tracker, compose(TRUE, se3_exp(turn)), seed=number)
+        found = tracker.track(cells, number * SECOND // 10, surfel_map, np.eye(4))
+        shares.append(found.companions)
+
+    assert max(shares) < LEAST_SHARE
