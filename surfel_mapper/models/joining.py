@@ -42,8 +42,12 @@ LARGER = 8.0
 LEAST_COSINE = 0.5
 """Noise is along the ray; at grazing incidence other errors dominate."""
 
-FLOOR_VOXELS = 0.02
-"""Residuals are not resolved below this, in voxels: exact surfaces would otherwise never join."""
+LEAST_FLOOR_VOXELS, MOST_FLOOR_VOXELS = 0.02, 0.1
+"""
+Residuals are not resolved below the first: exact surfaces would otherwise never join. Nor are they
+below noise that grows with range^2, up to the second. It is that of depth cameras, correlated over
+tens of centimetres: halves of a table seem to differ by less.
+"""
 
 LEAST_TURN_DEG, LEAST_BEND_VOXELS, LEAST_BEND_SIGMAS = 15.0, 0.25, 1.5
 """
@@ -192,8 +196,8 @@ class Comparison:
         Normals of the patches.
     sigma : (K,) float64, m
         Noise across them.
-    floor : float
-        Square of the residuals that are not resolved, m^2.
+    floor : (K,) float64, m^2
+        Square of the residuals that are not resolved.
 
     """
 
@@ -203,7 +207,7 @@ class Comparison:
     extents: Array
     normals: Array
     sigma: Array
-    floor: float
+    floor: Array
 
     @classmethod
     def of(
@@ -217,8 +221,10 @@ class Comparison:
         normals[np.einsum('ij,ij->i', towards, normals) < 0.0] *= -1.0
         range_sq = np.maximum(np.einsum('ij,ij->i', towards, towards), 1e-24)
         cosine = np.abs(np.einsum('ij,ij->i', towards, normals)) / np.sqrt(range_sq)
-        sigma = (noise[0] + noise[1] * range_sq) * np.maximum(cosine, LEAST_COSINE)
-        floor = (FLOOR_VOXELS * size_m) ** 2
+        cosine = np.maximum(cosine, LEAST_COSINE)
+        sigma = (noise[0] + noise[1] * range_sq) * cosine
+        limits = LEAST_FLOOR_VOXELS * size_m, MOST_FLOOR_VOXELS * size_m
+        floor = np.clip(noise[1] * range_sq * cosine, *limits) ** 2
         extents = np.sqrt(3.0 * values[:, 2]) + size_m
         sigma = np.maximum(sigma, np.sqrt(np.maximum(values[:, 0], floor)))
         return cls(pieces, means, covariances, extents, normals, sigma, floor)
@@ -305,7 +311,8 @@ class Comparison:
         limits = CURVED_GAIN, math.radians(LEAST_TURN_DEG), LEAST_BEND_VOXELS * size_m
         gains, turns, bends = (figures[:, :3] > limits).T
         curved = gains & turns & bends & (figures[:, 2] > LEAST_BEND_SIGMAS * own)
-        is_worse = figures[:, 3] > np.maximum(MOST_WORSE * own, UNRESOLVED_VOXELS * size_m)
+        limit_m = MOST_WORSE * np.sqrt(own**2 + self.floor[names])
+        is_worse = figures[:, 3] > np.maximum(limit_m, UNRESOLVED_VOXELS * size_m)
         is_worse &= ~curved & (np.bincount(index, minlength=every)[:-1] > 1)
         normals = totals[names]
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]

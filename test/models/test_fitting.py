@@ -154,6 +154,23 @@ def test_table_is_one_plane_and_objects_are_patches(data_folder, size_m, table, 
     assert mean['impure'] <= 0.01
 
 
+TURNED = [('test0', 2, 0.03), ('test1', 4, 0.03), ('test10', 2, 0.025), ('test12', 18, 0.03)]
+"""Frames, seeds of their directions, and voxel sizes, m, in which tables were two planes."""
+
+
+@pytest.mark.parametrize(('name', 'seed', 'size_m'), TURNED)
+def test_distorted_tables_are_one_plane_in_any_direction(data_folder, name, seed, size_m):
+    """Halves that differ by less than the noise of the camera were two planes."""
+    from scipy.spatial.transform import Rotation
+
+    points, labels = tabletop.frame(data_folder / 'data' / 'osd' / f'{name}.pcd')
+    R_turned_camera = Rotation.from_quat(np.random.default_rng(seed).standard_normal(4))
+    points = points @ R_turned_camera.as_matrix().T.astype(np.float32)
+    model = fit(points, ModelsConfig(voxel_size_m=size_m))
+    counts = np.bincount(model.labels[np.isfinite(points[:, 0]) & (labels == tabletop.TABLE)])
+    assert counts.max() > 0.95 * counts.sum()
+
+
 @pytest.mark.parametrize(
     ('sigma', 'outliers', 'least'),
     [

@@ -222,7 +222,7 @@ def compare_regions(pairs, groups, pieces, regions, floor, columns, out):
     groups   members (K,) int64 and first (K + 1,) int64: see above
     pieces   starts (K + 1,) int64, points (P, 3), weights (P,), patch normals (K, 3) float64
     regions  sums of normals (K, 3), middles (K, 3), extents (K,), m, noise across them (K,), m
-    floor    square of the residuals that are not resolved, m^2
+    floor    (K,) float64, square of the residuals that are not resolved, m^2
     columns  (4, P + 1) float64, scratch
     out      (R, 4) float64, out: gain of a pair, 0 for none; of a region: gain of the best height
              field over a plane, turn, rad, and bend, m, of the quadric, rms from a plane, m
@@ -271,13 +271,14 @@ def compare_regions(pairs, groups, pieces, regions, floor, columns, out):
                 end += 1
         if min(middle, end - middle) < 3 and not is_single:
             continue
-        both = heights(columns, zero, end, normals[2], floor)
+        least = max(floor[a], floor[b])
+        both = heights(columns, zero, end, normals[2], least)
         gain, out[r, 1], out[r, 2], out[r, 3] = both[1] - both[0], both[3], both[4], both[2]
         if not is_single:
             gain, rms_m = -both[0], max(noise[a], noise[b])
             for side in range(2):
                 low, high = (middle, end) if side else (zero, middle)
-                own = heights(columns, low, high, normals[side], floor)
+                own = heights(columns, low, high, normals[side], least)
                 gain, rms_m = gain + own[0], max(rms_m, own[2])
             if cosine > COPLANAR_COSINE and both[2] < COPLANAR_GROWTH * rms_m:
                 gain = max(gain, float(min(middle, end - middle)))
