@@ -21,14 +21,10 @@ from surfel_mapper.config import TsdfConfig
 from surfel_mapper.threads import share, usable_cores
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.kernels import lookup as kernels
-from surfel_mapper.tsdf.kernels.blocks import STAMP
-from surfel_mapper.tsdf.kernels.integration import (
-    integrate_blocks,
-    NUM_FOUND,
-    OBSERVED,
-)
+from surfel_mapper.tsdf.kernels.integration import integrate_blocks, NUM_FOUND
 from surfel_mapper.tsdf.measurements import (
     checked_pose,
+    fuse_into,
     Integrated,
     settings,
     warn_of_short_truncation,
@@ -117,28 +113,12 @@ class Integrator:
             fit = blocks.admit(selected.index, T[:3, 3])
         else:
             fit = blocks.find(selected.index) >= 0
-        index, near = selected.index[fit], selected.near[fit]
-        num_before = blocks.num_blocks
-        rows = blocks.place(index)
-        try:
-            skipped = ~near & blocks.settled(rows)
-            blocks.head[rows[skipped], STAMP] = stamp_ns
-            fused = ~skipped
-            figures = self._fuse(image, T, stamp_ns, index[fused], rows[fused])
-            observed = figures[:, OBSERVED]
-            changed = observed > 0
-            updated = rows[fused][changed]
-            if len(updated):
-                blocks.touch_fused(updated, stamp_ns, figures[changed])
-        finally:
-            blocks.drop_new(rows)
-        return Integrated(
-            num_blocks=len(index),
-            num_updated=len(updated),
-            num_skipped=int(skipped.sum()),
-            num_added=blocks.num_blocks - num_before,
-            num_voxels=int(observed.sum()),
-        )
+        index = selected.index[fit]
+
+        def fuse(chosen: Int64, rows: Int64) -> Int64:
+            return self._fuse(image, T, stamp_ns, index[chosen], rows)
+
+        return fuse_into(blocks, index, selected.near[fit], stamp_ns, fuse)
 
     def _fuse(
         self,

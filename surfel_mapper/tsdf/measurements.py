@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 import logging
@@ -16,7 +17,10 @@ from surfel_mapper.arguments import as_array, as_numbers
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.config.layers import LEAST_WEIGHT, MAX_LABEL, MAX_WEIGHT
 from surfel_mapper.errors import CloudFormatError, PoseError
+from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.kernels import lookup as kernels
+from surfel_mapper.tsdf.kernels.blocks import STAMP
+from surfel_mapper.tsdf.kernels.integration import OBSERVED
 
 logger = logging.getLogger(__name__)
 
@@ -67,6 +71,53 @@ class Integrated:
     num_skipped: int
     num_added: int
     num_voxels: int
+
+
+def fuse_into(
+    blocks: BlockMap,
+    index: Int64,
+    near: npt.NDArray[np.bool_],
+    stamp_ns: int,
+    fuse: Callable[[Int64, Int64], Int64],
+) -> Integrated:
+    """
+    Fuse a measurement into its blocks, of which missing ones are added.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        The map.
+    index : (K, 3) int64
+        The blocks.
+    near : (K,) bool
+        Blocks near a surface. Others are left out if they were free for long.
+    stamp_ns : int
+        Stamp of the measurement, ns.
+    fuse : callable
+        Fuses into blocks, given by their places in index and their rows; returns figures of each.
+
+    """
+    num_before = blocks.num_blocks
+    rows = blocks.place(index)
+    try:
+        skipped = ~near & blocks.settled(rows)
+        blocks.head[rows[skipped], STAMP] = stamp_ns
+        chosen = np.flatnonzero(~skipped)
+        figures = fuse(chosen, rows[chosen])
+        observed = figures[:, OBSERVED]
+        changed = observed > 0
+        updated = rows[chosen][changed]
+        if len(updated):
+            blocks.touch_fused(updated, stamp_ns, figures[changed])
+    finally:
+        blocks.drop_new(rows)
+    return Integrated(
+        num_blocks=len(rows),
+        num_updated=len(updated),
+        num_skipped=int(skipped.sum()),
+        num_added=blocks.num_blocks - num_before,
+        num_voxels=int(observed.sum()),
+    )
 
 
 def settings(config: TsdfConfig) -> Float32:
