@@ -168,8 +168,8 @@ class Scan:
     Raises
     ------
     ValueError
-        If the points are not a floating point array (N, 3), the stamp is no whole number, a
-        column is not of length N, or a pose or the free directions have another shape.
+        If the points are not a floating point array (N, 3), or the stamp is no whole number. If
+        a column is not of length N, or a pose or the free directions have another shape.
     TypeError
         If the frame is no name, or the columns are no mapping.
 

@@ -114,7 +114,7 @@ class LUM:
     max_iterations : int
         Maximum number of steps, at least one.
     convergence_threshold : float
-        Iteration ends when the change of the poses is at most this: the length of the change (m
+        Iteration ends when the change of the poses is at most this. The change is its length (m
         and rad together), averaged over the vertices other than 0.
     jacobian : str
         ``exact``, or ``pcl`` for the steps that PCL takes.
@@ -266,9 +266,9 @@ class LUM:
         Return the covariance of every pose at the present poses, (V, 6, 6).
 
         Of a small motion of the vertex in the frame of vertex 0: translation of its origin, m,
-        then rotation vector, rad. It follows from the noise of the pairs, which is estimated from
-        their residuals (pairs without weights) or stated by the weights, and from the weights that
-        edges have in the solution. Pairs are taken as independent, and weights as of one direction
+        then rotation vector, rad. It follows from the noise of the pairs and from the weights
+        that edges have in the solution. Weights of pairs state their noise, else it is estimated
+        from their residuals. Pairs are taken as independent, and weights as of one direction
         each, as those of surfels; weights of rank 3 give three times the covariance. 0 for vertex
         0, nan for vertices that no edge connects to it.
 

@@ -3,7 +3,7 @@
 """
 The one configuration of node and replay: a frozen dataclass for every stage.
 
-A setting states its default, unit, bounds and meaning once, here; the ROS parameters, the YAML
+A setting states its default, unit, bounds and meaning once, here. The ROS parameters, the YAML
 files and the table in docs/settings.md are made from it or compared with it. A setting is called
 ``stage.name`` everywhere, or by its name alone if it belongs to no stage. Values keep to the types
 of ROS parameters, so that one YAML serves both. Nothing is repaired in silence: an unknown name,

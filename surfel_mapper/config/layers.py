@@ -86,9 +86,9 @@ class TsdfConfig(Stage):
     )
     forget_s: float = setting(
         10.0,
-        'A surface that is gone becomes free within this time of being seen through, and one that '
-        'comes appears, however often the voxels were observed before, s; colours and labels '
-        'follow as fast; 0: after as many scans as have seen the opposite. Needs stamps.',
+        'A surface that is gone becomes free within this time of being seen through, s. A new '
+        'one appears as fast, however often the voxels were observed, and so do colours and '
+        'labels. 0: after as many scans as have seen the opposite. Needs stamps.',
         low=0.0,
         high=1e9,
     )

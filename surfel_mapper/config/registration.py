@@ -23,7 +23,7 @@ class RegistrationConfig(Stage):
 
     start: tuple[float, ...] = setting(
         (),
-        'Initial pose of the base in the fixed frame, x y z in m, qx qy qz qw; empty: the origin, '
+        'Initial pose of the base in the fixed frame, x y z in m, qx qy qz qw. Empty: the origin, '
         'or found by a search with map.mode frozen.',
     )
     noise_m: float = setting(

@@ -45,22 +45,22 @@ class MapConfig(Stage):
     )
     origin: str = setting(
         '',
-        'Point of the fixed frame that is the origin of the map, for poses in UTM or ECEF: '
-        'text of x y z, m; auto: near the first pose. Files have the coordinates of the fixed '
+        'Point of the fixed frame that is the origin of the map, for poses in UTM or ECEF. '
+        'Text of x y z, m; auto: near the first pose. Files have the coordinates of the fixed '
         'frame, topics those of the map. Empty: the two are the same.',
     )
     load: str = setting(
         '',
         'Map to start from: a file of ~/save_map or replay (.npz, .parquet), the output directory '
-        'of a replay, tiles, or a cloud of points (.ply, .pcd, .las, ...); its surfels stay. '
+        'of a replay, tiles, or a cloud of points (.ply, .pcd, .las, ...). Its surfels stay. '
         'latest: the newest map or checkpoint in output.directory, if any, with its window. '
         'Empty: none.',
     )
     max_bytes: int = setting(
         -1,
-        'The oldest scans are evicted while map and window need more bytes, and the farthest '
-        'blocks of the distance field while it needs more than they leave; -1: half of the '
-        'memory of the machine, for scans if the window has a limit; 0: no such limit.',
+        'The oldest scans are evicted while map and window need more bytes. The distance field '
+        'loses its farthest blocks while it needs more than they leave. -1: half of the memory '
+        'of the machine, for scans if the window has a limit. 0: no such limit.',
         low=-1,
         high=2**62,
         live=True,
@@ -139,7 +139,7 @@ class WindowConfig(Stage):
     gate_distance_m: float = setting(
         0.0,
         'A scan is left out unless the sensor has moved this far since the last one mapped, m, '
-        'or turned by gate_angle_deg; both 0: every scan is mapped.',
+        'or turned by gate_angle_deg. Both 0: every scan is mapped.',
         low=0.0,
         high=1e6,
         live=True,
@@ -160,9 +160,9 @@ class PoseConfig(Stage):
 
     source: str = setting(
         'auto',
-        'auto: the first of tf, odometry and pose that is there, else registration; tf: the tree '
-        'in /tf; odometry: nav_msgs/Odometry; pose: geometry_msgs/PoseStamped; identity: clouds '
-        'are in the fixed frame; registration: scans are aligned to the map.',
+        'auto: the first of tf, odometry and pose that is there, else registration. tf: the tree '
+        'in /tf. odometry: nav_msgs/Odometry. pose: geometry_msgs/PoseStamped. identity: clouds '
+        'are in the fixed frame. registration: scans are aligned to the map.',
         choices=POSE_SOURCES,
     )
     registration_after_s: float = setting(

@@ -110,8 +110,8 @@ class RemoveSensorBias(Filter):
     """
     Undo the bias of range at grazing angles; needs incidenceAngles and observationDirections.
 
-    The pulse of a beam of finite width returns stretched from an inclined surface, so that its
-    peak, which a lidar times, is not that of the beam's axis.
+    The pulse of a beam of finite width returns stretched from an inclined surface. A lidar times
+    its peak, which is not that of the beam's axis.
     """
 
     sensor_type: int = parameter(

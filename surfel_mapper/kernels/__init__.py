@@ -10,7 +10,7 @@ with the commands that install it.
 If numba finds no writable cache directory, it refuses to load any kernel; the kernels are then
 cached in a temporary directory and compiled at every start.
 
-numba recompiles a kernel if its own file changed, but not if a kernel that it calls did: after an
+numba recompiles a kernel if its own file changed, but not if a kernel that it calls did. After an
 update, cached kernels could disagree on the layout of a table. So a change in a module of kernels
 discards the cached kernels of that module and of all that import it, directly or not.
 """

@@ -165,7 +165,7 @@ class Surfel:
         Remove a point (3,), a batch (N, 3) or the points of another surfel; see from_points.
 
         Removing at least num_points points empties the surfel; a single remaining point has no
-        scatter. Removing points that were never added is not detected: the remaining scatter may
+        scatter. Removing points that were never added is not detected. The remaining scatter may
         then belong to no set of points, and its negative eigenvalues are reported as 0.
         """
         self._sums = self._sums.with_removed(_sums_of(points))

@@ -76,8 +76,8 @@ class SurfelMap(MomentMap):
         ``coarsen`` returned, to which no scan can be added.
     origin_m : (3,) float, m
         Place of the origin of the map in an outer frame, such as UTM, in which files are written.
-        Points are given and surfels returned in the frame of the map, and the digest does not
-        depend on it; ``merge`` and ``subtract`` shift maps of another origin, exactly.
+        Points are given and surfels returned in the frame of the map. The digest does not
+        depend on it. ``merge`` and ``subtract`` shift maps of another origin, exactly.
 
     Raises
     ------
@@ -189,7 +189,7 @@ class SurfelMap(MomentMap):
         this one is inserted.
 
         A point is quantised once, X = floor((((R0 x + R1 y) + R2 z) + t) 65536 / voxel size)
-        in float64; the voxel index is X >> 16 and the place in the voxel (X & 65535) - 32768.
+        in float64. The voxel index is X >> 16 and the place in the voxel (X & 65535) - 32768.
 
         Parameters
         ----------
@@ -230,8 +230,8 @@ class SurfelMap(MomentMap):
         min_points : int
             Voxels with fewer points are skipped.
         at_most : int, optional
-            Maximum number of surfels; a larger map is subsampled evenly in space, by a hash of
-            the voxel, so that the selection changes little while the map grows.
+            Maximum number of surfels. A larger map is subsampled evenly in space, by a hash of
+            the voxel: the selection changes little while the map grows.
         covariance : bool
             With the covariances of the points.
 
@@ -423,8 +423,8 @@ class SurfelMap(MomentMap):
         Parameters
         ----------
         path : str or Path
-            An .npz or .parquet file, or the output directory of a replay or a merge: of the
-            exact maps in it, also one in tiles, the one that was written last.
+            An .npz or .parquet file, or the output directory of a replay or a merge. Of the
+            exact maps in it, also one in tiles, the one that was written last is read.
 
         Raises
         ------

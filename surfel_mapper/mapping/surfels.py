@@ -120,7 +120,7 @@ class Surfels:
     position : (K, 3) float64, m
         Mean of the points.
     normal : (K, 3) float64
-        Unit eigenvector of the smallest eigenvalue, turned towards the sensor; if its position
+        Unit eigenvector of the smallest eigenvalue, turned towards the sensor. If its position
         is unknown, the component of largest magnitude is positive. nan for a single point and
         for identical points.
     planarity : (K,) float64
@@ -139,14 +139,14 @@ class Surfels:
     size : (K,) float64, m
         Edge of the voxel, or of the cell of adaptive surfels.
     thickness : (K,) float64, m
-        Standard deviation of the points along the normal about their plane: the square root of
-        e0 (n - 1) / (n - 3), as fitting the plane takes three of the n degrees of freedom. nan for
-        3 points or fewer.
+        Standard deviation of the points along the normal about their plane. It is the square root
+        of e0 (n - 1) / (n - 3): fitting the plane takes three of the n degrees of freedom. It is
+        nan for 3 points or fewer.
     normal_sigma : (K,) float64, rad
-        Standard error of the normal, at most pi/2, that of an undetermined normal: the square root
-        of the sum of 3 s e_i / ((n - 1) (e_i - s)^2) for i = 1, 2, where s is thickness^2, at
-        least 0.01^2 m^2, and 3 stands for errors that points share (Anderson 1963 without it).
-        nan for 3 points or fewer, and if the normal is nan.
+        Standard error of the normal; pi/2, the largest value, if it is undetermined. It is the
+        square root of the sum of 3 s e_i / ((n - 1) (e_i - s)^2) for i = 1, 2. s is thickness^2,
+        at least 0.01^2 m^2. The 3 stands for errors that points share (Anderson 1963 without it).
+        It is nan for 3 points or fewer, and if the normal is nan.
     radius : (K,) float64, m
         Radius of the uniform disc of equal spread in the plane: the square root of 2 (e1 + e2).
     covariance : (K, 6) float64, m^2, optional
@@ -225,11 +225,11 @@ class Surfels:
 
         Notes
         -----
-        Measured against fits of two planes to the dense points of each voxel. In two parts of a
-        hall at least 90 % of the voxels on one plane are good, at 0.5 and at 0.2 m, and at most
-        1.8 % of the good surfels are off by more than 10 deg; in a city at least 90 %, and at
-        most 2.6 %. ``planarity > 0.7`` keeps 67 % and selects up to 3.9 %. Voxels of 0.2 m with
-        few points do not determine their plane: a quarter of the good ones cannot be judged.
+        Measured against fits of two planes to the dense points of each voxel, at 0.5 and 0.2 m.
+        At least 90 % of the voxels on one plane are good, in two parts of a hall and in a city.
+        At most 1.8 % of the good surfels are off by more than 10 deg in the hall, 2.6 % in the
+        city. ``planarity > 0.7`` keeps 67 % and selects up to 3.9 %. Voxels of 0.2 m with few
+        points do not determine their plane: a quarter of the good ones cannot be judged.
         Source: ``python -m test.bench --only quality``.
 
         """
@@ -286,8 +286,8 @@ class Surfels:
         Return the surfels as a structured array of shape (K,).
 
         Fields x y z, normal_x normal_y normal_z, planarity, curvature, e0 e1 e2, num_points,
-        i j k, thickness, normal_sigma, radius, num_scans, size, cov_xx ... cov_zz if there are
-        covariances, and the channels; the names of columns of ``to_pandas``.
+        i j k, thickness, normal_sigma, radius, num_scans, size. With covariances also cov_xx ...
+        cov_zz, and the channels. ``to_pandas`` has columns of these names.
         """
         columns = self._columns()
         table = np.empty(len(self), [(name, values.dtype) for name, values in columns.items()])
@@ -360,8 +360,8 @@ class Surfels:
         Raises
         ------
         IndexError
-            If a row is negative, because ``SurfelIndex.at`` returns -1 for a voxel without a
-            surfel, or beyond the last; if rows are neither whole numbers nor a mask (K,).
+            If a row is negative (``SurfelIndex.at`` returns -1 for a voxel without a surfel), or
+            beyond the last. If rows are neither whole numbers nor a mask (K,).
 
         """
         if not isinstance(rows, slice):

@@ -225,7 +225,7 @@ class SlidingWindow:
         """
         Return the pose (4, 4) of the scan of a frame added last, whether it was evicted or not.
 
-        None if no scan of the frame was added since the window was cleared or restored; after
+        None if no scan of the frame was added since the window was cleared or restored. After
         ``move`` the kept scans alone count, as evicted ones have no pose that fits the others.
         """
         return self._travel.last_pose(frame_id)
@@ -234,9 +234,9 @@ class SlidingWindow:
         """
         Add a scan to the map and evict the scans that exceed a limit.
 
-        The newest scan always stays. Without any limit no scan is evicted; then, unless
-        ``keep_points`` is set, only the newest scan is kept, and memory does not grow with the
-        number of scans.
+        The newest scan always stays. Without any limit no scan is evicted. Then,
+        unless ``keep_points`` is set, only the newest scan is kept, and memory does not grow with
+        the number of scans.
 
         Parameters
         ----------

@@ -53,8 +53,8 @@ class Primitive:
     Raises
     ------
     ValueError
-        If the kind is unknown, the number of sizes is wrong, a size is not positive and finite,
-        the pose is invalid, or the reflectivity is out of bounds.
+        If the kind is unknown, the number of sizes is wrong, or a size is not positive and
+        finite. If the pose is invalid, or the reflectivity is out of bounds.
 
     """
 
