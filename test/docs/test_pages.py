@@ -52,6 +52,22 @@ def test_every_page_is_in_the_menu_once():
     assert listed == sorted(page.relative_to(DOCS).as_posix() for page in PAGES)
 
 
+def test_pages_follow_the_light_or_dark_style_of_the_reader():
+    config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
+    styles = {entry['media']: entry['scheme'] for entry in config['theme']['palette']}
+    assert styles == {
+        '(prefers-color-scheme: light)': 'default',
+        '(prefers-color-scheme: dark)': 'slate',
+    }
+
+
+def test_the_drawing_names_parts_that_exist():
+    text = (DOCS / 'images' / 'flow.svg').read_text(encoding='utf-8')
+    parts = re.findall(r'>([a-z]+)/[^<]*<', text)
+    assert len(parts) > 5
+    assert [part for part in parts if not (ROOT / 'surfel_mapper' / part).is_dir()] == []
+
+
 def test_links_lead_to_files_and_headings():
     broken = []
     for path in TEXTS:
