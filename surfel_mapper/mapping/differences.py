@@ -50,7 +50,7 @@ class MapDifferences:
             return 'equal to the bit'
         return (
             f'{counted(len(self.came), "surfel")} came, {len(self.went)} went, '
-            f'{len(self.turned)} turned; {self.num_same} voxels have one in both'
+            f'{len(self.turned)} turned; voxels with one in both: {self.num_same:,}'
         )
 
 
@@ -85,7 +85,7 @@ def diff(
     >>> floor = np.random.default_rng(0).uniform([0, 0, 0.2], [2, 2, 0.2], (1000, 3))
     >>> _ = earlier.add(floor), later.add(floor), later.add(floor + [0, 0, 2])
     >>> print(diff(earlier, later))
-    16 surfels came, 0 went, 0 turned; 16 voxels have one in both
+    16 surfels came, 0 went, 0 turned; voxels with one in both: 16
 
     """
     for surfel_map in (before, after):

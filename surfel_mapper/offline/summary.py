@@ -83,15 +83,17 @@ def stages_text(summary: Mapping[str, Any]) -> str:
     seconds = {stage: s for stage, s in stages if stage != 'total'}
     seconds['other'] = summary['replay_s'] - sum(seconds.values())
     seconds['total'] = summary['replay_s']
-    speed = f'{summary["recorded_s"] / summary["replay_s"]:.1f} times real time'
+    speed = ''
+    if summary['recorded_s']:  # not of a single scan
+        speed = f'   {summary["recorded_s"] / summary["replay_s"]:.1f} times real time'
     if of_workers:
-        return '   '.join([*(f'{stage} {s:.1f} s' for stage, s in seconds.items()), speed])
+        return '   '.join(f'{stage} {s:.1f} s' for stage, s in seconds.items()) + speed
     share = 1e3 / max(summary['scans']['received'], 1)
-    means = '   '.join(f'{stage} {share * s:.1f} ms' for stage, s in seconds.items())
+    means = '   '.join(f'{stage} {share * s:.1f} ms' for stage, s in seconds.items()) + ' a scan'
     mapping = summary['milliseconds'].get('total')
     if mapping:
-        speed = f'mapping {mapping["median"]:.1f} ms, p99 {mapping["p99"]:.1f}   {speed}'
-    return f'{means} a scan   {speed}'
+        means += f'   mapping {mapping["median"]:.1f} ms, p99 {mapping["p99"]:.1f}'
+    return means + speed
 
 
 def in_order(values: Mapping[str, Any], names: Sequence[str]) -> list[tuple[str, Any]]:

@@ -170,8 +170,8 @@ class Mapper:
         num_used = self.counters.mapped + self.counters.localised
         if source != AUTO or num_used or origin:
             raise ConfigError(
-                f'pose.source {source}, {num_used} scans mapped, map.origin {origin!r}: expected '
-                'auto, none and none to take registration'
+                f'pose.source {source}, {counted(num_used, "scan")} mapped, map.origin {origin!r}'
+                ': expected auto, none and none to take registration'
             )
         self._pipeline.register()
 

@@ -89,13 +89,13 @@ def lines(x: Array, series: Mapping[str, Array], x_label: str, y_label: str) -> 
     x : (N,) float64
         Ascending.
     series : mapping of str to (N,) float64
-        Values of each line by its name; nan leaves a gap.
+        Values of each line by its name; nan leaves a gap. A single value is no line.
     x_label, y_label : str
         Labels of the axes.
 
     """
     drawn = {name: thinned(x, y) for name, y in series.items() if np.isfinite(y).any()}
-    if not drawn:
+    if not drawn or len(x) < 2:
         return NO_DATA
     top = max(highest(y[np.isfinite(y)]) for _, y in drawn.values())
     with _axes() as (figure, axes):

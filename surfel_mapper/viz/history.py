@@ -18,6 +18,8 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
 
+Array = npt.NDArray[np.float64]
+
 FIGURES = 6
 """Figures of a scan: time after the first (s), voxels, drops, position of the sensor (m)."""
 
@@ -39,11 +41,7 @@ class History:
 
     """
 
-    def __init__(
-        self,
-        stamps_ns: Sequence[int] = (),
-        positions: Iterable[npt.NDArray[np.float64]] = (),
-    ) -> None:
+    def __init__(self, stamps_ns: Sequence[int] = (), positions: Iterable[Array] = ()) -> None:
         self.milliseconds: dict[str, array[float]] = {}
         self._first_ns = stamps_ns[0] if stamps_ns else 0
         self._figures: array[float] = array('d')
@@ -62,38 +60,37 @@ class History:
             times.append(update.milliseconds.get(stage, np.nan))
         if not self._figures:
             self._first_ns = update.stamp_ns
-        self._figures.append((update.stamp_ns - self._first_ns) / 1e9)
-        self._figures.append(mapper.map.num_voxels)
-        self._figures.append(mapper.counters.dropped.total())
+        seconds, dropped = (update.stamp_ns - self._first_ns) / 1e9, mapper.counters.dropped
+        self._figures.extend([seconds, mapper.map.num_voxels, dropped.total()])
         self._figures.extend(update.T_map_sensor[:3, 3])
 
-    def move(self, positions: npt.NDArray[np.float64]) -> None:
+    def move(self, positions: Array) -> None:
         """Take the positions (S, 3) after an alignment; after a restart they are fewer."""
         if len(positions) == len(self):
             figures = np.column_stack([self.figures[:, :3], positions])
             self._figures = array('d', figures.ravel())
 
     @property
-    def figures(self) -> npt.NDArray[np.float64]:
+    def figures(self) -> Array:
         """FIGURES of each scan, (S, 6)."""
         return np.array(self._figures, np.float64).reshape(-1, FIGURES)
 
     @property
-    def seconds(self) -> npt.NDArray[np.float64]:
+    def seconds(self) -> Array:
         """Time of each scan after the first, (S,) s."""
         return self.figures[:, 0]
 
     @property
-    def voxels(self) -> npt.NDArray[np.float64]:
+    def voxels(self) -> Array:
         """Number of voxels in the map after each scan, (S,)."""
         return self.figures[:, 1]
 
     @property
-    def dropped(self) -> npt.NDArray[np.float64]:
+    def dropped(self) -> Array:
         """Number of scans dropped before each scan, (S,)."""
         return self.figures[:, 2]
 
     @property
-    def trajectory(self) -> npt.NDArray[np.float64]:
+    def trajectory(self) -> Array:
         """Position of the sensor at each scan, map frame, (S, 3) m."""
         return self.figures[:, 3:]

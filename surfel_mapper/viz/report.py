@@ -172,7 +172,7 @@ def figures(summary: Mapping[str, Any], history: History, surfels: Surfels) -> s
     if len(history) > 1 and len(summary.get('bags', ())) < 2:  # not the way between bags
         steps = np.diff(history.trajectory, axis=0)
         shown['distance driven'] = f'{np.sqrt((steps * steps).sum(axis=1)).sum():.1f} m'
-    if 'recorded_s' in summary:
+    if summary.get('recorded_s'):
         shown['recorded'] = f'{summary["recorded_s"]:.1f} s'
     if 'total' in summary['milliseconds']:
         shown['time a scan (median)'] = f'{summary["milliseconds"]["total"]["median"]:.1f} ms'
@@ -193,8 +193,7 @@ def tracking_table(registration: Mapping[str, Any]) -> str:
         f'{track["last_s"]:.3f} s have no certain place on the map: {as_html(track["reason"])}</p>'
         for number, track in enumerate(registration['apart'], start=1)
     )
-    none = '<p class="none">None.</p>'
-    table = html_table(('scans', 'number', 's'), rows) if rows else none
+    table = html_table(('scans', 'number', 's'), rows) if rows else '<p class="none">None.</p>'
     return f'<h2>Scans of doubtful pose</h2>{table}{paragraphs}'
 
 
@@ -206,10 +205,9 @@ def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str
         for stage in sorted(history.milliseconds, key=stage_order)
     }
     slope = np.degrees(np.arccos(np.clip(np.abs(surfels.normal[:, 2]), 0.0, 1.0)))
-    growth = {'voxels': history.voxels}
     dropped = {'dropped': history.dropped}
     charts = {
-        'Voxels over time': lines(seconds, growth, 'time (s)', 'voxels'),
+        'Voxels over time': lines(seconds, {'voxels': history.voxels}, 'time (s)', 'voxels'),
         'Time by stage': lines(seconds, times, 'time (s)', 'ms a scan'),
         'Planarity of the surfels': histogram(
             surfels.planarity, 0.0, 1.0, 'planarity: 0 a line or a ball, 1 a plane', 'surfels'
@@ -260,11 +258,9 @@ def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
             error = errors[kind][name]
             numbers = [decimals(error[figure], factor) for figure in kinds]
             rows.append([f'{kind}, {unit}', *numbers])
-    drift_m, drift_deg = errors['drift_m_per_100m'], errors['drift_deg_per_100m']
-    drift = (
-        f'{counted(errors["num_poses"], "pose")} compared; drift {decimals(drift_m)} m and '
-        f'{decimals(drift_deg)} deg in 100 m.'
-    )
+    drift_m, drift_deg = (decimals(errors[f'drift_{unit}_per_100m']) for unit in ('m', 'deg'))
+    compared = counted(errors['num_poses'], 'pose')
+    drift = f'{compared} compared; drift {drift_m} m and {drift_deg} deg in 100 m.'
     table = html_table(('', *kinds), rows)
     return f'<h2>Errors of the poses</h2>{table}<p>{as_html(drift)}</p>'
 

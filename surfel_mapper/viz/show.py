@@ -145,8 +145,7 @@ def all_discs(
                 about[content.name] += f', shown as {len(discs):,} adaptive ones'
         elif isinstance(shape, DrawnDiscs):
             tiles[f'map/{content.name}'] = moved(shape, shift_m)
-            text = 'without their moments: at one level of detail'
-            about[content.name] = f'{counted(len(shape), "surfel")}, {text}'
+            about[content.name] = f'{counted(len(shape), "surfel")} without their moments'
     return tiles, about
 
 
@@ -195,8 +194,7 @@ def show_way(scene: Scene, path: str, poses: Trajectory, origin_m: Array) -> str
     scene.poses(f'{path}/sensor', poses.stamp_ns, xyz, poses.q_xyzw)
     sensor = scene.rerun.Points3D(np.zeros((1, 3)), radii=0.3, colors=[ORANGE])
     scene.log(f'{path}/sensor', sensor, static=True)
-    lasts_s = (poses.stamp_ns[-1] - poses.stamp_ns[0]) / 1e9
-    return f'{counted(len(poses), "pose")} over {lasts_s:.1f} s'
+    return f'{counted(len(poses), "pose")} over {np.ptp(poses.stamp_ns) / 1e9:.1f} s'
 
 
 def shared_origin(contents: Sequence[Content]) -> Array:

@@ -190,7 +190,7 @@ def test_differences_between_two_maps_are_counted_and_written(tmp_path, run):
         'compare_maps.py', 'before.npz', 'after.npz', '--output', 'new.ply', folder=tmp_path
     )
 
-    assert '1 surfels came, 1 went, 0 turned; 1 voxels have one in both' in printed
+    assert '1 surfel came, 1 went, 0 turned; voxels with one in both: 1' in printed
     written = read_points(tmp_path / 'new.ply')
     assert [written['x'][0], len(written['x'])] == [pytest.approx(comes[:, 0].mean()), 1]
 

@@ -190,7 +190,7 @@ def test_diff_finds_new_lost_and_turned_surfels():
     assert found.went.voxel_index.tolist() == [[0, 5, 0]]
     assert found.turned.voxel_index.tolist() == [[3, 0, 0]]
     assert found.num_same == 2
-    assert str(found) == '1 surfel came, 1 went, 1 turned; 2 voxels have one in both'
+    assert str(found) == '1 surfel came, 1 went, 1 turned; voxels with one in both: 2'
     assert str(diff(before, before.copy())) == 'equal to the bit'
     with pytest.raises(MapError, match='voxel size 1 m, level 0, and 2 m, level 1'):
         diff(before, before.coarsen(1))

@@ -146,7 +146,7 @@ def test_the_map_is_written_before_an_alignment_that_fails(bag, tmp_path):
     config = Config.from_mapping({'window.max_scans': 1})
     options = ReplayOptions(window=True, align=True)
 
-    with pytest.raises(AlignmentError, match='1 scans in the map'):
+    with pytest.raises(AlignmentError, match='1 scan in the map'):
         replay(bag, output=tmp_path / 'out', config=config, options=options)
 
     assert contents(tmp_path / 'out') == {'map.ply', 'map.npz', 'trajectory.tum'}
@@ -167,6 +167,20 @@ def test_the_stages_are_parts_of_the_wall_time(bag, tmp_path):
     assert abs(sum(parts) - total) <= 0.05 * len(printed)  # of rounding
     times = summary['milliseconds']['total']
     assert mapping.startswith(f'mapping {times["median"]:.1f} ms, p99 {times["p99"]:.1f}   ')
+
+
+@pytest.mark.drawn
+def test_a_single_scan_has_no_speed_and_no_lines_over_time(tmp_path):
+    path = tmp_path / 'one.xyz'
+    np.savetxt(path, np.random.default_rng(1).uniform(-1.0, 1.0, (2000, 3)))
+    summary = replay(path, output=tmp_path / 'out').summary
+
+    assert 'real time' not in as_text(summary, [])
+    page = (tmp_path / 'out/report.html').read_text(encoding='utf-8')
+    assert '1 scan, 2 k points' in page
+    assert 'Planarity of the surfels' in page
+    assert 'over time</figcaption>' not in page
+    assert 'recorded</dt>' not in page
 
 
 def test_the_trajectory_is_that_of_the_map_if_time_was_set_back():

@@ -65,5 +65,5 @@ def test_registration_is_refused_once_scans_are_mapped():
     add_pose(mapper, 0.9)
     add_pose(mapper, 1.1)
     assert len(insert(mapper, scan_at(1.0))) == 1
-    with pytest.raises(ConfigError, match='1 scans mapped'):
+    with pytest.raises(ConfigError, match='1 scan mapped'):
         mapper.register_scans()

@@ -54,7 +54,7 @@ def test_scans_are_mapped_while_the_map_of_before_is_written(
     assert mapper.map.digest() != expected
     finish.set()
 
-    assert saved.result(TIMEOUT_S).endswith(f'of 1 scans (1 received), digest {expected}')
+    assert saved.result(TIMEOUT_S).endswith(f'of 1 scan (1 received), digest {expected}')
     assert load_map(tmp_path / 'map.npz')[0].digest() == expected
     writer.close()
 

@@ -58,7 +58,7 @@ def test_the_outputs_equal_those_of_a_mapper_without_ros(start, peer, tmp_path):
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     path = tmp_path / 'maps' / 'map.ply'
     assert saved.message == (
-        f'{path} and .npz: {len(surfels)} surfels of 3 scans (6 received), digest {digest}'
+        f'{path} and .npz: {len(surfels):,} surfels of 3 scans (6 received), digest {digest}'
     )
     assert len(read_points(path)['x']) == len(surfels)
 

@@ -706,7 +706,7 @@
     if (picks.some(({ row }) => surfels[row * BYTES + 7] / 255 > until())) showPicks([]);
     redraw();
   }
-  document.getElementById('drive').hidden = path.length < 6;
+  for (const id of ['drive', 'later']) document.getElementById(id).hidden = path.length < 6;
   time.addEventListener('input', showTime);
   measure.addEventListener('click', () => {
     measure.setAttribute('aria-pressed', String(!measures()));
