@@ -66,8 +66,8 @@ With 5 voxels instead of 3 at 0.1 m the angles between faces in a hall are 12.4 
 13.5; at 0.2 m the median error would rise by 0.3 mm.
 """
 
-FIRST_BLOCKS = 4096
-"""Blocks for which there is room at first."""
+FIRST_BLOCKS = 4096, 16384
+"""Blocks for which there is room at first, without and with carving."""
 
 BLOCK_BYTES = 40
 """Bytes of a block of a scan in table and keys: 16 for each of two entries, and 8."""
@@ -275,7 +275,8 @@ class PointIntegrator:
         """Return the blocks that cells and their rays touch."""
         config, surfaces = self.blocks.config, cells.surfaces
         tau = config.tau_m / config.voxel_size_m
-        table, keys, freed = new_blocks(FIRST_BLOCKS, max(self.blocks.voxels_per_block // 64, 1))
+        room, words = FIRST_BLOCKS[self._carve_m > 0.0], self.blocks.voxels_per_block // 64
+        table, keys, freed = new_blocks(room, max(words, 1))
         pairs: npt.NDArray[np.int32] = np.empty((FIRST_PAIRS * len(surfaces) + 64, 2), np.int32)
         start = number = num_pairs = 0
         while start < len(surfaces):

@@ -217,18 +217,20 @@ def free_rays(cells, start, origin, limits, bits, table, keys, number, freed):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def sum_cells(grouped, cells, corner, tau, places, sums):
+def sum_cells(grouped, cells, corner, tau, places, sums, row):
     """
-    Sum the distances that cells give to the voxels of a block.
+    Sum the distances that cells give to the voxels of a block, and prefetch those voxels.
 
     grouped  (P,) int32, the cells that observe the block
     cells    (K, CELL) float64
     corner   (3,) int64, index of the block's first voxel
     places   (2, M^2) float32, index along x and y of the voxels of a layer
     sums     (2, M, M^2) float32, in: 0; out: weighted distances, voxels, and weights, by layer
+    row      (2 N,) float32, the field of the block
 
     All voxels of a layer between two lines are computed without branches, which is vectorised:
-    half of them are in the cylinder, so branches would be mispredicted.
+    half of them are in the cylinder, so branches would be mispredicted. Prefetching whole blocks
+    takes twice as many lines of the cache, and a sixth more time at 0.1 m.
     """
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     most, per_square = np.float32(DISC * DISC), np.float32(EDGE / (DISC * DISC))
@@ -248,6 +250,8 @@ def sum_cells(grouped, cells, corner, tau, places, sums):
         for k in range(max(low[2] - corner[2], 0), min(high[2] - corner[2], side - 1) + 1):
             distances, weights = sums[0, k, first:last], sums[1, k, first:last]
             z = first_z + np.float32(k)
+            for start in (k * side * side, len(row) // 2 + k * side * side):
+                prefetch_block(row, start + first, last - first)
             for i in range(len(distances)):
                 x, y = first_x + across[i], first_y + along[i]
                 signed = nx * x + ny * y + nz * z
@@ -287,14 +291,15 @@ def fuse_blocks(blocks, cells, origin, settings, voxel_m, bits, field, figures):
     observed = np.empty(num_voxels + 1, np.int64)
     flat, block_size = field.ravel(), 2 * num_voxels
     for b in range(len(rows)):
-        if b + 1 < len(rows):
+        if b + 1 < len(rows) and ends[b + 1, 0] == ends[b + 1, 1]:
             prefetch_block(flat, block_size * rows[b + 1], block_size)
         content = field[rows[b], 0], field[rows[b], 1], figures[b]
         figures[b, OBSERVED] = figures[b, MOVED] = figures[b, SOLID] = figures[b, NEAR] = 0
         near = grouped[ends[b, 0] : ends[b, 1]]
         if len(near):
             sums[:] = 0.0
-            sum_cells(near, cells, corners[b], tau, places, by_layer)
+            row = flat[block_size * rows[b] : block_size * (rows[b] + 1)]
+            sum_cells(near, cells, corners[b], tau, places, by_layer, row)
             fuse_sums(sums, observed, settings, voxel_m, rates[b], freed[b], content)
         free_voxels(freed[b], corners[b], origin, settings, voxel_m, bits, rates[b], content)
 
