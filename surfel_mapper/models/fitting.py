@@ -28,19 +28,9 @@ from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import AXIS_BITS, KEY_BITS
 from surfel_mapper.mapping.moments import are_far_apart, OTHER_UNIT
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.models.coarse_growth import (
-    CoarseRules,
-    grow_coarse,
-    SPARSE_SHARE,
-)
+from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse, SPARSE_SHARE
 from surfel_mapper.models.coverage import covered
-from surfel_mapper.models.growth import (
-    grow,
-    Grown,
-    grown,
-    owner_table,
-    VoxelPoints,
-)
+from surfel_mapper.models.growth import grow, Grown, grown, owner_table, VoxelPoints
 from surfel_mapper.models.kernels.frames import LEAST_WIDTH
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.noise import estimate_noise, NoiseSamples
@@ -60,9 +50,6 @@ _log = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
-
-BLOCK_VOXELS = 4.0
-"""Edge of the blocks whose outliers are one Gaussian."""
 
 SIZES = (0.5, 2.0, 4.0, 8.0, 16.0, 64.0, 128.0)
 """Edges of the voxels in which points that are left are grown, in those of the cloud; the finer
@@ -152,14 +139,12 @@ def fit_points(
 ) -> MultiModel:
     """Fit models to one point a voxel, and grow them over all points."""
     voxels = thinned.by_voxel()
-    core = voxels.core()
     if config.noise_m == config.noise_per_range_sq == 0.0:
         samples = NoiseSamples(voxels.points, voxels.starts, thinned.means, view=view)
         noise = estimate_noise(samples, config.voxel_size_m)
         config = replace(config, noise_m=min(noise[0], 1.0), noise_per_range_sq=min(noise[1], 1.0))
     laps.append(clock())
-    rows = np.flatnonzero(core)
-    clusters = segment_cloud(thinned.means[rows], config, view)
+    clusters = segment_cloud(thinned.means, config, view)
     laps.append(clock())
     close = replace(
         config,
@@ -170,23 +155,16 @@ def fit_points(
     laps.append(clock())
     patches = fitted_patches(clusters, surfaces, config, view, whole=False)
     laps.append(clock())
-    label, group = np.full((2, len(core)), -1, np.int32)
-    at = rows[clusters.order]
-    group[at] = np.repeat(np.arange(len(clusters), dtype=np.int32), clusters.num_points)
-    group[~core] = len(clusters) + blocks_of(thinned.means[~core], config.voxel_size_m)
+    label, group = np.full((2, len(thinned.means)), -1, np.int32)
+    group[clusters.order] = np.repeat(
+        np.arange(len(clusters), dtype=np.int32), clusters.num_points
+    )
     of_cluster = np.full(len(clusters), -1, np.int32)
     for k, (_, members) in enumerate(patches):
         of_cluster[members] = k
-    label[at] = np.repeat(of_cluster, clusters.num_points)
-    growth = grow(
-        voxels,
-        thinned.means,
-        label,
-        group,
-        [patch for patch, _ in patches],
-        config,
-        view,
-    )
+    label[clusters.order] = np.repeat(of_cluster, clusters.num_points)
+    shapes = [patch for patch, _ in patches]
+    growth = grow(voxels, thinned.means, label, group, shapes, config, view)
     joined = grow_sparse(thinned, voxels, growth, config, view)
     laps.append(clock())
     fitted = owner_patches(joined, config, view)
@@ -220,14 +198,6 @@ def grow_sparse(
         return growth
     owner = owner[voxels.rows]
     return grown(owner, owner_table(voxels, owner), *shape, growth.tolerance_m)
-
-
-def blocks_of(means: Array, size_m: float) -> npt.NDArray[np.int32]:
-    """Return the index of a block of BLOCK_VOXELS voxels a side for each point (N, 3)."""
-    index = np.floor(means / (BLOCK_VOXELS * size_m)).astype(np.int64)
-    inverse = np.unique(index, axis=0, return_inverse=True)[1].reshape(-1)
-    blocks: npt.NDArray[np.int32] = inverse.astype(np.int32)
-    return blocks
 
 
 def separated(

@@ -47,18 +47,6 @@ OwnerTable = tuple[Owners, Array, Array, Indices]
 FreeSurfels = tuple[Indices, npt.NDArray[np.bool_], Array, Array]
 """Number, flatness, mean and normal of the free points of every voxel, (V, ...) each."""
 
-CORE_SHARE, CORE_POINTS = 0.12, 8
-"""
-Sparse voxels have a smaller share of the points of their densest neighbour. If no voxel near one
-has CORE_POINTS, it is compared with voxels one farther away in each round, and then kept.
-"""
-
-WIDER_ROUNDS = 2
-"""See CORE_POINTS."""
-
-MOST_SPARSE = 0.3
-"""If more voxels are sparse, they are outliers; planes alone clip fewer to sparse ones."""
-
 TOLERANCE_SIGMAS, TOLERANCE_VOXELS, MOST_TOLERANCE_VOXELS = 3.0, 0.03, 0.5
 """Tolerance of a patch: sigmas of its points and a share of a voxel, up to half a voxel."""
 
@@ -125,15 +113,6 @@ class VoxelPoints:
         ends, near = np.empty(len(keys) + 1, np.int64), np.empty(26 * len(keys), np.int32)
         neighbour_table(keys, to_y, to_z, ends, near)
         return cls(points, rows, starts, (ends, near))
-
-    def core(self) -> npt.NDArray[np.bool_]:
-        """Return which voxels are not outliers, (V,) bool."""
-        counts = np.diff(self.starts)
-        most = most_around(counts, self.adjacent)
-        for _ in range(WIDER_ROUNDS):  # few points anywhere near: is it an outlier or far away?
-            most = np.where(most < CORE_POINTS, most_around(most, self.adjacent), most)
-        core: npt.NDArray[np.bool_] = (most < CORE_POINTS) | (counts >= CORE_SHARE * most)
-        return core if (~core).sum() > MOST_SPARSE * len(core) else np.ones_like(core)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,16 +195,6 @@ def grow(
     groups = -1 - np.repeat(group, np.diff(voxels.starts))
     owner = np.where(owner >= 0, np.append(index, 0)[owner], groups)
     return grown(owner, owner_table(voxels, owner), normals, curved, median_m)
-
-
-def most_around(values: Indices, adjacent: tuple[Indices, npt.NDArray[np.int32]]) -> Indices:
-    """Return the largest of the values (V,) of each voxel and its neighbours."""
-    first, near = adjacent
-    most, some = values.copy(), np.flatnonzero(np.diff(first))
-    if len(some):
-        around = np.maximum.reduceat(values[near[: first[-1]]], first[some])
-        most[some] = np.maximum(most[some], around)
-    return most
 
 
 def grown(
