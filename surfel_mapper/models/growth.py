@@ -53,6 +53,18 @@ TOLERANCE_SIGMAS, TOLERANCE_VOXELS, MOST_TOLERANCE_VOXELS = 3.0, 0.03, 0.5
 NOISE_SIGMAS = 2.5
 """Tolerance by the noise of the sensor at least: noise beyond a voxel is cut into layers."""
 
+SEPARATE_SIGMAS, SEPARATE_VOXELS, SEPARATE_ROUNDS, LEAST_LAYER = 3.0, 0.1, 6, 500
+"""
+Half the thickness of the largest layer of a plane, in sigmas of the sensor, and at least, in
+voxels. Its plane is refitted in this number of rounds. It has this number of voxels, at least.
+"""
+
+LEAST_DISPARITY_NOISE = 3e-4
+"""
+Sigma by range^2, 1/m, from which on layers are separated: that of depth cameras is 1e-3 1/m, of
+lidars less than 1e-4 1/m. Roads that a lidar sees are cambered, and have no layers.
+"""
+
 FAR_SIGMAS = 2.0
 """Tolerance of a plane in coarse voxels: these sigmas and the tolerance of facets, at most."""
 
@@ -176,8 +188,12 @@ def grow(
 
     """
     size_m, noise = config.voxel_size_m, (config.noise_m, config.noise_per_range_sq)
-    tangent = tangents(means, label, patches)
     sigma = noise_across(patches, noise, view)
+    planes: Array = np.array([(*patch.normal, patch.offset_m) for patch in patches])
+    planes = planes.reshape(-1, 4)
+    if noise[1] >= LEAST_DISPARITY_NOISE:
+        planes = largest_layers((means, label), patches, planes, sigma, size_m)
+    tangent = tangents(means, label, patches, planes)
     tolerance = tolerances(voxels, label, tangent, sigma, size_m)
     if len(tolerance):
         median_m = float(np.median(tolerance))
@@ -329,12 +345,62 @@ def add_facets(
     return planes[number:num, :3]
 
 
-def tangents(means: Array, label: Owners, patches: list[Plane]) -> Array:
+def largest_layers(
+    voxels: tuple[Array, Owners], patches: list[Plane], planes: Array, sigma: Array, size_m: float
+) -> Array:
+    """
+    Return the plane (K, 4) of each patch, that of its largest layer if it has several.
+
+    Books thinner than a voxel are in the clusters of their table. Voxels of smaller layers become
+    free, in place.
+
+    Parameters
+    ----------
+    voxels : (V, 3) float64, m, and (V,) int32
+        Means of the points by voxel, and indices of their patches.
+    patches, planes : list of Plane, (K, 4) float64
+        Patches, and their planes.
+    sigma : (K,) float64, m
+        Noise across the patches.
+    size_m : float
+        Edge of the voxels, m.
+
+    """
+    means, label = voxels
+    rms, thick = np.array([patch.rms_m for patch in patches]), SEPARATE_SIGMAS * sigma
+    thick = np.maximum(thick, SEPARATE_VOXELS * size_m)
+    may = [
+        3.0 * a > b and not isinstance(p, Surface)
+        for a, b, p in zip(rms, thick, patches, strict=True)
+    ]
+    rows = np.flatnonzero(np.append(may, False)[label])
+    rows = rows[np.argsort(label[rows], kind='stable')]
+    points, patch = means[rows], label[rows]
+    starts = np.searchsorted(patch, np.arange(len(patches) + 1))
+    plane, limit = planes, 2.0 * rms
+    for _ in range(SEPARATE_ROUNDS if len(rows) else 0):
+        near = np.abs(plane_heights(points, plane[patch])) < limit[patch]
+        middle, normal, _ = plane_frames(points, near.astype(np.float64), starts)
+        plane = np.column_stack([normal, -np.einsum('ij,ij->i', normal, middle)])
+        limit = np.maximum(0.7 * limit, thick)
+    away = np.abs(plane_heights(points, plane[patch])) / thick[patch]
+    on, far = (
+        np.bincount(patch[mask], minlength=len(patches)) for mask in (away < 1.0, away > 2.0)
+    )
+    is_layered = (on >= LEAST_LAYER) & (2 * far > np.diff(starts) - on)
+    label[rows[is_layered[patch] & (away >= 1.0)]] = FREE
+    return np.where(is_layered[:, None], plane, planes)
+
+
+def plane_heights(points: Array, planes: Array) -> Array:
+    """Return the signed distance (N,) of each point (N, 3) from its plane (N, 4), m."""
+    heights: Array = np.einsum('ij,ij->i', points, planes[:, :3]) + planes[:, 3]
+    return heights
+
+
+def tangents(means: Array, label: Owners, patches: list[Plane], planes: Array) -> Array:
     """Return the plane (V, 4) of the patch of each voxel, that of a surface tangential there."""
-    planes = np.zeros((len(patches) + 1, 4))  # label -1: the last
-    for k, patch in enumerate(patches):
-        planes[k] = (*patch.normal, patch.offset_m)
-    tangent: Array = planes[label]
+    tangent: Array = np.append(planes, np.zeros((1, 4)), axis=0)[label]  # label -1: the last
     for k, patch in enumerate(patches):
         if isinstance(patch, Surface):
             rows = np.flatnonzero(label == k)

@@ -90,9 +90,9 @@ def test_walls_of_real_rooms_are_few_planes(data_folder):
     assert model.size_bytes < 15_000
 
 
-@pytest.mark.parametrize(('size_m', 'impure'), [(0.01, 0.03), (0.02, 0.06)])
+@pytest.mark.parametrize(('size_m', 'impure'), [(0.01, 0.03), (0.02, 0.04), (0.03, 0.05)])
 def test_a_table_under_books_is_one_plane_without_them(size_m, impure):
-    """Books were in the plane of the table: a tenth of the points, and it fell into pieces."""
+    """Books were in the plane of the table, a tenth of the points, as layers of its clusters."""
     figures = []
     for seed in range(4):
         points, labels = depth_frames.table_of_books(seed)
