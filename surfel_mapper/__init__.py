@@ -29,7 +29,7 @@ Pipeline::
     Config            all settings; load_config reads them from a YAML file
     load_config       the configuration in a YAML file
 
-Beside them::
+Further::
 
     Trajectory        poses over time, from and to files
     estimate_normals  normals of a cloud from neighbours, without a map

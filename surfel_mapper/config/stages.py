@@ -404,7 +404,7 @@ class OutputConfig(Stage):
     )
     checkpoint_s: float = setting(
         0.0,
-        'The node saves the map this often while it changes, beside map_name, s; 0: never.',
+        'The node saves the map this often while it changes, next to map_name, s; 0: never.',
         low=0.0,
         high=1e9,
         live=True,
