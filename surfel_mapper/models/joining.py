@@ -51,11 +51,11 @@ tens of centimetres: halves of a table seem to differ by less.
 
 LEAST_TURN_DEG, LEAST_BEND_VOXELS, LEAST_BEND_SIGMAS = 15.0, 0.25, 1.5
 """
-A surface that turns or bends less is a plane: tables sag a little. Sigmas are those of its
-patches: far walls seem to bend by steps of disparity.
+A surface that turns or bends less is a plane: tables sag a little. Sigmas are those of the sensor:
+far walls seem to bend by steps of disparity.
 """
 
-CURVED_GAIN = 15.0
+CURVED_GAIN = 9.0
 """Gain of the criterion by which a curved surface is better than a plane, at least."""
 
 MOST_WORSE, UNRESOLVED_VOXELS = 1.25, 0.2
@@ -194,8 +194,8 @@ class Comparison:
         Moments of their points, and half their width, about.
     normals : (K, 3) float64
         Normals of the patches.
-    sigma : (K,) float64, m
-        Noise across them.
+    noise, sigma : (K,) float64, m
+        Noise of the sensor across them, and that of their points.
     floor : (K,) float64, m^2
         Square of the residuals that are not resolved.
 
@@ -206,6 +206,7 @@ class Comparison:
     covariances: Array
     extents: Array
     normals: Array
+    noise: Array
     sigma: Array
     floor: Array
 
@@ -222,12 +223,12 @@ class Comparison:
         range_sq = np.maximum(np.einsum('ij,ij->i', towards, towards), 1e-24)
         cosine = np.abs(np.einsum('ij,ij->i', towards, normals)) / np.sqrt(range_sq)
         cosine = np.maximum(cosine, LEAST_COSINE)
-        sigma = (noise[0] + noise[1] * range_sq) * cosine
+        across = (noise[0] + noise[1] * range_sq) * cosine
         limits = LEAST_FLOOR_VOXELS * size_m, MOST_FLOOR_VOXELS * size_m
         floor = np.clip(noise[1] * range_sq * cosine, *limits) ** 2
         extents = np.sqrt(3.0 * values[:, 2]) + size_m
-        sigma = np.maximum(sigma, np.sqrt(np.maximum(values[:, 0], floor)))
-        return cls(pieces, means, covariances, extents, normals, sigma, floor)
+        sigma = np.maximum(across, np.sqrt(np.maximum(values[:, 0], floor)))
+        return cls(pieces, means, covariances, extents, normals, across, sigma, floor)
 
     def with_layers(self, touching: Indices) -> tuple[Indices, Comparison]:
         """
@@ -306,11 +307,14 @@ class Comparison:
         figures = self.compared(np.stack([names, names], axis=1), root, described)
         index = np.searchsorted(names, root).astype(np.int32)
         points, every = self.pieces.num_points, len(names) + 1
-        squares = np.bincount(index, points * self.sigma**2, every)[:-1]
-        own = np.sqrt(squares / np.bincount(index, points, every)[:-1])
+        total = np.bincount(index, points, every)[:-1]
+        noise, own = (
+            np.sqrt(np.bincount(index, points * sigma**2, every)[:-1] / total)
+            for sigma in (self.noise, self.sigma)
+        )
         limits = CURVED_GAIN, math.radians(LEAST_TURN_DEG), LEAST_BEND_VOXELS * size_m
         gains, turns, bends = (figures[:, :3] > limits).T
-        curved = gains & turns & bends & (figures[:, 2] > LEAST_BEND_SIGMAS * own)
+        curved = gains & turns & bends & (figures[:, 2] > LEAST_BEND_SIGMAS * noise)
         limit_m = MOST_WORSE * np.sqrt(own**2 + self.floor[names])
         is_worse = figures[:, 3] > np.maximum(limit_m, UNRESOLVED_VOXELS * size_m)
         is_worse &= ~curved & (np.bincount(index, minlength=every)[:-1] > 1)

@@ -73,3 +73,13 @@ def test_joins_that_are_much_worse_planes_than_their_patches_are_undone():
     assert not curved.any()
     assert index[6] == index[7]
     assert np.bincount(index).max() <= 3
+
+
+def test_a_rough_patch_that_bends_more_than_the_noise_is_curved():
+    """Leaves of 5 cm on a dome were a plane: roughness of patches was taken for noise."""
+    rng = np.random.default_rng(7)
+    xy = rng.uniform(-0.5, 0.5, (20_000, 2))
+    dome = -0.15 * (xy**2).sum(axis=1) + 0.05 * rng.standard_normal(len(xy))
+    given = pieces(np.column_stack([xy, dome]), np.zeros(len(xy), np.int32))
+    for noise_m, is_curved in ((0.01, True), (0.2, False)):
+        assert join_patches(given, VIEW, (noise_m, 0.0), SIZE_M)[2].tolist() == [is_curved]
