@@ -30,6 +30,7 @@ from surfel_mapper.mapping.moments import are_far_apart, OTHER_UNIT
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse, SPARSE_SHARE
 from surfel_mapper.models.coverage import covered
+from surfel_mapper.models.frames import eigen
 from surfel_mapper.models.growth import grow, Grown, grown, owner_table, VoxelPoints
 from surfel_mapper.models.kernels.frames import LEAST_WIDTH
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
@@ -54,6 +55,13 @@ Indices = npt.NDArray[np.int64]
 SIZES = (0.5, 2.0, 4.0, 8.0, 16.0, 64.0, 128.0)
 """Edges of the voxels in which points that are left are grown, in those of the cloud; the finer
 ones only if these can be numbered."""
+
+PARTS, MOST_PARTED_M = 3, 0.1
+"""
+Parts of a voxel along each axis, and the largest voxels that are divided: models are grown over
+the means of the points in each, so patches of near and far surfaces follow the same rules. Larger
+voxels are as large as objects, so models are grown over all points.
+"""
 
 MERGED_VOXELS = 0.3
 """
@@ -107,11 +115,13 @@ def fit(
     if view.shape != (3,) or not np.isfinite(view).all():
         raise ModelError(f'viewpoint: {viewpoint!r}, expected three finite numbers')
     laps = [clock()]
-    thinned = thin(points.reshape(-1, 3), config.voxel_size_m)
+    grows = not is_paper(config) and config.kinds == 'all'
+    parts = PARTS if grows and config.voxel_size_m <= MOST_PARTED_M else 1
+    thinned = thin(points.reshape(-1, 3), config.voxel_size_m, parts)
     if are_far_apart(thinned.means, len(thinned.rows)):
         _log.warning(OTHER_UNIT)
     laps.append(clock())
-    grows = not is_paper(config) and config.kinds == 'all' and len(thinned.means) > 0
+    grows = grows and len(thinned.means) > 0
     model = (fit_points if grows else fit_means)(thinned, config, view, laps)
     if grows:
         model = covered(model, points.reshape(-1, 3), view)
@@ -134,13 +144,14 @@ def fit_means(
     return replace(model, labels=thinned.point_labels(labels))
 
 
-def fit_points(
-    thinned: Thinned, config: ModelsConfig, view: Array, laps: list[float]
-) -> MultiModel:
-    """Fit models to one point a voxel, and grow them over all points."""
+def fit_points(parts: Thinned, config: ModelsConfig, view: Array, laps: list[float]) -> MultiModel:
+    """Fit models to one point a voxel, and grow them over those of the parts of voxels."""
+    is_parted = parts.parts > 1
+    thinned = parts.whole_voxels() if is_parted else parts
     voxels = thinned.by_voxel()
     if config.noise_m == config.noise_per_range_sq == 0.0:
-        samples = NoiseSamples(voxels.points, voxels.starts, thinned.means, view=view)
+        starts = parts.starts[thinned.starts] if is_parted else parts.starts
+        samples = NoiseSamples(parts.points, parts.rows, starts, thinned.means, view=view)
         noise = estimate_noise(samples, config.voxel_size_m)
         config = replace(config, noise_m=min(noise[0], 1.0), noise_per_range_sq=min(noise[1], 1.0))
     laps.append(clock())
@@ -155,24 +166,25 @@ def fit_points(
     laps.append(clock())
     patches = fitted_patches(clusters, surfaces, config, view, whole=False)
     laps.append(clock())
-    label, group = np.full((2, len(thinned.means)), -1, np.int32)
-    group[clusters.order] = np.repeat(
-        np.arange(len(clusters), dtype=np.int32), clusters.num_points
-    )
+    label, group = np.empty((2, len(thinned.means)), np.int32)
+    group[clusters.order] = np.repeat(np.arange(len(clusters)), clusters.num_points)
     of_cluster = np.full(len(clusters), -1, np.int32)
     for k, (_, members) in enumerate(patches):
         of_cluster[members] = k
     label[clusters.order] = np.repeat(of_cluster, clusters.num_points)
-    shapes = [patch for patch, _ in patches]
-    growth = grow(voxels, thinned.means, label, group, shapes, config, view)
-    joined = grow_sparse(thinned, voxels, growth, config, view)
+    planes = [patch for patch, _ in patches]
+    growth = grow(voxels, thinned.means, label, group, planes, config, view)
+    weights = np.diff(parts.starts) if is_parted else 1
+    is_free = np.sum(weights * (growth.owner < 0)) >= max(SPARSE_SHARE * len(parts.rows), 1.0)
+    joined = grow_sparse(thinned, voxels, growth, config, view) if is_free else growth
     laps.append(clock())
     fitted = owner_patches(joined, config, view)
     lost = np.array([patch is None for patch in fitted], np.bool_)
     if lost.any() and joined is not growth:
         joined = separated(voxels, joined, growth, lost)
         fitted = owner_patches(joined, config, view)
-    return owner_models(thinned, voxels, joined, fitted, config)
+    model = owner_models(thinned, voxels, joined, fitted, config)
+    return replace(model, labels=parts.point_labels(model.labels)) if is_parted else model
 
 
 def grow_sparse(
@@ -181,22 +193,15 @@ def grow_sparse(
     """Find facets in finer, then in coarser voxels while many points are on no patch, and join."""
     noise = config.noise_m, config.noise_per_range_sq
     rules = CoarseRules(config.voxel_size_m, growth.tolerance_m, noise, view)
-    shape = growth.normals, growth.curved
-    owner: npt.NDArray[np.int32] = np.full(thinned.num_points, -1, np.int32)
-    owner[voxels.rows] = growth.owner
-    joined = False
+    shape, owner = (growth.normals, growth.curved), growth.owner.copy()
     halves = thinned.bits.max() < AXIS_BITS and thinned.bits.sum() + 3 <= KEY_BITS
     for factor in SIZES if halves else SIZES[1:]:
-        if (owner[voxels.rows] < 0).sum() < max(SPARSE_SHARE * len(growth.owner), 1.0):
+        if (owner < 0).sum() < max(SPARSE_SHARE * len(owner), 1.0):
             break
-        size_m, joined = factor * config.voxel_size_m, True
-        joins = factor <= MOST_JOINED
-        shape = grow_coarse(
-            thinned.points, owner, shape, size_m, rules, facets=config, joins=joins
-        )
-    if not joined:
+        size_m, joins = factor * config.voxel_size_m, factor <= MOST_JOINED
+        shape = grow_coarse(voxels.points, owner, shape, size_m, rules, facets=config, joins=joins)
+    if shape[0] is growth.normals:
         return growth
-    owner = owner[voxels.rows]
     return grown(owner, owner_table(voxels, owner), *shape, growth.tolerance_m)
 
 
@@ -221,8 +226,9 @@ def owner_patches(growth: Grown, config: ModelsConfig, view: Array) -> list[Plan
     number = len(growth.normals)
     starts = np.searchsorted(growth.owners, np.arange(number + 1))
     first = int(starts[0])
-    middle = np.array([growth.means[a:b].mean(axis=0) for a, b in pairwise(starts.tolist())])
-    middle = middle.reshape(-1, 3)
+    if not number:
+        return []
+    middle = np.add.reduceat(growth.means, starts[:-1]) / np.diff(starts)[:, None]
     towards = np.einsum('ij,ij->i', growth.normals, view - middle)
     points = PatchPoints(
         points=np.ascontiguousarray(growth.means[first:]),
@@ -231,7 +237,7 @@ def owner_patches(growth: Grown, config: ModelsConfig, view: Array) -> list[Plan
         thickness=thickness(middle, config, view),
         curved=growth.curved,
     )
-    return fit_patches(points, config, view) if number else []
+    return fit_patches(points, config, view)
 
 
 def owner_models(
@@ -270,7 +276,7 @@ def owner_models(
         WIDE_VOXELS * config.voxel_size_m,
     )
     label[own] += len(kept)
-    labels = np.full(thinned.num_points, -1, np.int32)
+    labels = np.full(len(thinned.points), -1, np.int32)
     labels[voxels.rows] = label
     counts = np.bincount(group)
     mean, covariance = group_moments(growth.means[is_free], group, counts)
@@ -285,7 +291,7 @@ def owner_models(
     )
 
 
-WIDE_VOXELS, LEAST_WIDE = 1.5, 4
+WIDE_VOXELS, LEAST_WIDE = 2.0, 4
 """Gaussians of as many points whose largest sigma exceeds that number of voxels are divided."""
 
 
@@ -317,11 +323,11 @@ def narrow_groups(
     while len(group):
         counts = np.bincount(group)
         mean, covariance = group_moments(xyz, group, counts)
-        values, vectors = np.linalg.eigh(covariance)
+        values, axes = eigen(covariance)
         is_wide = (counts >= LEAST_WIDE) & (values[:, 2] > wide_m**2)
         if not is_wide.any():
             break
-        axis = np.where(is_wide[:, None], vectors[:, :, 2], 0.0)
+        axis = np.where(is_wide[:, None], axes[:, 2], 0.0)
         number = len(counts) + np.cumsum(is_wide) - 1
         beyond = ((xyz - mean[group]) * axis[group]).sum(axis=1) > 0.0
         group = np.where(beyond, number[group], group)

@@ -431,13 +431,14 @@ def tolerances(
     rows, voxel = (array[label[voxel] >= 0] for array in (rows, voxel))
     who, plane = label[voxel], tangent[voxel]
     distance = np.abs(np.einsum('ij,ij->i', voxels.points[rows], plane[:, :3]) + plane[:, 3])
-    order = np.argsort(who, kind='stable')
-    ends = np.searchsorted(who[order], np.arange(1, number))
-    sigma = [
-        1.4826 * float(np.median(group)) if len(group) else 0.0
-        for group in np.split(distance[order], ends)
-    ][:number]
-    own = TOLERANCE_SIGMAS * np.array(sigma) + TOLERANCE_VOXELS * size_m
+    scale = 0.5 / max(float(distance.max(initial=0.0)), 1e-12)
+    ordered = np.append(np.sort(who + scale * distance), number)  # by patch, then by distance
+    starts = np.searchsorted(ordered, np.arange(number + 1))
+    counts = np.diff(starts)
+    halves = np.stack([np.maximum(counts - 1, 0) // 2, counts // 2])
+    medians = (ordered[starts[:-1] + halves].mean(axis=0) - np.arange(number)) / scale
+    sigma = np.where(counts > 0, 1.4826 * medians, 0.0)
+    own = TOLERANCE_SIGMAS * sigma + TOLERANCE_VOXELS * size_m
     most = np.maximum(MOST_TOLERANCE_VOXELS * size_m, TOLERANCE_SIGMAS * noise)
     result: Array = np.minimum(np.maximum(own, NOISE_SIGMAS * noise), most)
     return result

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -84,19 +85,22 @@ class NoiseSamples:
 
     Attributes
     ----------
-    points : (P, 3) float64, m
+    points : (N, 3) float32 or float64, m
+    rows : (P,) int
+        Rows of the finite ones, voxel by voxel.
     starts : (V + 1,) int64
-        First point of each voxel, and P.
+        First of these rows of each voxel, and P.
     means : (V, 3) float64, m
         Means of the points by voxel; those in one layer of z follow each other.
     weights : (P,) float64, optional
-        Weights of the points; 1 if omitted.
+        Weights of the rows; 1 if omitted.
     view : (3,) float64, m, optional
         Position of the sensor. Without it noise is across the surface, at any range.
 
     """
 
-    points: Array
+    points: npt.NDArray[Any]
+    rows: npt.NDArray[Any]
     starts: Indices
     means: Array
     weights: Array | None = None
@@ -168,7 +172,8 @@ def sampled_cubes(samples: NoiseSamples, edge_m: float) -> tuple[Array, Array, f
     if samples.weights is not None:
         counts = samples.weights[rows] * weight
         weight = counts * (weight.sum(axis=1) / counts.sum(axis=1))[:, None]
-    return samples.points[rows], weight, len(rows) / max(len(seeds), 1)
+    points = samples.points[samples.rows[rows]].astype(np.float64)
+    return points, weight, len(rows) / max(len(seeds), 1)
 
 
 def sampled_rows(samples: NoiseSamples, seeds: Indices, halves: Array, most: int) -> Indices:
@@ -247,7 +252,7 @@ def step_noise(samples: NoiseSamples) -> float:
     """Return sigma / distance^2, 1/m, of the steps of disparity along an axis; 0 without steps."""
     if samples.view is None:
         return 0.0
-    points = samples.points[:: 1 + len(samples.points) // STEP_SAMPLES]
+    points = samples.points[samples.rows[:: 1 + len(samples.rows) // STEP_SAMPLES]]
     sample = np.abs(points - samples.view)
     for values in sample.T[::-1]:  # the axis of a camera is z
         levels = np.unique(values[values > 0.0])

@@ -211,7 +211,7 @@ def cells_of(
     patch = np.repeat(np.arange(len(origins)), np.diff(groups.starts))
     local = np.empty((len(patch), 3))
     for k, (start, end) in enumerate(pairwise(groups.starts.tolist())):
-        local[start:end] = np.einsum('ij,nj->ni', axes[k], groups.points[start:end] - origins[k])
+        local[start:end] = (groups.points[start:end] - origins[k]) @ axes[k].T
     return Cells.around(local, patch, pitches, margin_m, snapped=snapped), local
 
 

@@ -49,6 +49,7 @@ def map_noise(surfel_map: SurfelMap) -> float:
     away = np.einsum('kcj,kj,kij->kci', signs, np.sqrt(np.maximum(values, 0.0)), axes)
     samples = NoiseSamples(
         points=(means[:, None] + away).reshape(-1, 3),
+        rows=np.arange(8 * number),
         starts=8 * np.arange(number + 1),
         means=means,
         weights=np.repeat(counts, 8),

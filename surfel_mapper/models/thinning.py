@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.filters.grids import ScanVoxels
+from surfel_mapper.filters.grids import KEY_BITS, ScanVoxels
 from surfel_mapper.models.growth import VoxelPoints
 from surfel_mapper.models.kernels.voxel_means import average_voxels, finite_ends, voxel_keys
 
@@ -38,9 +38,12 @@ class Thinned:
     starts : (V + 1,) int64
         First row of each voxel, and P.
     keys : (V,) int64
-        Keys of the voxels, ascending: x in the lowest bits, then y and z.
+        Keys of the voxels, ascending: x in the lowest bits, then y and z; of their parts see
+        models/kernels/voxel_means.py.
     bits : (3,) int64
         Bits of x, y and z in the keys.
+    parts : int
+        Parts of a voxel along each axis; if not 1, all of the above are those of the parts.
 
     """
 
@@ -50,26 +53,32 @@ class Thinned:
     starts: Indices
     keys: Indices
     bits: Indices
-
-    @property
-    def num_points(self) -> int:
-        """Number of all points, finite or not."""
-        return len(self.points)
+    parts: int = 1
 
     def by_voxel(self) -> VoxelPoints:
         """Return the finite points by voxel, with the neighbours of voxels."""
-        points = np.take(self.points, self.rows, axis=0).astype(np.float64)
+        points = np.take(self.points, self.rows, axis=0).astype(np.float64, copy=False)
         return VoxelPoints.of(points, self.rows, self.starts, self.keys, self.bits)
+
+    def whole_voxels(self) -> Thinned:
+        """Return the means of parts as a cloud by voxel."""
+        keys = self.keys // self.parts**3
+        first = np.flatnonzero(np.diff(keys, prepend=-1))
+        starts = np.append(first, len(keys))
+        counts = np.diff(self.starts)[:, None]
+        means = np.add.reduceat(counts * self.means, first) / np.add.reduceat(counts, first)
+        rows = np.arange(len(keys), dtype=np.int32)
+        return Thinned(means, self.means, rows, starts, keys[first], self.bits)
 
     def point_labels(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """Return labels of all points from those of the means; -1 if not finite."""
-        of_points = np.full(self.num_points, -1, np.int32)
+        of_points = np.full(len(self.points), -1, np.int32)
         of_points[self.rows] = np.repeat(labels, np.diff(self.starts))
         return of_points
 
 
-def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:
-    """Return the means of the points (N, 3) in each voxel."""
+def thin(points: npt.NDArray[Any], voxel_size_m: float, parts: int = 1) -> Thinned:
+    """Return the means of the points (N, 3) in each voxel, or in the parts^3 parts of each."""
     points, ends = np.require(points, None, ['C', 'W']), np.empty((2, 3))
     number = finite_ends(points, ends)
     if not number:
@@ -77,28 +86,32 @@ def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:
         rows, bits = none.astype(np.int32), np.zeros(3, np.int64)
         return Thinned(np.empty((0, 3)), points, rows, np.zeros(1, np.int64), none, bits)
     grid = ScanVoxels.between(ends[0], ends[1], np.full(3, voxel_size_m), 'origin')
-    ordered, to_key, long_keys = sorted_keys(points, grid, number)
+    if int(grid.bits.sum()) + (parts**3 - 1).bit_length() > KEY_BITS:
+        parts = 1
+    ordered, to_key, long_keys = sorted_keys(points, (grid, parts), number)
     rows, starts = np.empty(number, np.int32), np.empty(number + 1, np.int64)
     keys, means = np.empty(number, np.int64), np.empty((number, 3))
     num = average_voxels(points, ordered, to_key, rows, starts, keys, means)
     keys = keys[:num].copy() if long_keys is None else long_keys[keys[:num]]
-    return Thinned(means[:num].copy(), points, rows, starts[: num + 1].copy(), keys, grid.bits)
+    starts = starts[: num + 1].copy()
+    return Thinned(means[:num].copy(), points, rows, starts, keys, grid.bits, parts)
 
 
 def sorted_keys(
-    points: npt.NDArray[Any], grid: ScanVoxels, number: int
+    points: npt.NDArray[Any], voxels: tuple[ScanVoxels, int], number: int
 ) -> tuple[Indices, int, Indices | None]:
     """
     Return key and row of each finite point as one number, sorted, and the bits of a row.
 
     Keys that leave no room for rows are replaced by their ranks; they are returned too, ascending.
     """
+    (grid, parts), to_key = voxels, len(points).bit_length()
     keys: Indices = np.empty(number, np.int64)
     rows: Indices = np.empty(number, np.int64)
-    voxel_keys(points, (np.stack([grid.size, grid.shift, grid.base]), grid.bits), keys, rows)
-    to_key = len(points).bit_length()
+    axes = np.stack([grid.size, grid.shift, grid.base])
+    voxel_keys(points, (axes, grid.bits), parts, keys, rows)
     long_keys: Indices | None = None
-    if int(grid.bits.sum()) + to_key > 63:
+    if int(grid.bits.sum()) + (parts**3 - 1).bit_length() + to_key > 63:
         long_keys, ranks = np.unique(keys, return_inverse=True)
         keys = ranks.astype(np.int64)
     return np.sort(keys << to_key | rows), to_key, long_keys

@@ -57,6 +57,15 @@ def test_floor_walls_and_faces_are_one_plane_each(seen):
         assert np.bincount(labels).max() / len(labels) > 0.9
 
 
+def test_models_do_not_depend_on_repeated_points():
+    """Facets and joins counted points, which are as many as there are in a close surface."""
+    points, _ = room(noise_per_range_sq=1e-3)
+    config = ModelsConfig(voxel_size_m=A, noise_per_range_sq=1e-3)
+    once, twice = (fit(np.tile(points.reshape(-1, 3), (n, 1)), config, VIEW) for n in (1, 2))
+    assert len(once.planes) == len(twice.planes)
+    assert twice.labels.tolist() == 2 * once.labels.tolist()
+
+
 @pytest.mark.parametrize(('which', 'most'), [(CYLINDER, 2), (BALL, 4)])
 def test_round_objects_are_few_surfaces_within_7_mm(seen, which, most):
     _, lies_on, model = seen

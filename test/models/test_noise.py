@@ -25,11 +25,15 @@ KINDS = {
 """Arguments of a wall, and sigma of its depth by depth^2."""
 
 
+def samples_of(thinned, view):
+    return NoiseSamples(thinned.points, thinned.rows, thinned.starts, thinned.means, view=view)
+
+
 def noise_of(cloud, size_m):
     """Return the estimate at the median point, m, and depth times range there, m^2."""
     thinned = thin(cloud.reshape(-1, 3), size_m)
     voxels = thinned.by_voxel()
-    samples = NoiseSamples(voxels.points, voxels.starts, thinned.means, view=np.zeros(3))
+    samples = samples_of(thinned, np.zeros(3))
     n0, n2 = estimate_noise(samples, size_m)
     range_sq = np.nanmedian((voxels.points**2).sum(axis=1))
     return n0 + n2 * range_sq, np.median(voxels.points[:, 2]) * np.sqrt(range_sq)
@@ -108,8 +112,7 @@ def test_noise_grows_with_the_square_of_the_range():
         z = far + 1.5e-3 * far**2 * rng.standard_normal(len(xy))
         parts.append(np.column_stack([xy, z]))
     thinned = thin(np.concatenate(parts), 0.06)
-    voxels = thinned.by_voxel()
-    samples = NoiseSamples(voxels.points, voxels.starts, thinned.means, view=np.zeros(3))
+    samples = samples_of(thinned, np.zeros(3))
     n0, n2 = estimate_noise(samples, 0.06)
     for far in (1.0, 2.0, 3.0, 4.0):
         assert n0 + n2 * far**2 == pytest.approx(1.5e-3 * far**2, rel=0.25)
@@ -119,5 +122,5 @@ def test_noise_grows_with_the_square_of_the_range():
 def test_too_few_points_have_no_noise(number):
     points = np.zeros((number, 3)) + np.arange(number)[:, None] * [0.1, 0.0, 0.0]
     thinned = thin(points, 0.04)
-    samples = NoiseSamples(points, thinned.starts, thinned.means, view=np.ones(3))
+    samples = samples_of(thinned, np.ones(3))
     assert estimate_noise(samples, 0.04) == (0.0, 0.0)

@@ -48,3 +48,30 @@ def test_means_and_rows_are_those_of_a_dictionary(number, dtype, spread_m):
     for label, rows in enumerate(expected.values()):
         by_point[rows] = label
     assert thinned.point_labels(labels).tolist() == by_point.tolist()
+
+
+def test_parts_divide_voxels_and_make_up_their_means():
+    points = cloud(700, np.float64)
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    part = np.floor(points[finite] / (EDGE_M / 3)).astype(int)
+    order = np.column_stack([np.floor(points[finite] / EDGE_M).astype(int), part])
+    rows = {}
+    for row, key in zip(finite.tolist(), order.tolist(), strict=True):
+        rows.setdefault((*key[2::-1], *key[:2:-1]), []).append(row)
+    expected = [rows[key] for key in sorted(rows)]
+
+    parts, whole = thin(points, EDGE_M, 3), thin(points, EDGE_M)
+    voxels = parts.whole_voxels()
+
+    assert parts.rows.tolist() == [row for part_rows in expected for row in part_rows]
+    assert np.diff(parts.starts).tolist() == [len(part_rows) for part_rows in expected]
+    means = [points[part_rows].mean(axis=0) for part_rows in expected]
+    np.testing.assert_allclose(voxels.points, means, rtol=1e-14)
+    assert voxels.keys.tolist() == whole.keys.tolist()
+    assert parts.starts[voxels.starts].tolist() == whole.starts.tolist()
+    np.testing.assert_allclose(voxels.means, whole.means, rtol=1e-13)
+
+
+def test_voxels_that_leave_no_numbers_for_parts_are_not_divided():
+    corners = np.array([[0.25] * 3, [2.0**19 - 0.75] * 3])
+    assert (thin(corners, 0.5, 3).parts, thin(corners, 1.0, 3).parts) == (1, 3)

@@ -36,13 +36,14 @@ def finite_ends(points, ends):
 
 
 @kernel(error_model='numpy')
-def voxel_keys(points, grid, keys, rows):
+def voxel_keys(points, grid, parts, keys, rows):
     """
-    Compute the keys of the voxels of the finite points.
+    Compute the keys of the finite points: of their voxels, times parts^3, plus the part of these.
 
     points  (N, 3) float32 or float64, m
     grid    size, shift and base of each axis (3, 3) float64, and its bits in a key (3,) int64
-    keys    (P,) int64, out: x in the lowest bits, then y and z
+    parts   into which a voxel is divided along each axis
+    keys    (P,) int64, out: x of the voxel in the lowest bits, then y and z; of parts alike
     rows    (P,) int64, out: rows of these points
     """
     axes, bits = grid
@@ -50,10 +51,15 @@ def voxel_keys(points, grid, keys, rows):
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         if math.isfinite(x) and math.isfinite(y) and math.isfinite(z):
-            kx = np.int64(math.floor(x / axes[0, 0] - axes[1, 0]) - axes[2, 0])
-            ky = np.int64(math.floor(y / axes[0, 1] - axes[1, 1]) - axes[2, 1])
-            kz = np.int64(math.floor(z / axes[0, 2] - axes[1, 2]) - axes[2, 2])
-            keys[number] = kx | (ky | kz << bits[1]) << bits[0]
+            x, y, z = x / axes[0, 0], y / axes[0, 1], z / axes[0, 2]
+            x, y, z = x - axes[1, 0], y - axes[1, 1], z - axes[1, 2]
+            kx = np.int64(math.floor(x) - axes[2, 0])
+            ky = np.int64(math.floor(y) - axes[2, 1])
+            kz = np.int64(math.floor(z) - axes[2, 2])
+            key = kx | (ky | kz << bits[1]) << bits[0]
+            for along in (z, y, x):
+                key = key * parts + min(np.int64((along - math.floor(along)) * parts), parts - 1)
+            keys[number] = key
             rows[number] = i
             number += 1
 

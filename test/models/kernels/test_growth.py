@@ -43,7 +43,7 @@ def test_neighbours_equal_brute_force(extent):
 def test_points_of_cubes_are_taken_evenly_from_the_voxels_with_means_inside():
     points = np.random.default_rng(3).uniform(0.0, 1.0, (2000, 3))
     thinned, voxels = by_voxel(points)
-    samples = NoiseSamples(voxels.points, voxels.starts, thinned.means)
+    samples = NoiseSamples(points, thinned.rows, thinned.starts, thinned.means)
     seeds, halves = np.arange(0, len(thinned.means), 7), np.linspace(0.01, 0.4, 143)
     halves = halves[: len(seeds)]
     rows = sampled_rows(samples, seeds, halves, 30)
