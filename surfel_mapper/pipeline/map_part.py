@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.registration import is_near, Registration, RegistrationResult
+from surfel_mapper.alignment.place_search import PlaceSearch
+from surfel_mapper.alignment.registration import is_near, Registration, RegistrationResult, turned
 from surfel_mapper.alignment.surfel_planes import means
 from surfel_mapper.alignment.tracking import FIRST_SUPPORT, Tracker
 from surfel_mapper.config import Config
@@ -33,10 +34,22 @@ CONFIRMING = 2
 """Number of scans that have to agree with the place of an earlier one."""
 
 MOST_SCANS = 200
-"""Number of scans that a part keeps for joining it, some 300 MB of 131,072 points each."""
+"""Number of scans that a part keeps for joining it, some 300 MB of 131,072 points each; all parts
+that wait for the end of the input keep as many."""
 
 LEAST_SCANS = 3
 """Parts of fewer scans are not kept: their scans count as dropped."""
+
+LEAST_MATCHED = 4
+"""Smaller parts are not matched as a whole: of 24 parts of three scans with a view of 90 deg at a
+wrong place one would be taken, of 90 of four to eight scans none."""
+
+REACH_M, MOST_CELLS = 60.0, 20_000
+"""Distance up to which surfaces of a map count, and number of them, if parts are matched."""
+
+MOST_APART, MOST_SEEN_THROUGH = 0.4, 0.15
+"""Largest distance of the poses found both ways, in voxels, and largest share of the surfaces of
+one map that the other sees through, in a match."""
 
 LEAST_SUPPORT = 0.1
 """Minimum support of a scan on its part: a scan that hardly fits says nothing about the motion."""
@@ -260,6 +273,40 @@ class MapPart:
         self._num_agreeing += 1
         return (self._T_map_part, result) if self._num_agreeing >= CONFIRMING else None
 
+    def matched(
+        self, surfel_map: SurfelMap, T_map_body: Transform
+    ) -> tuple[Transform, RegistrationResult] | None:
+        """
+        Return T_map_part if all scans together have a certain place on a map, else None.
+
+        The smaller of the two maps is aligned to the larger, since more of it overlaps, from
+        T_map_body at all headings and from the places of a search. The surroundings of the place
+        found are then aligned back.
+        """
+        if len(self.scans) < LEAST_MATCHED:
+            return None
+        T_part_body, registration = self.scans[0].T_part_body, self._registration
+        search = PlaceSearch(means(surfel_map.moments()), surfel_map.voxel_size_m)
+        places = turned([T_map_body], 24) + search.poses(cells_around(self._map, T_part_body))
+        small, large, T_small_body = self._map, surfel_map, T_part_body
+        if is_larger := self._map.num_voxels > surfel_map.num_voxels:
+            small, large, T_small_body = surfel_map, self._map, T_map_body
+            places = [compose(T_part_body, compose(inverse(T), T_map_body)) for T in places]
+        result = registration.relocate(cells_around(small, T_small_body), large, places)
+        cells = cells_around(large, result.T_map_sensor)
+        back = registration.align(
+            cells, small, [T_small_body], registration.config.max_deviation_m
+        )
+        is_right = result.rival == 0.0 and registration.fits(result)
+        for way in (result, back):
+            is_right &= way.converged and not len(way.degenerate)
+            is_right &= way.seen_through <= MOST_SEEN_THROUGH
+        most_m = MOST_APART * surfel_map.voxel_size_m
+        if not is_right or not is_near(back.T_map_sensor, T_small_body, most_m):
+            return None
+        T_small_large = compose(T_small_body, inverse(result.T_map_sensor))
+        return T_small_large if is_larger else inverse(T_small_large), result
+
     def _refused(self, result: RegistrationResult) -> str:
         """Return why a scan has no certain place on the map; empty if it has."""
         usual_support, max_seen_through = self.limits
@@ -280,3 +327,10 @@ class MapPart:
             poses=[scan.T_part_sensor for scan in self.scans],
             reason=self.reasons,
         )
+
+
+def cells_around(surfel_map: SurfelMap, T_map_body: Transform) -> npt.NDArray[np.float64]:
+    """Return one point of each voxel near a pose, as seen from there, (K, 3) m."""
+    points = means(surfel_map.moments()) - T_map_body[:3, 3]
+    near = points[np.hypot(points[:, 0], points[:, 1]) < REACH_M] @ T_map_body[:3, :3]
+    return np.ascontiguousarray(near[:: len(near) // MOST_CELLS + 1])

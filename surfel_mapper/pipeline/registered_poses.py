@@ -43,8 +43,9 @@ from surfel_mapper.scan import PointTimes, Scan
 MOST_PARTS = 20
 """Number of parts whose maps are kept; of more, the oldest are forgotten."""
 
-STATES = ('lost', 'unconfirmed', 'ambiguous', 'degenerate', 'surrounded')
-"""States of tracking; surrounded: most of a scan seems to move along, its pose may be wrong."""
+STATES = ('lost', 'unconfirmed', 'ambiguous', 'degenerate', 'surrounded', 'rejoined')
+"""States of tracking; surrounded: most of a scan seems to move along, its pose may be wrong;
+rejoined: its part was matched to the map at the end of the input."""
 
 UNKNOWN_START = 'its initial pose is unknown, and searched for in the map'
 
@@ -109,6 +110,7 @@ class RegisteredPoses:
         self._transforms = transforms
         self._drops = drops
         self._map_part: MapPart | None = None
+        self._ended_parts: list[MapPart] = []
         self.apart: list[ApartMap] = []
         self._states = StateTimes()
         self._surroundings = SurroundingMotion()
@@ -251,15 +253,48 @@ class RegisteredPoses:
             placed = self._track(sighting, surfel_map, T_map_fixed)
         else:
             placed = self._recover(sighting, self._map_part, surfel_map, T_map_fixed)
+        if placed:
+            self.finish()  # scans are mapped in order
         is_surrounded = self._is_surrounded(sighting, placed, surfel_map)
         self._count_state(scan.stamp_ns, placed, is_surrounded)
         return placed
 
+    def rejoin(self, surfel_map: SurfelMap, T_map_fixed: Transform) -> list[Prepared]:
+        """
+        Return the scans of the next part that as a whole has a certain place; none at the end.
+
+        They come after the scans of the map, and none do while further scans may follow.
+        """
+        if not self.scans_ended or self._config.map.mode == 'frozen' or not surfel_map.num_voxels:
+            return []
+        self._end_part(waits=True)
+        while self._ended_parts:
+            map_part = self._ended_parts.pop(0)
+            T_map_body = compose(T_map_fixed, self._tracker.pose)
+            if match := map_part.matched(surfel_map, T_map_body):
+                T_fixed_part = compose(inverse(T_map_fixed), match[0])
+                self._tracker.restart(compose(T_fixed_part, map_part.scans[-1].T_part_body))
+                for waiting in map_part.scans:
+                    self._states.add(waiting.prepared.scan.stamp_ns, ['rejoined'])
+                return self._joined(map_part, T_fixed_part, match[1])
+            self._leave_apart(map_part)
+        return []
+
     def finish(self) -> None:
-        """End the part whose place was not confirmed: it stays apart."""
-        map_part, self._map_part = self._map_part, None
-        if map_part is None:
-            return
+        """End the parts whose places were not confirmed: they stay apart."""
+        self._end_part(waits=False)
+
+    def _end_part(self, *, waits: bool) -> None:
+        """End the newest part; some may wait for the end of the input, if loops are closed."""
+        if self._map_part is not None:
+            self._ended_parts.append(self._map_part)
+            self._map_part = None
+        most = MOST_SCANS if waits and self._config.loops.enabled else 0
+        while sum(len(ended.scans) for ended in self._ended_parts) > most:
+            self._leave_apart(self._ended_parts.pop(0))
+
+    def _leave_apart(self, map_part: MapPart) -> None:
+        """Drop the scans of a part, and keep its map."""
         is_kept = len(map_part.scans) >= LEAST_SCANS
         for waiting in map_part.scans:
             cause = 'apart' if is_kept else 'not_aligned'
@@ -349,14 +384,20 @@ class RegisteredPoses:
             confirmed = map_part.confirmed(sighting.cells, surfel_map, T_part_middle, places)
         if confirmed is None:
             if len(map_part.scans) >= MOST_SCANS:
-                self.finish()
+                self._end_part(waits=True)
             return []
         T_map_part, result = confirmed
-        T_fixed_part = compose(inverse(T_map_fixed), T_map_part)
         self._map_part, self._knows_start = None, True
+        T_fixed_part = compose(inverse(T_map_fixed), T_map_part)
         T_fixed_middle = compose(T_fixed_part, T_part_middle)
         twist = map_part.tracker.twist
         self._tracker.resume(T_fixed_middle, sighting.stamp_ns, twist, sighting.cells)
+        return self._joined(map_part, T_fixed_part, result)
+
+    def _joined(
+        self, map_part: MapPart, T_fixed_part: Transform, result: RegistrationResult
+    ) -> list[Prepared]:
+        """Return the scans of a part at their poses, and count them."""
         self._num_aligned += len(map_part.scans)
         self._fits.append(result.fit)
         return [
@@ -396,7 +437,7 @@ class RegisteredPoses:
         A single scan that fits nothing is no loss: the next one may continue the track, unless
         the single one came after a part of several.
         """
-        self.finish()
+        self._end_part(waits=True)
         if len(map_part.scans) > 1 or map_part.follows_part:
             guess = compose(map_part.guess, map_part.tracker.predict(sighting.stamp_ns))
             limits, reason = map_part.limits, map_part.reason

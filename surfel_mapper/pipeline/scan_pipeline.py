@@ -141,9 +141,8 @@ class ScanPipeline:
         """
         while self.arrived:  # each is used, held until the next message, or dropped
             self._settle(self.guard.judge(self.arrived.popleft()))
-        while (posed := self._next_posed(more_follows)) is not None:
-            laps, T_map_fixed = Laps(), self.aligner.T_map_fixed
-            for prepared in self._prepared(*posed, laps):  # deskewed, filtered and registered
+        for laps, T_map_fixed, ready in self._ready(more_follows):
+            for prepared in ready:
                 inserted, update, alignment, results = None, None, None, dict[str, Any]()
                 try:
                     if self.config.map.mode != 'frozen':  # which takes no scan
@@ -167,6 +166,16 @@ class ScanPipeline:
                 if update is not None:
                     yield update
                 laps = Laps()
+
+    def _ready(self, more_follows: bool) -> Iterator[tuple[Laps, Transform, Sequence[Prepared]]]:
+        """Yield scans deskewed, filtered and registered, with their times and T_map_fixed."""
+        while (posed := self._next_posed(more_follows)) is not None:
+            laps = Laps()
+            yield laps, self.aligner.T_map_fixed, self._prepared(*posed, laps)
+        registered, aligner = self.poses.registered, self.aligner
+        while registered and (joined := registered.rejoin(self.map, aligner.T_map_fixed)):
+            joined = [replace(p, T_map_sensor=aligner.to_map(p.T_map_sensor)) for p in joined]
+            yield Laps(), aligner.T_map_fixed, joined
 
     def add_scan(self, scan: Scan) -> None:
         """Take a scan that can be mapped; ``run`` judges its stamp."""

@@ -45,6 +45,7 @@ STATES = {
     'ambiguous': 'with another pose that fits as well',
     'degenerate': 'without surfaces that fix every direction',
     'surrounded': 'with most surfaces moving with the sensor',
+    'rejoined': 'placed at the end, with all scans of their part',
 }
 """States of tracking in words."""
 
