@@ -233,8 +233,6 @@ class Registration:
         """
         levels = PlaneLevels(self.config, surfel_map, cells, starts)
         result = self._descend(cells, levels, starts[0], deviation_m)
-        if len(result.degenerate) and not is_lost:
-            result = self._determined(result, cells, levels, starts)
         is_usual = result.converged and result.support >= expected_support and self.fits(result)
         is_predicted = deviation_m <= self._voxel_size_m and not is_lost
         if is_usual and is_predicted and self._is_near(result, starts[0]):
@@ -251,6 +249,55 @@ class Registration:
         results = self._at_one_level([result, *searched], cells, levels)
         chosen = self._chosen(results, starts, is_lost)
         return replace(chosen, is_found=not self._is_near(chosen, result.T_map_sensor))
+
+    def determined(
+        self,
+        result: RegistrationResult,
+        cells: npt.NDArray[np.float64],
+        surfel_map: SurfelMap,
+        starts: Sequence[Transform],
+    ) -> RegistrationResult:
+        """
+        Return a degenerate result of ``align``, or one nearby that determines more directions.
+
+        The end of a corridor determines the motion along it, but no cell of it meets a surfel if
+        the start is off by more than a voxel. So starts along the undetermined directions are
+        aligned to the largest voxels, and the whole scan from the best of those. It is for starts
+        without a prediction: in a hall seen by 90 deg predictions were better than this.
+
+        Parameters
+        ----------
+        result : RegistrationResult
+            The degenerate result.
+        cells : (K, 3) float64, m
+            Cells of the scan.
+        surfel_map : SurfelMap
+            The map.
+        starts : sequence of (4, 4) float64
+            Those of the result; of places that fit about equally well the nearest is taken.
+
+        """
+        levels = PlaneLevels(self.config, surfel_map, cells, starts)
+        level, num = self.config.coarse_levels, len(result.degenerate)
+        planes, some = levels.planes(level), thinned(cells, SEARCH_CELLS)
+        size_m = planes.voxel_size_m
+        steps = result.degenerate / np.repeat([1.0, result.radius_m], 3)
+        rough = [
+            self._converge(
+                *(some, planes, moved(result.T_map_sensor, number * 0.5 * size_m * step)),
+                *(size_m, COARSE_TOLERANCE * size_m, self.config.max_iterations),
+            )
+            for step in steps
+            for number in STEPS_ALONG
+        ]
+        places = [other for other in rough if len(other.degenerate) < num]
+        view, results = ScanView(cells), []
+        for pose in self._distinct_poses(places, SEARCH_STARTS):
+            other = self._viewed(self._descend(cells, levels, pose, size_m), view, levels)
+            fits = other.converged and other.support >= AMBIGUOUS * result.support
+            if fits and len(other.degenerate) < num and other.seen_through <= MAX_SEEN_THROUGH:
+                results.append(other)
+        return self._chosen(results, starts, is_lost=False) if results else result
 
     def relocate(
         self,
@@ -421,41 +468,6 @@ class Registration:
             degenerate=degenerate,
             radius_m=radius_m,
         )
-
-    def _determined(
-        self,
-        result: RegistrationResult,
-        cells: npt.NDArray[np.float64],
-        levels: PlaneLevels,
-        starts: Sequence[Transform],
-    ) -> RegistrationResult:
-        """
-        Return a degenerate result, or one nearby at which more directions are determined.
-
-        The end of a corridor determines the motion along it, but no cell of it meets a surfel if
-        the prediction is off by more than a voxel. So starts along the undetermined directions are
-        aligned to the largest voxels, and the whole scan from the best of those.
-        """
-        level, num = self.config.coarse_levels, len(result.degenerate)
-        planes, some = levels.planes(level), thinned(cells, SEARCH_CELLS)
-        size_m = planes.voxel_size_m
-        steps = result.degenerate / np.repeat([1.0, result.radius_m], 3)
-        rough = [
-            self._converge(
-                *(some, planes, moved(result.T_map_sensor, number * 0.5 * size_m * step)),
-                *(size_m, COARSE_TOLERANCE * size_m, self.config.max_iterations),
-            )
-            for step in steps
-            for number in STEPS_ALONG
-        ]
-        places = [other for other in rough if len(other.degenerate) < num]
-        view, results = ScanView(cells), []
-        for pose in self._distinct_poses(places, SEARCH_STARTS):
-            other = self._viewed(self._descend(cells, levels, pose, size_m), view, levels)
-            fits = other.converged and other.support >= AMBIGUOUS * result.support
-            if fits and len(other.degenerate) < num and other.seen_through <= MAX_SEEN_THROUGH:
-                results.append(other)
-        return self._chosen(results, starts, is_lost=False) if results else result
 
     def _searched_poses(
         self, cells: npt.NDArray[np.float64], levels: PlaneLevels, starts: Sequence[Transform]

@@ -183,6 +183,8 @@ class Tracker:
             starts.append(compose(T_map_fixed, self.pose))
         expected = self.expected_support
         result = self._registration.align(cells, surfel_map, starts, self.deviation_m, expected)
+        if len(result.degenerate) and not self.twist.any():  # no motion is known yet
+            result = self._registration.determined(result, cells, surfel_map, starts)
         result = self._without_companions(result, cells, surfel_map, starts)
         is_usual = bool(self._supports) and result.support >= expected > 0.0
         is_steady = result.converged or is_usual

@@ -160,7 +160,7 @@ def test_the_prediction_is_kept_along_a_corridor():
 
 
 @pytest.mark.parametrize('ahead_m', [-2.5, -1.5, 1.5])
-def test_the_end_of_a_corridor_determines_the_motion_if_the_prediction_misses_it(ahead_m):
+def test_the_end_of_a_corridor_determines_the_motion_if_the_start_misses_it(ahead_m):
     end = (((20.0, -1.5, 0.0), (0.0, 3.0, 0.0), (0.0, 0.0, 2.5)),)
     corridor = (
         *[((-60.0, *corner[1:]), (80.0, *along[1:]), up) for corner, along, up in CORRIDOR],
@@ -170,6 +170,8 @@ def test_the_end_of_a_corridor_determines_the_motion_if_the_prediction_misses_it
     points = scan_of(corridor, reach_m=25.0)
 
     found = align(corridor, start, 0.3, points=points)
+    aligner = registration()
+    found = aligner.determined(found, aligner.cells(points), map_of(corridor), [start])
 
     assert len(found.degenerate) == 0
     assert off(found.T_map_sensor)[0] < 3e-3
