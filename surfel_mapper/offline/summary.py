@@ -25,7 +25,7 @@ DOUBTFUL = {
     'surrounded': (5, 'most surfaces seem to move with the sensor'),
     'ambiguous': (5, 'two places fit about equally well'),
     'degenerate': (2, 'surfaces do not determine every direction of motion'),
-    'rejoined': (1, 'only a part of the map as a whole had a certain place'),
+    'rejoined': (1, 'only their separate map as a whole had a certain place'),
 }
 """States that put poses in doubt: the least number of scans, as right maps of halls and streets
 have up to one ambiguous scan, and the statement."""
