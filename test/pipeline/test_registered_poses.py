@@ -403,7 +403,7 @@ def test_the_text_names_scans_by_their_state_of_tracking():
     ('state', 'least', 'statement'),
     [
         ('ambiguous', 5, 'two places fit about equally well'),
-        ('degenerate', 2, 'surfaces do not determine every direction of motion'),
+        ('degenerate', 3, 'surfaces do not determine every direction of motion'),
     ],
 )
 def test_a_map_of_many_doubtful_scans_is_in_doubt(state, least, statement):
