@@ -290,13 +290,14 @@ class Registration:
             for step in steps
             for number in STEPS_ALONG
         ]
-        places = [other for other in rough if len(other.degenerate) < num]
+        candidates = [coarse for coarse in rough if len(coarse.degenerate) < num]
         view, results = ScanView(cells), []
-        for pose in self._distinct_poses(places, SEARCH_STARTS):
-            other = self._viewed(self._descend(cells, levels, pose, size_m), view, levels)
-            fits = other.converged and other.support >= AMBIGUOUS * result.support
-            if fits and len(other.degenerate) < num and other.seen_through <= MAX_SEEN_THROUGH:
-                results.append(other)
+        for pose in self._distinct_poses(candidates, SEARCH_STARTS):
+            candidate = self._viewed(self._descend(cells, levels, pose, size_m), view, levels)
+            fits = candidate.converged and candidate.support >= AMBIGUOUS * result.support
+            is_determined = len(candidate.degenerate) < num
+            if fits and is_determined and candidate.seen_through <= MAX_SEEN_THROUGH:
+                results.append(candidate)
         return self._chosen(results, starts, is_lost=False) if results else result
 
     def relocate(

@@ -74,7 +74,7 @@ def test_several_bags_become_one_map(bags, both, alone, tmp_path, capsys):
     assert len(view['seconds']) == summary['scans']['mapped']  # the trajectory of all scans
     assert 'distance driven' not in page  # which has the way between the bags
     assert 'Voxels over time' not in page  # which no process knows
-    assert 'window.max_scans' not in page.partition('<details>')[0]  # nobody set it
+    assert 'window.max_scans' not in page.partition('<details>')[0]  # a default
 
 
 @pytest.mark.drawn

@@ -76,7 +76,7 @@ def test_some_trucks_that_move_along_or_pass_are_not():
 
 
 def is_in_doubt(shares):
-    """Return which scans seem to move along with what is around, by shares of new voxels."""
+    """Return the scans that are reported, from their motions and shares of new voxels."""
     surroundings, surfel_map = SurroundingMotion(), SurfelMap(1.0)
     standing = np.arange(1000)[:, None] * [1.0, 0.0, 0.0] + 0.5
     surfel_map.add(standing)
