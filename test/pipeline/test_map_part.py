@@ -110,7 +110,7 @@ def test_scans_of_a_narrow_view_are_joined_at_the_end_and_named(data_folder, clo
     text = uncertain_text(mapper.summary())
     if closes_loops:
         assert stamps_ns == [number * 10**8 for number in range(1, 33)]
-        assert 'in 4 of 32 scans (2.900 to 3.200 s) only a part' in text
+        assert 'in 4 of 32 scans (2.900 to 3.200 s) only their separate map' in text
     else:
         assert len(stamps_ns) == 28
         assert mapper.counters.dropped == {'apart': 4}
