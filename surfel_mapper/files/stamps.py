@@ -51,7 +51,10 @@ def nanoseconds(text: str, where: str, unit: str = '') -> int:
 
 def unit_by_digits(text: str) -> str:
     """Return the unit of a time by the digits before its point: ns, us or ms since 1970, or s."""
-    digits = len(text.strip().partition('.')[0])
+    try:
+        digits = Decimal(text.strip()).adjusted() + 1
+    except InvalidOperation:
+        return 's'
     return 's' if digits < 12 else 'ms' if digits < 14 else 'us' if digits < 17 else 'ns'
 
 

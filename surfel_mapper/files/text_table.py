@@ -148,9 +148,9 @@ def finite(texts: Sequence[str], where: str) -> list[float]:
     return values
 
 
-def read_lines(path: str | Path) -> TextLines:
+def read_lines(path: str | Path, *, comments: bool = False) -> TextLines:
     """
-    Return the lines of a text but empty ones and comments; a commented CSV header is kept.
+    Return the lines of a text but empty ones and, unless they are asked for, comments.
 
     Raises
     ------
@@ -166,14 +166,14 @@ def read_lines(path: str | Path) -> TextLines:
         reason = getattr(error, 'strerror', None) or error
         raise FileFormatError(f'{path}: cannot be read: {reason}') from error
     lines = text.replace('\r\n', '\n').replace('\r', '\n').split('\n')
-    kept = [(number, line) for number, line in enumerate(lines, 1) if has_content(line)]
+    numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip()]
+    kept = [(n, line) for n, line in numbered if comments or not is_comment(line)]
     return TextLines(path, [number for number, _ in kept], [line for _, line in kept])
 
 
-def has_content(line: str) -> bool:
-    """Return whether a line is neither empty nor a comment."""
-    text = line.lstrip()
-    return bool(text) and (text[0] not in '#%' or ',' in text)
+def is_comment(line: str) -> bool:
+    """Return whether a line that is not empty is a comment."""
+    return line.lstrip()[0] in '#%'
 
 
 def table_rows(

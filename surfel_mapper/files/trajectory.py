@@ -3,10 +3,11 @@
 """
 Trajectories as text: reading those of most programs, writing TUM.
 
-A line is a pose: a stamp or nothing, x y z and a quaternion, or a matrix; the first line decides.
-Read are TUM (with an id behind it: RTAB-Map; in nanoseconds: ORB-SLAM3), KITTI, matrices of four
-rows in a line (Replica), KITTI-360 with the number of the scan
-before them, g2o's VERTEX_SE3, and CSV with names of its columns (EuRoC, Newer College).
+A line is a pose: a stamp or nothing, x y z and a quaternion, or a matrix. A header names the
+columns, also in a comment (EuRoC, Newer College, rostopic echo -p). Without one the first line
+decides. Read are TUM (with an id behind it: RTAB-Map; in nanoseconds: ORB-SLAM3), KITTI, matrices
+of four rows in a line (Replica), with the number of the scan (KITTI-360) or a time (MulRan) before
+them, and g2o's VERTEX_SE3.
 
 Coordinates are written with the digits that restore the same float64, stamps with all nanoseconds
 (stamps.py). Poses are neither sorted nor interpolated here: a pose of the wrong time maps a scan
@@ -20,7 +21,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+import re
+from textwrap import shorten
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -29,8 +32,8 @@ from surfel_mapper.arguments import as_array, as_numbers, as_path, as_whole, mad
 from surfel_mapper.errors import counted, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.pose_rows import matrix_rows, quaternion_rows, warn_of_skew
-from surfel_mapper.files.stamps import column_ns, read_times, unit_by_digits, UNITS_NS
-from surfel_mapper.files.text_table import read_lines, Rows, table_rows, TextLines
+from surfel_mapper.files.stamps import column_ns, read_times, unit_by_digits
+from surfel_mapper.files.text_table import is_comment, read_lines, Rows, table_rows, TextLines
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw, quaternions
 from surfel_mapper.poses.buffer import seconds
 
@@ -47,21 +50,29 @@ TUM_HEADER = '# stamp_s x y z qx qy qz qw\n'
 KITTI_TIMES = 'times.txt'
 """The file beside KITTI poses with the seconds of each."""
 
-POSE_COLUMNS = (
-    ('x', 'tx', 'px', 'p_x', 'p_rs_r_x', 'position_x', 'pos_x'),
-    ('y', 'ty', 'py', 'p_y', 'p_rs_r_y', 'position_y', 'pos_y'),
-    ('z', 'tz', 'pz', 'p_z', 'p_rs_r_z', 'position_z', 'pos_z'),
-    ('qx', 'q_x', 'q_rs_x', 'orientation_x'),
-    ('qy', 'q_y', 'q_rs_y', 'orientation_y'),
-    ('qz', 'q_z', 'q_rs_z', 'orientation_z'),
-    ('qw', 'q_w', 'q_rs_w', 'orientation_w'),
-)
-"""Names of the seven numbers of a pose in CSV files (those with RS are EuRoC's)."""
+POSE_COLUMNS = [
+    *(rf'((.*_)?(pos|pose|position|translation|t|p)_?|p_rs_r_)?{axis}' for axis in 'xyz'),
+    *(rf'(.*_)?(q|q_rs|quat|quaternion|orientation|rot|rotation)_?{axis}' for axis in 'xyzw'),
+]
+"""
+Names of the seven numbers of a pose in a header, as of EuRoC (p_RS_R_x) or a topic of ROS
+(field.pose.pose.position.x, /odom/pose/pose/orientation/w).
+"""
 
-STAMP_COLUMNS = ('stamp', 'timestamp', 'time', 't')
+STAMP_COLUMN = re.compile(r'(?:.*_)?(?:u?time|(?:time)?stamp|t)(?:_(sec|[mun]?s))?')
+"""Names of a stamp, perhaps with its unit."""
 
-PARTS = (('sec', 'secs'), ('nsec', 'nsecs', 'nanosec'))
+PARTS = ('(.*_)?secs?', '(.*_)?(nsecs?|nanosec)')
 """Names of the columns of a stamp in two numbers."""
+
+MOST_COMMENTS = 100
+"""Number of lines in which a header is looked for."""
+
+MOST_NUMBER = 10**9
+"""Limit of the number of a scan; larger ones before a matrix are times."""
+
+MOST_SHOWN = 200
+"""Length of the names of columns in an error, characters."""
 
 TUM, RTABMAP = 8, 9
 """Numbers of columns: stamp x y z qx qy qz qw, and an id."""
@@ -71,6 +82,14 @@ MATRICES = (12, 13, 16, 17)
 
 VERTEX = 'VERTEX_SE3:QUAT'
 """First word of a pose in g2o: its number, x y z qx qy qz qw."""
+
+
+class PoseColumns(NamedTuple):
+    """Number of columns of a table, those of its stamp with their units, those of the pose."""
+
+    width: int
+    stamps: dict[int, str]
+    pose: list[int]
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -272,14 +291,21 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
         not increase.
 
     """
-    lines = read_lines(path)
-    if not lines.texts:
+    commented = read_lines(path, comments=True)
+    headers = [header_of(text) for text in commented.texts[:MOST_COMMENTS]]
+    header = next(filter(None, headers), None)
+    first = headers.index(header) + 1 if header else 0
+    texts = commented.texts
+    lines = commented.at([row for row in range(first, len(texts)) if not is_comment(texts[row])])
+    if header is None and not lines.texts:
         raise FileFormatError(f'{path}: no poses in it, expected a line for each')
-    format_ = format_ or guessed(path, lines.texts)
+    format_ = format_ or ('csv' if header else guessed(path, lines.texts))
     if format_ not in FORMATS:
         expected = ', '.join(FORMATS)
         raise FileFormatError(f'{path}: format {format_!r}, expected one of {expected}')
-    readers = {'csv': csv_poses, 'kitti': matrix_poses, 'tum': tum_poses, 'g2o': g2o_poses}
+    if header is not None and format_ in ('csv', 'tum'):
+        return named_poses(lines, header)
+    readers = {'csv': unnamed_poses, 'kitti': matrix_poses, 'tum': tum_poses, 'g2o': g2o_poses}
     return readers[format_](lines)
 
 
@@ -295,15 +321,16 @@ def guessed(path: str | Path, texts: Sequence[str]) -> str:
     words = line.split()
     if words[0].startswith(('VERTEX', 'EDGE', 'FIX', 'PARAMS')):
         return 'g2o'
-    if ',' in line:
-        return 'csv'
+    separator = separator_of(line)
+    if separator:
+        return 'kitti' if len(line.split(separator)) in MATRICES else 'csv'
     if len(words) in (TUM, RTABMAP):
         return 'tum'
     if len(words) not in MATRICES:
         raise FileFormatError(
             f'{path}: {len(words)} columns in the first line, expected 8 (TUM; 9 with an id), 12 '
-            '(KITTI) or 16 (4 x 4) of a matrix, 13 or 17 with the number of the scan before it '
-            f'(KITTI-360), commas (CSV), or {VERTEX} (g2o)'
+            '(KITTI) or 16 (4 x 4) of a matrix, 13 or 17 with a number or a time before it, '
+            f'{VERTEX} (g2o), or a header that names the columns'
         )
     return 'kitti'
 
@@ -341,26 +368,46 @@ def numbered_poses(poses: npt.NDArray[np.float64], number: npt.NDArray[np.int64]
     return Trajectory(None, poses[:, :3], poses[:, 3:], None if is_all else number)
 
 
-def csv_poses(lines: TextLines) -> Trajectory:
-    """Return the poses of a CSV file with a header, its first line."""
-    header = [column_name(column) for column in lines.texts[0].lstrip('# ').split(',')]
-    names = [name for name, _ in header]
-    stamps = [column for column, name in enumerate(names) if name in STAMP_COLUMNS]
-    halves = [[names.index(alias) for alias in aliases if alias in names] for aliases in PARTS]
-    aliased = [[names.index(a) for a in aliases if a in names] for aliases in POSE_COLUMNS]
-    if not (stamps or all(halves)) or not all(aliased):
-        raise FileFormatError(
-            f'{lines.where(0)}: columns {", ".join(names)}; expected a header with stamp_s or '
-            'stamp_ns (or sec, nsec), x, y, z, qx, qy, qz, qw'
-        )
-    rows = table_rows(lines.at(range(1, len(lines.texts))), len(names), separator=',')
-    if stamps:
-        unit = header[stamps[0]][1] or unit_of_column(rows, stamps[0])
-        stamp_ns = column_ns(rows, stamps[0], unit)
-    else:
-        stamp_ns = column_ns(rows, halves[0][0], 's') + column_ns(rows, halves[1][0], 'ns')
-    poses = quaternion_rows(rows, [columns[0] for columns in aliased])
-    return stamped_poses(rows.lines, stamp_ns, poses)
+def separator_of(line: str) -> str | None:
+    """Return the character between the columns of a line; None for spaces."""
+    return next((mark for mark in ',;' if mark in line), None)
+
+
+def header_of(line: str) -> PoseColumns | None:
+    """Return the columns of a stamp and a pose that a line names; None if one is missing."""
+    cells = [column_name(cell) for cell in line.lstrip('#%/ ').split(separator_of(line))]
+
+    def named(pattern: str | re.Pattern[str]) -> list[int]:
+        return [at for at, (name, _) in enumerate(cells) if re.fullmatch(pattern, name)]
+
+    pose, halves, stamps = [*map(named, POSE_COLUMNS)], [*map(named, PARTS)], named(STAMP_COLUMN)
+    if not all(pose) or not (stamps or all(halves)):
+        return None
+    columns = [numbers[0] for numbers in pose]
+    if all(halves):
+        return PoseColumns(len(cells), {halves[0][0]: 's', halves[1][0]: 'ns'}, columns)
+    stamp = min(stamps, key=lambda at: 'stamp' not in cells[at][0])  # rostopic's %time is recorded
+    match = STAMP_COLUMN.fullmatch(cells[stamp][0])
+    return PoseColumns(len(cells), {stamp: cells[stamp][1] or (match and match[1]) or ''}, columns)
+
+
+def named_poses(lines: TextLines, header: PoseColumns) -> Trajectory:
+    """Return the poses of a table by the names of its columns."""
+    separator = separator_of(lines.texts[0]) if lines.texts else None
+    rows = table_rows(lines, header.width, separator=separator)
+    stamps = header.stamps.items()
+    parts = [column_ns(rows, at, unit or unit_of_column(rows, at)) for at, unit in stamps]
+    stamp_ns = np.array(parts).sum(axis=0)
+    return stamped_poses(rows.lines, stamp_ns, quaternion_rows(rows, header.pose))
+
+
+def unnamed_poses(lines: TextLines) -> Trajectory:
+    """Raise FileFormatError, as the order of the columns is not known."""
+    names = ', '.join(map(str.strip, lines.texts[0].split(separator_of(lines.texts[0]))))
+    raise FileFormatError(
+        f'{lines.where(0)}: columns {shorten(names, MOST_SHOWN, placeholder=" ...")}; expected a '
+        'header with stamp_s or stamp_ns (or sec, nsec), x, y, z, qx, qy, qz, qw'
+    )
 
 
 def stamped_poses(
@@ -378,19 +425,17 @@ def stamped_poses(
 
 
 def column_name(text: str) -> tuple[str, str]:
-    """Return name and unit of a CSV column: ``stamp_ns``, or ``timestamp [ns]`` as EuRoC has."""
-    name, _, bracket = text.strip().strip('"').lower().replace('(', '[').partition('[')
-    name, unit = name.strip(), bracket.rstrip(')] ').strip()
-    for suffix in UNITS_NS:
-        if name.removesuffix(f'_{suffix}') in STAMP_COLUMNS:
-            return name.removesuffix(f'_{suffix}'), unit or name.rpartition('_')[2] * ('_' in name)
-    return name, unit
+    """Return name, with _ for marks, and unit of a column: ``timestamp [ns]`` as EuRoC has it."""
+    name, _, bracket = text.lower().replace('(', '[').partition('[')
+    return re.sub(r'\W+', '_', name).strip('_'), bracket.strip(')] "')
 
 
 def matrix_poses(lines: TextLines) -> Trajectory:
-    """Return the poses of a file of matrices, in a line each, perhaps numbered."""
-    width = len(lines.texts[0].split())
-    rows = table_rows(lines, width if width in MATRICES else 12, meaning=': 3 or 4 rows of 4')
+    """Return the poses of a file of matrices, in a line each, perhaps with a number or a time."""
+    separator = separator_of(lines.texts[0])
+    width = len(lines.texts[0].split(separator))
+    columns = width if width in MATRICES else 12
+    rows = table_rows(lines, columns, separator=separator, meaning=': 3 or 4 rows of 4')
     first = width % 4
     poses, skew = matrix_rows(rows, slice(first, first + 12))
     if width >= 16 and not np.allclose(rows.numbers(slice(first + 12, None)), [0, 0, 0, 1]):
@@ -398,7 +443,10 @@ def matrix_poses(lines: TextLines) -> Trajectory:
     warn_of_skew(lines.path, skew)
     table = np.hstack([poses[:, :3, 3], quaternions(poses)])
     if first:
-        return numbered_poses(table, rows.numbers([0])[:, 0].astype(np.int64))
+        number = rows.numbers([0])[:, 0]
+        if (number != np.rint(number)).any() or number.max() >= MOST_NUMBER:
+            return stamped_poses(lines, column_ns(rows, 0, unit_of_column(rows, 0)), table)
+        return numbered_poses(table, number.astype(np.int64))
     stamps = kitti_stamps(Path(lines.path).with_name(KITTI_TIMES), len(poses))
     return Trajectory(stamps, table[:, :3], table[:, 3:])
 

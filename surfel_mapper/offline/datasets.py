@@ -30,16 +30,15 @@ from surfel_mapper.errors import ConfigError, FileFormatError, refusing
 from surfel_mapper.files.atomic import by_number
 from surfel_mapper.files.foreign_points import read_feather
 from surfel_mapper.files.pose_rows import (
-    matrix_rows,
     MAX_SKEW,
     rigid_poses,
     warn_of_skew,
 )
 from surfel_mapper.files.raw import FLOATS
 from surfel_mapper.files.scan_files import read_scan
-from surfel_mapper.files.stamps import column_ns, read_dates, read_times
-from surfel_mapper.files.text_table import finite, read_lines, table_rows
-from surfel_mapper.files.trajectory import read_trajectory, stamped_poses, Trajectory
+from surfel_mapper.files.stamps import read_dates, read_times
+from surfel_mapper.files.text_table import finite, read_lines
+from surfel_mapper.files.trajectory import read_trajectory, Trajectory
 from surfel_mapper.geometry import pose_matrix, quaternions
 from surfel_mapper.offline.scan_times import numbered, rows_of
 
@@ -255,12 +254,8 @@ def read_argoverse2(path: Path) -> tuple[npt.NDArray[Any], Columns]:
 def mulran_poses(path: Path) -> Trajectory:
     """Return the poses of the lidar in MulRan, a time in ns and a matrix of the base a line."""
     T_base_lidar = euler_pose(MULRAN_MOUNT[:3], np.radians(MULRAN_MOUNT[3:]))
-    rows = table_rows(read_lines(path), 13, separator=',')
-    T_map_base, skew = matrix_rows(rows, slice(1, None))
-    T_map_lidar = T_map_base @ T_base_lidar
-    numbers = np.hstack([T_map_lidar[:, :3, 3], quaternions(T_map_lidar)])
-    warn_of_skew(path, skew)
-    return stamped_poses(rows.lines, column_ns(rows, 0, 'ns'), numbers)
+    poses = read_trajectory(path)
+    return Trajectory.from_matrices(poses.matrices @ T_base_lidar, poses.stamp_ns)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

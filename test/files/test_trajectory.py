@@ -174,6 +174,56 @@ def wxyz(pose):
             STAMPS,
             None,
         ),
+        # another order of the quaternion, in a comment below another one
+        (
+            '# by hand, 2024\n# timestamp tx ty tz qw qx qy qz\n'
+            + rows(['1403636580.838555648', '1403636580.938555648'], map(wxyz, QUATERNIONS)),
+            STAMPS,
+            None,
+        ),
+        # a header without a mark, tabs, a comment behind it
+        (
+            'Timestamp PosX PosY PosZ QuatX QuatY QuatZ QuatW\n% metres\n'
+            + rows(STAMPS, QUATERNIONS, separator='\t'),
+            STAMPS,
+            None,
+        ),
+        # rostopic echo -p: the time of the record comes first
+        (
+            '%time,field.header.seq,field.header.stamp,field.header.frame_id,'
+            + ','.join(f'field.pose.pose.position.{axis}' for axis in 'xyz')
+            + ','
+            + ','.join(f'field.pose.pose.orientation.{axis}' for axis in 'xyzw')
+            + ','
+            + ','.join(f'field.twist.twist.linear.{axis}' for axis in 'xyz')
+            + '\n'
+            + rows(
+                [7, 8], [0, 1], STAMPS, ['odom'] * 2, QUATERNIONS, ['9,9,9'] * 2, separator=','
+            ),
+            STAMPS,
+            None,
+        ),
+        # PlotJuggler, with semicolons
+        (
+            '__time;'
+            + ';'.join(f'/odom/pose/pose/position/{axis}' for axis in 'xyz')
+            + ';'
+            + ';'.join(f'/odom/pose/pose/orientation/{axis}' for axis in 'xyzw')
+            + '\n'
+            + rows(STAMPS, QUATERNIONS, separator=';'),
+            STAMPS,
+            None,
+        ),
+        # numpy.savetxt of nanoseconds, rounded to float64
+        (
+            rows([f'{stamp:.18e}' for stamp in STAMPS], QUATERNIONS),
+            [int(f'{stamp:.0f}') for stamp in map(float, STAMPS)],
+            None,
+        ),
+        # times before matrices, and commas between their numbers
+        (rows(['0.5', '0.75'], MATRICES), [500_000_000, 750_000_000], None),
+        (rows(STAMPS, MATRICES).replace(' ', ','), STAMPS, None),
+        (rows(MATRICES).replace(' ', ', '), None, None),
         # KITTI-360: poses.txt, and cam0_to_world.txt
         (rows([1, 7], MATRICES), None, [1, 7]),
         (rows([1, 7], MATRICES, ['0 0 0 1'] * 2), None, [1, 7]),
@@ -225,6 +275,8 @@ def test_poses_of_programs_and_data_sets_are_read_by_their_first_line(
         ('2 0 0 0 0 1 0 0 0 0 1 0', None, ':1: .* no rotation'),
         ('0.998 0 0 0 0 1 0 0 0 0 1 0', None, ':1: .* no rotation'),
         ('stamp,x,y,z\n0,0,0,0', None, ':1: columns stamp, x, y, z; expected a header'),
+        ('0,1,2,3,0,0,0,1', None, ':1: columns 0, 1, 2, 3, 0, 0, 0, 1; expected a header'),
+        (f'[{"1, " * 200}]', None, r':1: columns \[1, (1, )+1? ?\.\.\.; expected a header'),
         ('stamp_s,x,y,z,qx,qy,qz,qw\n1,2', None, ':2: 2 columns, expected 8'),
         ('stamp_ns,x,y,z,qx,qy,qz,qw\n1e99999999,0,0,0,0,0,0,1', None, ':2: time'),
         ('stamp[h],x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1', None, ":2: unit 'h'"),
