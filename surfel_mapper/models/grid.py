@@ -10,10 +10,11 @@ that the patch was fitted to lies outside.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from surfel_mapper.models.kernels.coverage import box_patches, cut_rims, mark_rims, sum_cells
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -172,81 +173,27 @@ class Cells:
             Whether grids start at multiples of their pitch, else at the first point.
 
         """
-        starts, pitch = np.searchsorted(patch, np.arange(len(pitches))), pitches[:, None]
-        xy = local[:, :2]
-        low = np.minimum.reduceat(xy, starts) if len(xy) else np.empty((0, 2))
-        high = np.maximum.reduceat(xy, starts) if len(xy) else np.empty((0, 2))
-        origins = np.floor(low / pitch) * pitch if snapped else low
-        sizes = ((high - origins) / pitch).astype(np.int64) + 1
+        low, high = np.empty((2, len(pitches), 2))
+        box_patches(local, patch, low, high)
+        origins = np.floor(low / pitches[:, None]) * pitches[:, None] if snapped else low
+        sizes = ((high - origins) / pitches[:, None]).astype(np.int64) + 1
         ends = sizes.prod(axis=1).cumsum()
         first, total = ends - sizes.prod(axis=1), int(ends[-1]) if len(ends) else 0
-        cell = ((xy - origins[patch]) / pitch[patch]).astype(np.int64)
-        cell = np.minimum(cell, sizes[patch] - 1)
-        row = first[patch] + cell[:, 0] * sizes[patch, 1] + cell[:, 1]
-        sums: Array = np.empty((total, 4))
-        for column, x in enumerate((*local.T, None)):
-            sums[:, column] = np.bincount(row, x, total)
-        cells = cls(
-            pitches=pitches,
-            origins=origins,
-            sizes=sizes,
-            first=first,
-            sums=sums,
-            rim=np.zeros(total, np.bool_),
-            corner=np.zeros(total, np.uint8),
-            cuts=np.zeros((total, 3), np.uint8),
-        )
+        grids, rows = (pitches, origins, sizes, first), np.empty(len(local), np.int64)
+        sums: Array = np.zeros((total, 4))
+        sum_cells(local, patch, grids, rows, sums)
+        rim, surrounded = np.zeros((2, total), np.bool_)
+        corner, cuts = np.zeros(total, np.uint8), np.zeros((total, 3), np.uint8)
         if margin_m is not None:
-            cells._cut(xy - origins[patch], row, margin_m)
-        return cells
-
-    def _cut(self, offset: Array, row: Indices, margin_m: float) -> None:
-        """Cut boundary cells; offset (N, 2) of points in cells from the origin of their grid."""
-        filled = self.sums[:, 3] > 0.0
-        of = np.repeat(np.arange(len(self.sizes)), self.sizes.prod(axis=1))
-        x, y = np.divmod(np.arange(len(of)) - self.first[of], self.sizes[of, 1])
-        at = np.stack([x, y], axis=1)
-
-        def occupied(chosen: Indices, dx: Any, dy: Any) -> npt.NDArray[np.bool_]:
-            """Return which cells hold points some cells beside chosen ones (n,)."""
-            size, beside = self.sizes[of[chosen]], at[chosen] + np.stack([dx, dy], axis=1)
-            inside = ((beside >= 0) & (beside < size)).all(axis=1)
-            neighbour = np.where(inside, chosen + dx * size[:, 1] + dy, 0)
-            is_filled: npt.NDArray[np.bool_] = inside & filled[neighbour]
-            return is_filled
-
-        some = np.flatnonzero(filled)
-        zero, unit = np.zeros(len(some), np.int64), np.ones(len(some), np.int64)
-        whole = np.logical_and.reduce(
-            [
-                occupied(some, -unit, zero),
-                occupied(some, unit, zero),
-                occupied(some, zero, -unit),
-                occupied(some, zero, unit),
-            ]
-        )
-        rim = some[~whole]
-        self.rim[rim] = True
-        pitch = self.pitches[of[rim]]
-        mean = self.sums[rim, :2] / self.sums[rim, 3:] - self.origins[of[rim]]
-        is_high = mean < (at[rim] + 0.5) * pitch[:, None]
-        self.corner[rim] = is_high @ [1, 2]
-        on_rim = np.flatnonzero(self.rim[row])
-        number = np.cumsum(self.rim) - 1
-        rim_cell = number[row[on_rim]]
-        away = np.abs(offset[on_rim] - ((at[rim] + is_high) * pitch[:, None])[rim_cell])
-        least = np.full((len(rim), 3), np.inf)
-        for j, values in enumerate((away[:, 0], away[:, 1], away.sum(axis=1))):
-            np.minimum.at(least[:, j], rim_cell, values)
-        least -= margin_m * np.array([1.0, 1.0, np.sqrt(2.0)])
-        cuts = np.floor(least / (CUT_STEP * pitch[:, None] / 255.0 * np.array([1.0, 1.0, 2.0])))
-        cuts *= CUT_STEP
-        dx, dy = (2 * is_high.astype(np.int64) - 1).T
-        surrounded = np.logical_and.reduce(
-            [occupied(rim, dx, 0 * dy), occupied(rim, 0 * dx, dy), occupied(rim, dx, dy)]
-        )
-        cuts[surrounded] = 0.0
-        self.cuts[rim] = np.clip(cuts, 0.0, 255.0).astype(np.uint8)
+            mark_rims(grids, sums, rim, corner, surrounded)
+            least = np.full((total, 3), np.inf)
+            cut_rims(local, patch, rows, grids, rim, corner, least)
+            cut = np.flatnonzero(rim & ~surrounded)
+            steps = np.repeat(pitches, sizes.prod(axis=1))[cut, None] * (CUT_STEP / 255.0)
+            free_m = least[cut] - margin_m * np.array([1.0, 1.0, np.sqrt(2.0)])
+            number = np.floor(free_m / (steps * np.array([1.0, 1.0, 2.0])))
+            cuts[cut] = np.clip(CUT_STEP * number, 0.0, 255.0).astype(np.uint8)
+        return cls(pitches, origins, sizes, first, sums, rim, corner, cuts)
 
     def of(self, patch: int) -> slice:
         """Return the rows of a patch."""

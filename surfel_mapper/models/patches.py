@@ -10,7 +10,6 @@ the work.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +18,7 @@ from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models.bspline import fit_cells, HeightField
 from surfel_mapper.models.frames import eigen, means_and_scatters, oriented
 from surfel_mapper.models.grid import Cells
+from surfel_mapper.models.kernels.coverage import place_points
 from surfel_mapper.models.multi_model import Plane, Surface
 from surfel_mapper.models.segmentation import is_paper
 
@@ -210,8 +210,7 @@ def cells_of(
     origins, axes, pitches = frames
     patch = np.repeat(np.arange(len(origins)), np.diff(groups.starts))
     local = np.empty((len(patch), 3))
-    for k, (start, end) in enumerate(pairwise(groups.starts.tolist())):
-        local[start:end] = (groups.points[start:end] - origins[k]) @ axes[k].T
+    place_points(groups.points, groups.starts, origins, axes, local)
     return Cells.around(local, patch, pitches, margin_m, snapped=snapped), local
 
 

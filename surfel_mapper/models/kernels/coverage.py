@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The points of a cloud in cells of the planes of their patches, and the cells that they cover."""
 
+import math
+
 import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel
@@ -91,3 +93,99 @@ def cover_cells(counts, weights, grids, pitch, coarse, rules, filled, gaps):
                     number += 1
                     empty += filled[cell] == 0
         gaps[k] = empty / max(number, 1)
+
+
+@kernel(error_model='numpy')
+def place_points(points, starts, origins, axes, local):
+    """Write points (N, 3) in the frames of their patches; patch k has rows from starts[k] on."""
+    for k in range(len(origins)):
+        for i in range(starts[k], starts[k + 1]):
+            x, y = points[i, 0] - origins[k, 0], points[i, 1] - origins[k, 1]
+            z = points[i, 2] - origins[k, 2]
+            for j in range(3):
+                local[i, j] = x * axes[k, j, 0] + y * axes[k, j, 1] + z * axes[k, j, 2]
+
+
+@kernel(error_model='numpy')
+def box_patches(local, patch, low, high):
+    """Find the least and greatest x and y, (K, 2) each, of points (N, 3) of patches (N,)."""
+    low[:], high[:] = math.inf, -math.inf
+    for i in range(len(local)):
+        k = patch[i]
+        for j in range(2):
+            low[k, j], high[k, j] = min(low[k, j], local[i, j]), max(high[k, j], local[i, j])
+
+
+@kernel(error_model='numpy')
+def sum_cells(local, patch, grids, rows, sums):
+    """
+    Sum the points of each cell.
+
+    local  (N, 3) float64, m, in the frames of patches (N,) int64
+    grids  pitches (K,), origins (K, 2), sizes (K, 2) and first (K,) of Cells
+    rows   (N,) int64, out: cell of each point
+    sums   (C, 4) float64, zeros, changed in place: sums of x, y and z, and number of points
+    """
+    pitches, origins, sizes, first = grids
+    for i in range(len(local)):
+        k = patch[i]
+        x = min(np.int64((local[i, 0] - origins[k, 0]) / pitches[k]), sizes[k, 0] - 1)
+        y = min(np.int64((local[i, 1] - origins[k, 1]) / pitches[k]), sizes[k, 1] - 1)
+        row = rows[i] = first[k] + x * sizes[k, 1] + y
+        for j in range(3):
+            sums[row, j] += local[i, j]
+        sums[row, 3] += 1.0
+
+
+@kernel(error_model='numpy')
+def mark_rims(grids, sums, rim, corner, surrounded):
+    """
+    Find the boundary cells, and the corner of each that is farthest from the mean of its points.
+
+    grids, sums  of sum_cells
+    rim, corner  (C,) of Cells, zeros, changed in place
+    surrounded   (C,) bool, out for boundary cells: whether the cells at that corner hold points
+    """
+    pitches, origins, sizes, first = grids
+    for k in range(len(first)):
+        rows, columns = sizes[k, 0], sizes[k, 1]
+        for x in range(rows):
+            for y in range(columns):
+                cell = first[k] + x * columns + y
+                if sums[cell, 3] == 0.0:
+                    continue
+                if 0 < x < rows - 1 and 0 < y < columns - 1:
+                    along_x = sums[cell - columns, 3] * sums[cell + columns, 3]
+                    if along_x * sums[cell - 1, 3] * sums[cell + 1, 3] > 0.0:
+                        continue
+                rim[cell] = True
+                mean_x = sums[cell, 0] / sums[cell, 3] - origins[k, 0]
+                mean_y = sums[cell, 1] / sums[cell, 3] - origins[k, 1]
+                high_x, high_y = mean_x < (x + 0.5) * pitches[k], mean_y < (y + 0.5) * pitches[k]
+                corner[cell] = high_x + 2 * high_y
+                dx, dy = 2 * high_x - 1, 2 * high_y - 1
+                surrounded[cell] = 0 <= x + dx < rows and 0 <= y + dy < columns
+                if surrounded[cell]:
+                    around = sums[cell + dx * columns, 3] * sums[cell + dy, 3]
+                    surrounded[cell] = around * sums[cell + dx * columns + dy, 3] > 0.0
+
+
+@kernel(error_model='numpy')
+def cut_rims(local, patch, rows, grids, rim, corner, least):
+    """
+    Find how near the points of boundary cells are to their corner.
+
+    local, patch, rows, grids  of sum_cells
+    rim, corner                of mark_rims
+    least                      (C, 3) float64, m, inf, changed in place: along x, along y, and sum
+    """
+    pitches, origins, sizes, first = grids
+    for i in range(len(local)):
+        row, k = rows[i], patch[i]
+        if rim[row]:
+            x, y = (row - first[k]) // sizes[k, 1], (row - first[k]) % sizes[k, 1]
+            from_x = local[i, 0] - origins[k, 0] - (x + (corner[row] & 1)) * pitches[k]
+            from_y = local[i, 1] - origins[k, 1] - (y + (corner[row] >> 1)) * pitches[k]
+            least[row, 0] = min(least[row, 0], abs(from_x))
+            least[row, 1] = min(least[row, 1], abs(from_y))
+            least[row, 2] = min(least[row, 2], abs(from_x) + abs(from_y))
