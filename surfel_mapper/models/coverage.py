@@ -60,7 +60,7 @@ def covered(model: MultiModel, points: npt.NDArray[Any], view: Array) -> MultiMo
 
     """
     finer, pitch_m = model.patches, model.voxel_size_m
-    number = np.bincount(model.labels[model.labels >= 0], minlength=len(finer))
+    number = np.bincount(model.labels + 1, minlength=len(finer) + 1)[1:]
     cells = [np.count_nonzero(p.grid.filled) * (p.grid.pitch_m / pitch_m) ** 2 for p in finer]
     chosen = np.flatnonzero(number[: len(finer)] >= LEAST_MEAN * np.array(cells))
     if not len(chosen):

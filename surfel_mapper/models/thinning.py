@@ -16,7 +16,12 @@ import numpy.typing as npt
 
 from surfel_mapper.filters.grids import KEY_BITS, ScanVoxels
 from surfel_mapper.models.growth import VoxelPoints
-from surfel_mapper.models.kernels.voxel_means import average_voxels, finite_ends, voxel_keys
+from surfel_mapper.models.kernels.voxel_means import (
+    average_voxels,
+    finite_ends,
+    spread_labels,
+    voxel_keys,
+)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -73,7 +78,7 @@ class Thinned:
     def point_labels(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """Return labels of all points from those of the means; -1 if not finite."""
         of_points = np.full(len(self.points), -1, np.int32)
-        of_points[self.rows] = np.repeat(labels, np.diff(self.starts))
+        spread_labels(labels, self.starts, self.rows, of_points)
         return of_points
 
 
@@ -107,11 +112,13 @@ def sorted_keys(
     """
     (grid, parts), to_key = voxels, len(points).bit_length()
     keys: Indices = np.empty(number, np.int64)
-    rows: Indices = np.empty(number, np.int64)
-    axes = np.stack([grid.size, grid.shift, grid.base])
-    voxel_keys(points, (axes, grid.bits), parts, keys, rows)
+    is_long = int(grid.bits.sum()) + (parts**3 - 1).bit_length() + to_key > 63
+    axes = grid.size, grid.shift, grid.base
+    voxel_keys(points, (axes, grid.bits), parts, 0 if is_long else to_key, keys)
     long_keys: Indices | None = None
-    if int(grid.bits.sum()) + (parts**3 - 1).bit_length() + to_key > 63:
+    if is_long:
+        rows = np.flatnonzero(np.isfinite(points).all(axis=1))
         long_keys, ranks = np.unique(keys, return_inverse=True)
-        keys = ranks.astype(np.int64)
-    return np.sort(keys << to_key | rows), to_key, long_keys
+        keys = ranks << to_key | rows
+    keys.sort()
+    return keys, to_key, long_keys

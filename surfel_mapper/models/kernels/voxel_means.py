@@ -23,44 +23,44 @@ def finite_ends(points, ends):
     ends    (2, 3) float64, out: least and greatest coordinates
     """
     number = 0
-    for axis in range(3):
-        ends[0, axis], ends[1, axis] = math.inf, -math.inf
+    low_x = low_y = low_z = math.inf
+    high_x = high_y = high_z = -math.inf
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        if math.isfinite(x) and math.isfinite(y) and math.isfinite(z):
+        if (x - x) + (y - y) + (z - z) == 0.0:  # else one is not finite
             number += 1
-            ends[0, 0], ends[1, 0] = min(ends[0, 0], x), max(ends[1, 0], x)
-            ends[0, 1], ends[1, 1] = min(ends[0, 1], y), max(ends[1, 1], y)
-            ends[0, 2], ends[1, 2] = min(ends[0, 2], z), max(ends[1, 2], z)
+            low_x, low_y, low_z = min(low_x, x), min(low_y, y), min(low_z, z)
+            high_x, high_y, high_z = max(high_x, x), max(high_y, y), max(high_z, z)
+    ends[0, 0], ends[0, 1], ends[0, 2] = low_x, low_y, low_z
+    ends[1, 0], ends[1, 1], ends[1, 2] = high_x, high_y, high_z
     return number
 
 
 @kernel(error_model='numpy')
-def voxel_keys(points, grid, parts, keys, rows):
+def voxel_keys(points, grid, parts, to_key, keys):
     """
     Compute the keys of the finite points: of their voxels, times parts^3, plus the part of these.
 
     points  (N, 3) float32 or float64, m
     grid    size, shift and base of each axis (3, 3) float64, and its bits in a key (3,) int64
     parts   into which a voxel is divided along each axis
-    keys    (P,) int64, out: x of the voxel in the lowest bits, then y and z; of parts alike
-    rows    (P,) int64, out: rows of these points
+    to_key  bits of a row; 0 for keys alone
+    keys    (P,) int64, out: key << to_key | row; x of the voxel in the lowest bits, then y and z;
+            of parts alike
     """
-    axes, bits = grid
-    number = 0
+    (size, shift, base), (bits_x, bits_y, _) = grid
+    number, last = 0, parts - 1
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        if math.isfinite(x) and math.isfinite(y) and math.isfinite(z):
-            x, y, z = x / axes[0, 0], y / axes[0, 1], z / axes[0, 2]
-            x, y, z = x - axes[1, 0], y - axes[1, 1], z - axes[1, 2]
-            kx = np.int64(math.floor(x) - axes[2, 0])
-            ky = np.int64(math.floor(y) - axes[2, 1])
-            kz = np.int64(math.floor(z) - axes[2, 2])
-            key = kx | (ky | kz << bits[1]) << bits[0]
-            for along in (z, y, x):
-                key = key * parts + min(np.int64((along - math.floor(along)) * parts), parts - 1)
-            keys[number] = key
-            rows[number] = i
+        if (x - x) + (y - y) + (z - z) == 0.0:  # else one is not finite
+            x, y, z = x / size[0] - shift[0], y / size[1] - shift[1], z / size[2] - shift[2]
+            i_x, i_y, i_z = np.floor(x), np.floor(y), np.floor(z)
+            key = np.int64(i_y - base[1]) | np.int64(i_z - base[2]) << bits_y
+            key = np.int64(i_x - base[0]) | key << bits_x
+            key = key * parts + min(np.int64((z - i_z) * parts), last)
+            key = key * parts + min(np.int64((y - i_y) * parts), last)
+            key = key * parts + min(np.int64((x - i_x) * parts), last)
+            keys[number] = key << to_key | i if to_key else key
             number += 1
 
 
@@ -94,3 +94,11 @@ def average_voxels(points, ordered, to_key, rows, starts, keys, means):
         for axis in range(3):
             means[voxel, axis] /= count
     return number
+
+
+@kernel()
+def spread_labels(labels, starts, rows, of_points):
+    """Write the label of each voxel to its points, (N,) int32; starts and rows: see above."""
+    for v in range(len(labels)):
+        for i in range(starts[v], starts[v + 1]):
+            of_points[rows[i]] = labels[v]
