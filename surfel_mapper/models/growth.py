@@ -24,11 +24,11 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.models.frames import eigen, means_and_scatters, plane_frames
+from surfel_mapper.models.frames import plane_frames
 from surfel_mapper.models.joining import join_patches, LEAST_COSINE, Pieces
-from surfel_mapper.models.kernels.frames import LEAST_WIDTH
 from surfel_mapper.models.kernels.growth import (
     assign_points,
+    describe_free,
     find_facets,
     FREE,
     grow_patches,
@@ -449,12 +449,9 @@ def free_surfels(
 ) -> FreeSurfels:
     """Return number, flatness, mean and normal of the free points of every voxel."""
     thickness = min(FLAT_VOXELS * size_m, 8.0 / TOLERANCE_SIGMAS * tolerance_m)
-    weights = (owner == FREE).astype(np.float64)
-    total, mean, scatters = means_and_scatters(voxels.points, weights, voxels.starts)
-    flat, normal = np.zeros(len(total), np.bool_), np.zeros_like(mean)
-    enough = np.flatnonzero(total >= LEAST_POINTS)
-    values, axes = eigen(scatters[enough] / total[enough, None, None])
-    is_flat = 36.0 * values[:, 0] < thickness**2
-    is_flat &= values[:, 1] > LEAST_WIDTH * values[:, 2]
-    flat[enough], normal[enough] = is_flat, axes[:, 0]
-    return total.astype(np.int64), flat, mean, normal
+    number = len(voxels.starts) - 1
+    count, flat = np.zeros(number, np.int64), np.zeros(number, np.bool_)
+    mean, normal = np.zeros((2, number, 3))
+    rules = LEAST_POINTS, thickness**2
+    describe_free(voxels.points, voxels.starts, owner, rules, count, flat, mean, normal)
+    return count, flat, mean, normal

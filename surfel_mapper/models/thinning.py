@@ -19,6 +19,7 @@ from surfel_mapper.models.growth import VoxelPoints
 from surfel_mapper.models.kernels.voxel_means import (
     average_voxels,
     finite_ends,
+    merge_parts,
     spread_labels,
     voxel_keys,
 )
@@ -67,13 +68,11 @@ class Thinned:
 
     def whole_voxels(self) -> Thinned:
         """Return the means of parts as a cloud by voxel."""
-        keys = self.keys // self.parts**3
-        first = np.flatnonzero(np.diff(keys, prepend=-1))
-        starts = np.append(first, len(keys))
-        counts = np.diff(self.starts)[:, None]
-        means = np.add.reduceat(counts * self.means, first) / np.add.reduceat(counts, first)
-        rows = np.arange(len(keys), dtype=np.int32)
-        return Thinned(means, self.means, rows, starts, keys[first], self.bits)
+        number, cubed = len(self.keys), self.parts**3
+        first, keys, means = np.empty(number + 1, np.int64), self.keys.copy(), self.means.copy()
+        num = merge_parts(self.keys, self.starts, self.means, cubed, first, keys, means)
+        rows = np.arange(number, dtype=np.int32)
+        return Thinned(means[:num], self.means, rows, first[: num + 1], keys[:num], self.bits)
 
     def point_labels(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """Return labels of all points from those of the means; -1 if not finite."""

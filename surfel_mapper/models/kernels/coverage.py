@@ -24,6 +24,7 @@ def count_points(points, label, frames, view, grids, pitch, counts, weights):
     weights  (C,) float64, m^3, changed in place
     """
     first, corners, sizes = grids
+    per_m = 1.0 / pitch
     for i in range(len(points)):
         k = label[i]
         if 0 <= k < len(frames):
@@ -33,7 +34,7 @@ def count_points(points, label, frames, view, grids, pitch, counts, weights):
                 x += away * frames[k, 0, j]
                 y += away * frames[k, 1, j]
                 range_sq += (points[i, j] - view[j]) ** 2
-            column, row = np.int64(np.floor(x / pitch)), np.int64(np.floor(y / pitch))
+            column, row = np.int64(np.floor(x * per_m)), np.int64(np.floor(y * per_m))
             if 0 <= column < sizes[k, 0] and 0 <= row < sizes[k, 1]:
                 cell = first[k] + column * sizes[k, 1] + row
                 counts[cell] += 1

@@ -69,6 +69,35 @@ def add_point(points, i, origin, sums):
 
 
 @kernel(error_model='numpy')
+def describe_free(points, starts, owner, rules, count, flat, mean, normal):
+    """
+    Describe the free points of each voxel.
+
+    owner   (P,) int32
+    rules   least number of points; squared thickness, 6 sigma, of flat voxels, m^2
+    count   (V,) int64, zeros; out: free points
+    flat    (V,) bool, zeros; out: whether there are enough, and are flat
+    mean    (V, 3) float64, zeros, m; out for voxels with enough
+    normal  (V, 3) float64, zeros; out for voxels with enough
+    """
+    sums, value, axes = np.empty(10), np.empty(3), np.empty((3, 3))
+    for v in range(len(count)):
+        for i in range(starts[v], starts[v + 1]):
+            count[v] += owner[i] == FREE
+        if count[v] < rules[0]:
+            continue
+        sums[:] = 0.0
+        for i in range(starts[v], starts[v + 1]):
+            if owner[i] == FREE:
+                add_point(points, i, points[starts[v]], sums)
+        plane_of(sums, sums[0], value, axes)
+        flat[v] = 36.0 * value[0] < rules[1] and value[1] > LEAST_WIDTH * value[2]
+        for j in range(3):
+            mean[v, j] = points[starts[v], j] + sums[1 + j] / sums[0]
+            normal[v, j] = axes[0, j]
+
+
+@kernel(error_model='numpy')
 def grow_patches(
     points, starts, adjacent, label, tangent, tolerance, free, candidate, candidate_plane
 ):
