@@ -30,11 +30,12 @@ from surfel_mapper.models.kernels.growth import (
     assign_points,
     describe_free,
     find_facets,
+    fit_layers,
     FREE,
     grow_patches,
     SLOTS,
 )
-from surfel_mapper.models.kernels.voxel_points import neighbour_table, owner_means
+from surfel_mapper.models.kernels.voxel_points import neighbour_table, owner_means, sort_owners
 from surfel_mapper.models.multi_model import Plane, Surface
 
 Array = npt.NDArray[np.float64]
@@ -245,12 +246,11 @@ def sorted_table(
     table: OwnerTable, least: int, number: int
 ) -> tuple[Indices, npt.NDArray[np.int32], Array, Array]:
     """Return starts (number + 1,), voxels, means and counts by owner, from owner least on."""
-    owners, means, counts, first = table
-    order = np.argsort(owners, kind='stable')
-    order = order[np.count_nonzero(owners < least) :]
-    starts = np.searchsorted(owners[order], np.arange(least, least + number + 1))
-    voxel = np.repeat(np.arange(len(first) - 1, dtype=np.int32), np.diff(first))
-    return starts, voxel[order], means[order], counts[order]
+    starts = np.zeros(number + 2, np.int64)
+    voxel, means = np.empty(len(table[0]), np.int32), np.empty((len(table[0]), 3))
+    counts = np.empty(len(table[0]))
+    num = sort_owners(table, least, starts, voxel, means, counts)
+    return starts[:-1], voxel[:num], means[:num], counts[:num]
 
 
 def extend_patches(
@@ -377,12 +377,8 @@ def largest_layers(
     rows = rows[np.argsort(label[rows], kind='stable')]
     points, patch = means[rows], label[rows]
     starts = np.searchsorted(patch, np.arange(len(patches) + 1))
-    plane, limit = planes, 2.0 * rms
-    for _ in range(SEPARATE_ROUNDS if len(rows) else 0):
-        near = np.abs(plane_heights(points, plane[patch])) < limit[patch]
-        middle, normal, _ = plane_frames(points, near.astype(np.float64), starts)
-        plane = np.column_stack([normal, -np.einsum('ij,ij->i', normal, middle)])
-        limit = np.maximum(0.7 * limit, thick)
+    plane = planes.copy()
+    fit_layers(points, starts, np.stack([2.0 * rms, thick]), SEPARATE_ROUNDS, plane)
     away = np.abs(plane_heights(points, plane[patch])) / thick[patch]
     on, far = (
         np.bincount(patch[mask], minlength=len(patches)) for mask in (away < 1.0, away > 2.0)

@@ -93,12 +93,6 @@ class Pieces:
     first: Indices
     owners: npt.NDArray[np.int32]
 
-    @property
-    def num_points(self) -> Array:
-        """Points of each patch, (K,)."""
-        patch = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
-        return np.bincount(patch, self.weights, len(self.starts) - 1).astype(np.float64)
-
     def touching(self) -> Indices:
         """Return pairs of touching patches (R, 3): patch, other, voxels of the patch that do."""
         pairs = np.empty((64 * len(self.starts), 3), np.int64)
@@ -190,6 +184,8 @@ class Comparison:
     ----------
     pieces : Pieces
         Their points.
+    num_points : (K,) float64
+        Number of these.
     means, covariances, extents : (K, 3), (K, 3, 3), (K,) float64, m
         Moments of their points, and half their width, about.
     normals : (K, 3) float64
@@ -202,6 +198,7 @@ class Comparison:
     """
 
     pieces: Pieces
+    num_points: Array
     means: Array
     covariances: Array
     extents: Array
@@ -215,8 +212,8 @@ class Comparison:
         cls, pieces: Pieces, view: Array, noise: tuple[float, float], size_m: float
     ) -> Comparison:
         """Describe every patch; the parameters are those of join_patches."""
-        _, means, scatters = means_and_scatters(pieces.means, pieces.weights, pieces.starts)
-        covariances = scatters / np.maximum(pieces.num_points, 1.0)[:, None, None]
+        number, means, scatters = means_and_scatters(pieces.means, pieces.weights, pieces.starts)
+        covariances = scatters / np.maximum(number, 1.0)[:, None, None]
         values, axes = eigen(covariances)
         towards, normals = view - means, axes[:, 0].copy()
         normals[np.einsum('ij,ij->i', towards, normals) < 0.0] *= -1.0
@@ -228,7 +225,7 @@ class Comparison:
         floor = np.clip(noise[1] * range_sq * cosine, *limits) ** 2
         extents = np.sqrt(3.0 * values[:, 2]) + size_m
         sigma = np.maximum(across, np.sqrt(np.maximum(values[:, 0], floor)))
-        return cls(pieces, means, covariances, extents, normals, across, sigma, floor)
+        return cls(pieces, number, means, covariances, extents, normals, across, sigma, floor)
 
     def with_layers(self, touching: Indices) -> tuple[Indices, Comparison]:
         """
@@ -237,7 +234,7 @@ class Comparison:
         Noise beyond a voxel is cut into layers. In the second result these have the normals of
         the larger patches, and their distances from them are noise.
         """
-        points, (a, b, touch) = self.pieces.num_points, touching.T
+        points, (a, b, touch) = self.num_points, touching.T
         is_layer = touch >= LAYER_SHARE * np.diff(self.pieces.starts)[a]
         is_layer &= points[a] < points[b]
         a, b = a[is_layer], b[is_layer]
@@ -256,7 +253,7 @@ class Comparison:
 
     def regions(self) -> Regions:
         """Return a region for every patch."""
-        normals = self.normals * self.pieces.num_points[:, None]
+        normals = self.normals * self.num_points[:, None]
         rows = np.diff(self.pieces.starts)
         return Regions(rows, normals, self.means.copy(), self.extents.copy())
 
@@ -306,7 +303,7 @@ class Comparison:
         described = replace(regions, normals=totals)
         figures = self.compared(np.stack([names, names], axis=1), root, described)
         index = np.searchsorted(names, root).astype(np.int32)
-        points, every = self.pieces.num_points, len(names) + 1
+        points, every = self.num_points, len(names) + 1
         total = np.bincount(index, points, every)[:-1]
         noise, own = (
             np.sqrt(np.bincount(index, points * sigma**2, every)[:-1] / total)

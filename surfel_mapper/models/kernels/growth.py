@@ -98,6 +98,32 @@ def describe_free(points, starts, owner, rules, count, flat, mean, normal):
 
 
 @kernel(error_model='numpy')
+def fit_layers(points, starts, widths, rounds, planes):
+    """
+    Fit the plane of each group again to its points near the plane, several times.
+
+    points, starts  (N, 3) float64, (K + 1,) int64: group k has rows from starts[k] on
+    widths          (2, K) float64, m: distance of near points in the first round, and at least
+    planes          (K, 4) float64, in place
+    """
+    sums, value, axes, middle = np.empty(10), np.empty(3), np.empty((3, 3)), np.empty(3)
+    for k in range(len(planes)):
+        width, start = widths[0, k], starts[k]
+        for _ in range(rounds):
+            sums[:] = 0.0
+            for i in range(start, starts[k + 1]):
+                if plane_distance(points, i, planes[k]) < width:
+                    add_point(points, i, points[start], sums)
+            if sums[0] == 0.0:
+                break
+            plane_of(sums, sums[0], value, axes)
+            for j in range(3):
+                middle[j] = points[start, j] + sums[1 + j] / sums[0]
+            set_plane(axes[0], middle, planes[k])
+            width = max(0.7 * width, widths[1, k])
+
+
+@kernel(error_model='numpy')
 def grow_patches(
     points, starts, adjacent, label, tangent, tolerance, free, candidate, candidate_plane
 ):

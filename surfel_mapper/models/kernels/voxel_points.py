@@ -79,6 +79,32 @@ def owner_means(points, starts, owner, owners, means, counts, first):
 
 
 @kernel()
+def sort_owners(table, least, starts, voxel, means, counts):
+    """
+    Sort means by owner, from owner least on, and return their number.
+
+    table   owners (M,), means (M, 3) and counts (M,) by voxel, and first (V + 1,): of owner_means
+    starts  (K + 2,) int64, zeros; out: first mean of each owner, and their number
+    voxel, means, counts  (M,) int32, (M, 3) float64, (M,) float64, out
+    """
+    owners, unsorted, points, first = table
+    for m in range(len(owners)):
+        if owners[m] >= least:
+            starts[owners[m] - least + 2] += 1
+    for k in range(2, len(starts)):
+        starts[k] += starts[k - 1]
+    for v in range(len(first) - 1):
+        for m in range(first[v], first[v + 1]):
+            if owners[m] >= least:
+                i = starts[owners[m] - least + 1]
+                starts[owners[m] - least + 1] += 1
+                voxel[i], counts[i] = v, points[m]
+                for j in range(3):
+                    means[i, j] = unsorted[m, j]
+    return starts[-1]
+
+
+@kernel()
 def sample_cubes(means, starts, cubes, voxels, rows):
     """
     Take points evenly from the voxels with means in a cube.
