@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The area that dense patches cover, cell by cell of one voxel, from all points of the cloud.
+The area that dense patches cover, cell by cell of one voxel, from the points of the cloud.
 
 Patches are fitted to few points a voxel, so their grids have cells of three voxels with cut
 corners, and cover what lies between: on frames of rooms, 4 % of the points were in cells with a
@@ -45,7 +45,9 @@ CLOSED_BY = 5
 RULES = float(LEAST_POINTS), LEAST_SHARE, CLOSED_BY
 
 
-def covered(model: MultiModel, points: npt.NDArray[Any], view: Array) -> MultiModel:
+def covered(
+    model: MultiModel, points: npt.NDArray[Any], view: Array, numbers: Indices | None = None
+) -> MultiModel:
     """
     Return models whose dense patches cover cells of one voxel.
 
@@ -54,13 +56,15 @@ def covered(model: MultiModel, points: npt.NDArray[Any], view: Array) -> MultiMo
     model : MultiModel
         Models of the points; the ids of patches are 0, 1, 2, ... in order.
     points : (N, 3) float32 or float64, m
-        All points of the cloud.
+        The points of the labels.
     view : (3,) float64, m
         Position of the sensor.
+    numbers : (N,) int64, optional
+        Number of points of the cloud that each stands for; 1 if omitted.
 
     """
     finer, pitch_m = model.patches, model.voxel_size_m
-    number = np.bincount(model.labels + 1, minlength=len(finer) + 1)[1:]
+    number = np.bincount(model.labels + 1, numbers, len(finer) + 1)[1:]
     cells = [np.count_nonzero(p.grid.filled) * (p.grid.pitch_m / pitch_m) ** 2 for p in finer]
     chosen = np.flatnonzero(number[: len(finer)] >= LEAST_MEAN * np.array(cells))
     if not len(chosen):
@@ -74,7 +78,7 @@ def covered(model: MultiModel, points: npt.NDArray[Any], view: Array) -> MultiMo
     first, corners, sizes = grids
     total = first[-1] + sizes[-1].prod()
     counts, weights, filled = np.zeros(total, np.int64), np.zeros(total), np.zeros(total, np.uint8)
-    count_points(points, labels, frames, view, grids, pitch_m, counts, weights)
+    count_points(points, labels, frames, view, grids, pitch_m, counts, weights, numbers)
     gaps, coarse = np.empty(len(patches)), inner_cells([patch.grid for patch in patches])
     cover_cells(counts, weights, grids, pitch_m, coarse, RULES, filled, gaps)
     for k in np.flatnonzero(gaps <= MOST_GAPS).tolist():

@@ -123,8 +123,6 @@ def fit(
     laps.append(clock())
     grows = grows and len(thinned.means) > 0
     model = (fit_points if grows else fit_means)(thinned, config, view, laps)
-    if grows:
-        model = covered(model, points.reshape(-1, 3), view)
     laps.append(clock())
     names = ('thin', 'cluster', 'merge', 'fit') if len(laps) == 5 else STAGES
     times = [1e3 * (end - start) for start, end in pairwise(laps)]
@@ -184,7 +182,10 @@ def fit_points(parts: Thinned, config: ModelsConfig, view: Array, laps: list[flo
         joined = separated(voxels, joined, growth, lost)
         fitted = owner_patches(joined, config, view)
     model = owner_models(thinned, voxels, joined, fitted, config)
-    return replace(model, labels=parts.point_labels(model.labels)) if is_parted else model
+    if not is_parted:
+        return covered(model, parts.points, view)
+    model = covered(model, parts.means, view, np.diff(parts.starts))
+    return replace(model, labels=parts.point_labels(model.labels))
 
 
 def grow_sparse(
