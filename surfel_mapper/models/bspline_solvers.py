@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.models.kernels.splines import sum_equations
+
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -86,7 +88,7 @@ def solve_band(
         Weight of the penalty, and weight that pulls control points to 0.
 
     """
-    from scipy.linalg import solveh_banded  # seconds to import
+    from scipy.linalg.lapack import dpbsv  # seconds to import
 
     (smoothing, ridge), shape = rules, (len(positions[0]), len(positions[1]))
     reach = samples.rows[:, -1:] - samples.rows[:, :1] if len(samples.rows) else np.zeros((1, 1))
@@ -102,19 +104,16 @@ def solve_band(
             along[: shape[axis] - k] = np.diagonal(product, -k)
             grid[k * step] += smoothing * (along[:, None] if axis == 0 else along)
     grid[0] += ridge
-    solution = solveh_banded(band, right, lower=True, check_finite=False, overwrite_ab=True)
+    _, solution, info = dpbsv(band, right, lower=1, overwrite_ab=1)
+    assert info == 0, 'the ridge makes the matrix positive'
     return np.array(solution.reshape(shape), np.float64)  # a view would keep the band
 
 
 def equations(samples: FieldSamples, width: int, number: int) -> tuple[Array, Array]:
     """Return the lower band (width, number) and right side (number,) of the normal equations."""
-    rows, weighted = samples.rows, samples.share[:, None] * samples.weights
-    right = np.bincount(rows.ravel(), (weighted * samples.z[:, None]).ravel(), number)
-    i, j = np.triu_indices(rows.shape[1])
-    row, column = rows[:, j], rows[:, i]  # element k, c of the band is that of row c + k, column c
-    band_index, products = (row - column) * number + column, weighted[:, i] * samples.weights[:, j]
-    band = np.bincount(band_index.ravel(), products.ravel(), width * number)
-    return band.reshape(width, number).astype(np.float64), right.astype(np.float64)
+    band, right = np.zeros((width, number)), np.zeros(number)
+    sum_equations(samples.rows, samples.weights, samples.share, samples.z, band, right)
+    return band, right
 
 
 def relax(

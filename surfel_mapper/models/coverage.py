@@ -12,14 +12,15 @@ the cube of the inverse range, so each counts by the cube of its range.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.grid import Grid, rim_of
-from surfel_mapper.models.kernels.coverage import count_points, cover_cells
+from surfel_mapper.models.grid import Grid
+from surfel_mapper.models.kernels.coverage import box_patches, count_points, cover_cells
 from surfel_mapper.models.multi_model import MultiModel
 from surfel_mapper.models.primitives import Surface
 
@@ -75,15 +76,13 @@ def covered(
     labels = model.labels if len(chosen) == len(finer) else index[model.labels]
     frames = np.array([[*patch.R_patch_map, patch.mean] for patch in patches])
     grids = cells_over([patch.grid for patch in patches], pitch_m)
-    first, corners, sizes = grids
-    total = first[-1] + sizes[-1].prod()
+    total = grids[0][-1] + grids[2][-1].prod()
     counts, weights, filled = np.zeros(total, np.int64), np.zeros(total), np.zeros(total, np.uint8)
     count_points(points, labels, frames, view, grids, pitch_m, counts, weights, numbers)
     gaps, coarse = np.empty(len(patches)), inner_cells([patch.grid for patch in patches])
     cover_cells(counts, weights, grids, pitch_m, coarse, RULES, filled, gaps)
-    for k in np.flatnonzero(gaps <= MOST_GAPS).tolist():
-        own = filled[first[k] : first[k] + sizes[k].prod()].reshape(sizes[k]) > 0
-        finer[chosen[k]] = replace(patches[k], grid=trimmed(own, corners[k], pitch_m))
+    for k, grid in trimmed(filled, grids, np.flatnonzero(gaps <= MOST_GAPS), pitch_m):
+        finer[chosen[k]] = replace(patches[k], grid=grid)
     return replace(
         model,
         planes=finer[: len(model.planes)],
@@ -112,15 +111,33 @@ def inner_cells(grids: list[Grid]) -> tuple[Array, Array, Indices, Indices, Mask
     )
 
 
-def trimmed(filled: Mask, corner: Array, pitch_m: float) -> Grid:
-    """Return the grid of covered cells, without empty rows at its ends."""
-    rows, columns = (np.flatnonzero(filled.any(axis=axis)) for axis in (1, 0))
-    kept = filled[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].copy()
-    return Grid(
-        pitch_m=pitch_m,
-        origin=corner + pitch_m * np.array([rows[0], columns[0]]),
-        filled=kept,
-        rim=rim_of(kept),
-        corner=np.zeros(kept.shape, np.uint8),
-        cuts=np.zeros((*kept.shape, 3), np.uint8),
-    )
+def trimmed(
+    filled: Mask, grids: tuple[Indices, Array, Indices], chosen: Indices, pitch_m: float
+) -> Iterator[tuple[int, Grid]]:
+    """Yield chosen patches and grids of their covered cells, without empty rows at the ends."""
+    first, corners, sizes = grids
+    cells, patch = np.flatnonzero(filled), np.repeat(np.arange(len(sizes)), sizes.prod(axis=1))
+    columns, low, high = sizes[patch[cells], 1], *np.empty((2, len(sizes), 2))
+    near = np.stack([cells - columns, cells + columns, cells - 1, cells + 1])
+    rim = np.zeros(len(filled), np.bool_)
+    rim[cells] = ~filled[near].all(axis=0)  # the first and last cell of a row are empty
+    xy = np.stack(np.divmod(cells - first[patch[cells]], columns), axis=1)
+    box_patches(xy.astype(np.float64), patch[cells], low, high)
+    for k in chosen.tolist():
+        (x, y), (end_x, end_y) = low[k].astype(np.int64), high[k].astype(np.int64) + 1
+        own = slice(first[k], first[k] + sizes[k, 0] * sizes[k, 1])
+        kept, boundary = (
+            flags[own].reshape(sizes[k])[x:end_x, y:end_y].astype(np.bool_)
+            for flags in (filled, rim)
+        )
+        yield (
+            k,
+            Grid(
+                pitch_m=pitch_m,
+                origin=corners[k] + pitch_m * low[k],
+                filled=kept,
+                rim=boundary,
+                corner=np.zeros(kept.shape, np.uint8),
+                cuts=np.zeros((*kept.shape, 3), np.uint8),
+            ),
+        )

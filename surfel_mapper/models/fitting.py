@@ -32,7 +32,7 @@ from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse, SPARSE_
 from surfel_mapper.models.coverage import covered
 from surfel_mapper.models.frames import eigen
 from surfel_mapper.models.growth import grow, Grown, grown, owner_table, VoxelPoints
-from surfel_mapper.models.kernels.frames import LEAST_WIDTH
+from surfel_mapper.models.kernels.frames import LEAST_WIDTH, member_moments, split_members
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.noise import estimate_noise, NoiseSamples
 from surfel_mapper.models.patches import fit_patches, PatchPoints
@@ -321,6 +321,7 @@ def narrow_groups(
 
     """
     (xyz, group), (every, of_point) = means, points
+    group, of_point = group.copy(), of_point.copy()
     while len(group):
         counts = np.bincount(group)
         mean, covariance = group_moments(xyz, group, counts)
@@ -330,22 +331,16 @@ def narrow_groups(
             break
         axis = np.where(is_wide[:, None], axes[:, 2], 0.0)
         number = len(counts) + np.cumsum(is_wide) - 1
-        beyond = ((xyz - mean[group]) * axis[group]).sum(axis=1) > 0.0
-        group = np.where(beyond, number[group], group)
-        beyond = ((every - mean[of_point]) * axis[of_point]).sum(axis=1) > 0.0
-        of_point = np.where(beyond, number[of_point], of_point)
+        split_members(xyz, group, mean, axis, number)
+        split_members(every, of_point, mean, axis, number)
     return group, of_point
 
 
 def group_moments(points: Array, group: Indices, counts: Indices) -> tuple[Array, Array]:
     """Return mean (G, 3) and covariance (G, 3, 3) of groups of points."""
-    number = len(counts)
-    mean = np.stack([np.bincount(group, x, number) for x in points.T], axis=1) / counts[:, None]
-    away = points - mean[group]
-    covariance = np.empty((number, 3, 3))
-    for i, j in np.ndindex(3, 3):
-        covariance[:, i, j] = np.bincount(group, away[:, i] * away[:, j], number)
-    return mean, covariance / np.maximum(counts - 1, 1)[:, None, None]
+    mean, covariance = np.zeros((len(counts), 3)), np.zeros((len(counts), 3, 3))
+    member_moments(points, group, counts, mean, covariance)
+    return mean, covariance
 
 
 def fitted_patches(

@@ -11,7 +11,7 @@ A quadric removes curvature. If a quartic fits much better, the residual is shap
 does not count. If too few cubes count, smaller ones are used. A wall that faces the camera may be
 one step of disparity. Steps show in the coordinates along its axis, and bound the noise below.
 
-All cubes are fitted together by numpy: there are at most 128, with 64 points each.
+There are at most 128 cubes, with 64 points each.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.models.joining import LEAST_COSINE
+from surfel_mapper.models.kernels.noise import RIDGE, trimmed_sigmas
 from surfel_mapper.models.kernels.voxel_points import sample_cubes
 
 Array = npt.NDArray[np.float64]
@@ -50,12 +51,6 @@ If ranges are unknown, quantile of the noise of surfaces, as most are nearer tha
 factor of the cubes and of their points, as a high quantile needs more.
 """
 
-TRIMMING_ROUNDS = 2
-"""Fits of a cube without its outliers; one leaves a tenth of outliers half of their effect."""
-
-MEDIAN_TO_SIGMA = 1.4826
-"""Sigma of normally distributed values by the median of their absolute values."""
-
 LEAST_WIDTH, MOST_THICKNESS = 0.1, 0.1
 """
 A cube with a smaller ratio of the tangential variances is a line; one with a larger ratio of the
@@ -67,9 +62,6 @@ LEAST_KEPT, LEAST_QUARTIC = 0.9, 0.75
 A smooth surface with noise keeps this share of its points, and the residual of a quartic is at
 least this share of that of a quadric.
 """
-
-RIDGE = 1e-10
-"""Added to the normal equations, relative to the weight, for points in one line."""
 
 STEP_SAMPLES, STEP_POINTS, STEP_SPREAD = 20_000, 8, 2.5
 """
@@ -142,7 +134,8 @@ def cube_noise(samples: NoiseSamples, edge_m: float) -> tuple[Array, Array, floa
     sheets = np.flatnonzero(is_sheet & (values[:, 0] < MOST_THICKNESS * values[:, 1]))
     scale = np.sqrt(values[sheets, 2] / number[sheets])
     local = away[sheets] @ axes[sheets][:, :, ::-1] / scale[:, None, None]
-    sigma, quartic, kept = trimmed_sigmas(local, weight[sheets])
+    (sigma, quartic), kept = np.empty((2, len(sheets))), np.empty(len(sheets))
+    trimmed_sigmas(local, weight[sheets], sigma, quartic, kept)
     smooth = (quartic >= LEAST_QUARTIC * sigma) | (sigma < math.sqrt(RIDGE))
     smooth &= kept >= LEAST_KEPT
     share *= float(smooth.sum()) / max(len(points), 1)
@@ -200,52 +193,6 @@ def sampled_rows(samples: NoiseSamples, seeds: Indices, halves: Array, most: int
     voxels = np.empty(np.max(last - first, initial=0), np.int64)
     sample_cubes(samples.means, samples.starts, (seeds, halves, first, last), voxels, rows)
     return rows
-
-
-def trimmed_sigmas(points: Array, weight: Array) -> tuple[Array, Array, Array]:
-    """
-    Return residuals (B,) of quadrics and quartics without the points beyond three sigma.
-
-    The third result is the share of points that remain.
-
-    Parameters
-    ----------
-    points : (B, n, 3) float64
-        Height over x and y.
-    weight : (B, n) float64
-        1 for points, 0 for none.
-
-    """
-    x, y, z = np.moveaxis(points, 2, 0)
-    terms = [np.ones_like(x)]
-    for degree in range(1, 5):
-        terms += [x * term for term in terms[-degree:]] + [y * terms[-1]]
-    basis = np.stack(terms, axis=2)
-    number = weight.sum(axis=1)
-    middle = ((number - 1.0) // 2.0).astype(np.int64)[:, None]
-    used = weight
-    for _ in range(TRIMMING_ROUNDS):
-        away = np.abs(residuals(basis[:, :, :6], used, z))
-        ascending = np.sort(np.where(weight > 0.0, away, np.inf), axis=1)
-        median = np.take_along_axis(ascending, middle, axis=1)
-        used = weight * (away <= 3.0 * MEDIAN_TO_SIGMA * median)
-    total, effective = used.sum(axis=1), used.sum(axis=1) ** 2 / (used**2).sum(axis=1)
-    sigmas = []
-    for order in (6, 15):
-        squares = used * residuals(basis[:, :, :order], used, z) ** 2
-        free = np.maximum(1.0 - order / effective, 0.1)
-        sigmas.append(np.sqrt(squares.sum(axis=1) / (total * free)))
-    return sigmas[0], sigmas[1], total / number
-
-
-def residuals(basis: Array, weight: Array, z: Array) -> Array:
-    """Return z less its best fit by a basis (B, n, T), (B, n)."""
-    weighted = basis * weight[:, :, None]
-    matrix = basis.transpose(0, 2, 1) @ weighted
-    matrix += RIDGE * weight.sum(axis=1)[:, None, None] * np.eye(basis.shape[2])
-    terms = np.linalg.solve(matrix, weighted.transpose(0, 2, 1) @ z[:, :, None])
-    away: Array = z - (basis @ terms)[:, :, 0]
-    return away
 
 
 def step_noise(samples: NoiseSamples) -> float:

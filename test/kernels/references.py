@@ -42,6 +42,7 @@ REFERENCES = {
     'models/kernels/gaussian_mixture.py': 'models/kernels/test_bisection.py',
     'models/kernels/joining.py': 'models/kernels/test_joining.py',
     'models/kernels/growth.py': 'models/kernels/test_growth.py',
+    'models/kernels/noise.py': 'models/test_noise.py',
     'models/kernels/outlines.py': 'models/test_outlines.py',
     'models/kernels/region_merging.py': 'models/kernels/test_patches.py',
     'models/kernels/splines.py': 'models/test_bspline.py',

@@ -98,3 +98,48 @@ def group_scatters(points, weights, starts, totals, means, scatters):
             scatters[k, 0, 1] = scatters[k, 1, 0] = xy - sx * y
             scatters[k, 0, 2] = scatters[k, 2, 0] = xz - sx * z
             scatters[k, 1, 2] = scatters[k, 2, 1] = yz - sy * z
+
+
+@kernel(error_model='numpy')
+def member_moments(points, group, counts, means, covariances):
+    """
+    Compute the moments of groups of points in any order.
+
+    points       (N, 3) float64
+    group        (N,) int64, group of each
+    counts       (G,) int64, points of each group
+    means        (G, 3) float64, zeros; out
+    covariances  (G, 3, 3) float64, zeros; out: 0 for single points
+    """
+    for i in range(len(points)):
+        for a in range(3):
+            means[group[i], a] += points[i, a]
+    for g in range(len(counts)):
+        for a in range(3):
+            means[g, a] /= counts[g]
+    for i in range(len(points)):
+        g = group[i]
+        for a in range(3):
+            for b in range(3):
+                product = (points[i, a] - means[g, a]) * (points[i, b] - means[g, b])
+                covariances[g, a, b] += product
+    for g in range(len(counts)):
+        for a in range(3):
+            for b in range(3):
+                covariances[g, a, b] /= max(counts[g] - 1, 1)
+
+
+@kernel(error_model='numpy')
+def split_members(points, group, means, axes, number):
+    """
+    Move the points of groups beyond planes through their means to other groups, in place.
+
+    points  (N, 3), group (N,) int64; means, axes (G, 3) float64: normals of the planes, 0 for none
+    number  (G,) int64, the other groups
+    """
+    for i in range(len(points)):
+        g, along = group[i], 0.0
+        for a in range(3):
+            along += (points[i, a] - means[g, a]) * axes[g, a]
+        if along > 0.0:
+            group[i] = number[g]

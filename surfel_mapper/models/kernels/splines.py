@@ -68,3 +68,21 @@ def tensor_heights(first_x, along_x, first_y, along_y, control, heights):
                 row += along_y[m, j] * control[first_x[m] + i, first_y[m] + j]
             total += along_x[m, i] * row
         heights[m] = total
+
+
+@kernel(error_model='numpy')
+def sum_equations(rows, weights, share, z, band, right):
+    """
+    Sum the lower band (width, number) and right side (number,) of normal equations.
+
+    rows     (M, W) int64, unknowns of each sample, ascending
+    weights  (M, W) float64, of these
+    share, z (M,) float64, weights and values of the samples
+    band     element k, c is that of row c + k, column c; changed in place, as right is
+    """
+    for m in range(len(rows)):
+        for i in range(rows.shape[1]):
+            row, weight = rows[m, i], share[m] * weights[m, i]
+            right[row] += weight * z[m]
+            for j in range(i + 1):
+                band[row - rows[m, j], rows[m, j]] += weight * weights[m, j]
