@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Mapping
 import logging
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from surfel_mapper.bags.compression import ZSTD_MAGIC
@@ -171,7 +172,10 @@ def loose_files(directory: Path) -> list[Path]:
     if not files:
         endings = Counter(file.suffix for file in directory.iterdir() if file.is_file())
         listed = ', '.join(f'{n} {ending or "without ending"}' for ending, n in endings.items())
-        raise BagError(f'{directory}: files in it: {listed or "none"}; expected {readable()}')
+        listed = f'files in it: {listed or "none"}'
+        if folders := sorted(file.name for file in directory.iterdir() if file.is_dir()):
+            listed += f'; its folders: {shorten(", ".join(folders), 80)}'
+        raise BagError(f'{directory}: {listed}; expected {readable()}')
     return sorted(files, key=by_number)
 
 

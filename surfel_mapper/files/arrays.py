@@ -4,7 +4,8 @@
 Points as arrays of numpy, .npy and .npz.
 
 A .npy is an array (N, 3 or more), organised (H, W, 3 or more), or with fields x, y, z. An .npz has
-such an array, perhaps with one of colours and of other columns, or arrays x, y and z.
+such an array, by its name or the longest, perhaps with one of colours and of other columns, or
+arrays x, y and z.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from surfel_mapper.files.point_columns import Columns, named_columns, NORMALS, R
 from surfel_mapper.files.state import MANIFEST
 
 SUFFIXES = ('.npy', '.npz')
+
+NAMES = ('points', 'xyz', 'pc', 'pcd', 'pcl', 'cloud', 'pointcloud', 'point_cloud', 'coords')
+"""Names of the points among several arrays; else the longest array is taken."""
 
 TRIPLES = {'colors': RGB, 'colours': RGB, 'rgb': RGB, 'normals': NORMALS}
 """Names of arrays (N, 3) beside the points, and of their columns."""
@@ -82,15 +86,19 @@ def columns_of_arrays(path: str | Path, arrays: Mapping[str, npt.NDArray[Any]]) 
     if {*'xyz'} <= arrays.keys():
         columns: Columns = {axis: np.ravel(arrays[axis]) for axis in 'xyz'}
     else:
-        shaped = [
-            name
+        shaped = {
+            name: len(array)
             for name, array in arrays.items()
             if array.ndim == 2 and 3 <= array.shape[1] <= MAX_COLUMNS and name not in TRIPLES
-        ]
-        if not shaped:
+        }
+        longest = [name for name in shaped if shaped[name] == max(shaped.values())]
+        named = [name for name in NAMES if name in shaped] or longest
+        if not named or (len(named) > 1 and named == longest):
             shapes = ', '.join(f'{name} {array.shape}' for name, array in arrays.items())
-            raise FileFormatError(f'{path}: arrays {shapes}, expected one of points (N, 3)')
-        columns = columns_of(path, arrays[shaped[0]])
+            raise FileFormatError(
+                f'{path}: arrays {shapes}, expected one of points (N, 3), or its name points'
+            )
+        columns = columns_of(path, arrays[named[0]])
     number = len(columns['x'])
     for name, array in arrays.items():
         if name in TRIPLES and array.shape == (number, 3):

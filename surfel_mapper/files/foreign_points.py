@@ -130,11 +130,9 @@ def read_obj(path: str | Path) -> Columns:
 
 
 def read_feather(path: str | Path) -> Columns:
-    """Return the columns of a feather file, float16 as float32; see decoding."""
+    """Return the columns of a feather file; see decoding."""
     path = Path(path)
     feather = decoder('pyarrow.feather', path, 'formats')
     with decoding(path):
         table = feather.read_table(str(path))
-        columns = {name: table[name].to_numpy() for name in table.column_names}
-    is_half = {name: values.dtype == np.float16 for name, values in columns.items()}
-    return {n: v.astype(np.float32) if is_half[n] else v for n, v in columns.items()}
+        return {name: table[name].to_numpy() for name in table.column_names}

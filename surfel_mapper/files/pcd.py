@@ -189,8 +189,9 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
         names, kinds = words['FIELDS'], words['TYPE']
         sizes = [int(word) for word in words['SIZE']]
         counts = [int(word) for word in words.get('COUNT', ['1'] * len(names))]
-        num_points = int(words['POINTS'][0])
         stated = [int(words[name][0]) for name in ('WIDTH', 'HEIGHT') if name in words]
+        is_stated = 'POINTS' in words or len(stated) < 2
+        num_points = int(words['POINTS'][0]) if is_stated else math.prod(stated)
         if len(stated) == 2 and stated[0] * stated[1] not in (0, num_points):
             raise ValueError(f'WIDTH {stated[0]}, HEIGHT {stated[1]}, POINTS {num_points}')
         (encoding,) = words['DATA']
@@ -206,7 +207,8 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
         if not fields or layout.itemsize > MAX_POINT_BYTES:
             raise ValueError('no fields' if not fields else f'points of {layout.itemsize} bytes')
     except (LookupError, ValueError) as error:
-        raise FileFormatError(f'{path}: inconsistent PCD header: {error}') from error
+        problem = f'no {error}' if isinstance(error, KeyError) else error
+        raise FileFormatError(f'{path}: inconsistent PCD header: {problem}') from error
     if num_points < 0 or encoding not in ('ascii', 'binary', 'binary_compressed'):
         raise FileFormatError(
             f'{path}: {num_points} points, DATA {encoding}, expected ascii, binary or '

@@ -60,12 +60,15 @@ def scan_files(directory: Path) -> list[Path]:
 
     Links that lead nowhere are among them, so that their readers report them as damaged. Hidden
     files are not: macOS writes a ._ file beside each. Tables, arrays and OBJ files are scans if
-    there are no others and they look like points.
+    there are no others and they look like points. If none does and the folder has but one ending,
+    all are returned, so that their reader states the fault.
     """
     candidates = (file for file in directory.iterdir() if scan_suffix(file) in SUFFIXES)
     files = [file for file in candidates if file.is_file() or not file.exists()]
     scans = [file for file in files if scan_suffix(file) not in SHARED]
-    return sorted(scans or filter(looks_like_points, files), key=by_number)
+    scans = scans or [*filter(looks_like_points, files)]
+    endings = {file.suffix for file in directory.iterdir() if file.name[0] != '.'}
+    return sorted(scans or (files if len(endings) == 1 else []), key=by_number)
 
 
 def looks_like_points(path: Path) -> bool:
@@ -130,6 +133,10 @@ def read_scan(path: str | Path, layout: RawLayout | None = None) -> Points:
 
 def scan_of(path: Path, columns: Columns) -> Points:
     """Return the points and the other columns of a file, named as elsewhere."""
+    for axis in 'xyz':
+        if axis not in columns and axis.upper() in columns:
+            columns[axis] = columns.pop(axis.upper())
+    columns = {n: v.astype(np.float32) if v.dtype == np.float16 else v for n, v in columns.items()}
     missing = [name for name in 'xyz' if name not in columns]
     if missing:
         raise FileFormatError(

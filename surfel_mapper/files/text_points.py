@@ -9,6 +9,7 @@ XYZN, and PTS, which begins with the number of its points.
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 import re
 from typing import NamedTuple
@@ -32,6 +33,11 @@ UNNAMED = (3, 4, 6, 7)
 
 MARKS = ('#', '//', '%')
 
+AXIS = re.compile(r'([xyz])_(mm|cm|m)_?')
+"""Coordinates with their unit in a header: x_mm, X (m)."""
+
+METRES = {'m': 1.0, 'cm': 0.01, 'mm': 0.001}
+
 QUATERNION = re.compile(r'(q|orientation|rotation)[_.]?\w*[wxyz]\b|q[wxyz]')
 """Names in a header of poses."""
 
@@ -48,7 +54,8 @@ class TextLayout(NamedTuple):
     def is_points(self) -> bool:
         """Whether the rows have coordinates, and are no poses."""
         if self.names:
-            return {*'xyz'} <= {*self.names} and not any(map(QUATERNION.match, self.names))
+            axes = {AXIS.sub(r'\1', name) for name in self.names}
+            return axes >= {*'xyz'} and not any(map(QUATERNION.match, self.names))
         return self.width in UNNAMED
 
 
@@ -97,24 +104,32 @@ def read_points(path: str | Path) -> Columns:
     with refusing(path):
         layout = text_layout(Path(path))
         if layout is None or not layout.is_points:
-            seen = '' if layout is None else f'{layout.width} columns {", ".join(layout.names)}'
+            names = '' if layout is None else ', '.join(layout.names)
+            seen = layout and f'{layout.width} columns {names}'.strip()
             raise FileFormatError(
                 f'{path}: {seen or "no row of numbers"}, expected a header with x, y, z, or '
                 'rows x y z, x y z intensity, x y z r g b, or x y z intensity r g b'
             )
         with open_regular(path) as file:
             table = np.loadtxt(
-                file,
+                io.TextIOWrapper(file, 'utf-8-sig', 'replace'),  # notes in other encodings
                 delimiter=layout.separator,
                 skiprows=layout.skipped,
                 comments=MARKS,
                 ndmin=2,
                 usecols=range(layout.width),
-                encoding='utf-8-sig',
             )
     if layout.names:
-        columns = dict(zip(layout.names, np.ascontiguousarray(table.T), strict=True))
-        return {name: values for name, values in columns.items() if name}  # pandas' index has none
+        columns = {}
+        for name, values in zip(layout.names, np.ascontiguousarray(table.T), strict=True):
+            axis = AXIS.fullmatch(name)
+            columns[axis[1] if axis else name] = METRES[axis[2]] * values if axis else values
+        columns.pop('', None)  # pandas' index
+        return columns
+    if len(table) > 2 and (np.diff(table[:, 0]) == 1.0).all():
+        raise FileFormatError(
+            f'{path}: the first column counts the rows, expected x; name the columns in a header'
+        )
     columns = named_columns(table)
     if Path(path).suffix.lower() == '.pts' and 'column_3' in columns:  # Leica's are negative
         columns['intensity'] = columns.pop('column_3')

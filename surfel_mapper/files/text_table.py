@@ -65,7 +65,7 @@ def read_table(
         try:
             table = np.loadtxt(file, layout, comments=None, ndmin=1, max_rows=rows)
         except (ValueError, DeprecationWarning, MemoryError) as error:
-            raise FileFormatError(f'{path}: {error}') from error
+            raise FileFormatError(f'{path}: {str(error).partition("; use")[0]}') from error
     if len(table) != count:
         raise FileFormatError(f'{path}: {len(table)} rows, expected {count} points; truncated?')
     return table

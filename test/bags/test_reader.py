@@ -290,10 +290,13 @@ def test_a_choice_that_cannot_be_made_names_the_candidates(tmp_path, type_, name
 def test_a_path_without_a_bag_is_refused(tmp_path):
     (tmp_path / 'notes.txt').write_text('no bag')
     (tmp_path / 'empty').mkdir()
+    for day in ('mon', 'tue'):
+        (tmp_path / 'days' / day).mkdir(parents=True)
     for name, says in (
         ('nothing', 'no such file or directory'),
         ('notes.txt', '.txt is not read; expected a bag'),
         ('empty', 'files in it: none; expected a bag: a directory with metadata.yaml'),
+        ('days', 'files in it: none; its folders: mon, tue; expected a'),
     ):
         with pytest.raises(BagError, match=f'{name}: .*{says}'):
             BagReader(tmp_path / name)

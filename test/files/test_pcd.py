@@ -112,6 +112,12 @@ def test_fields_of_several_numbers_and_padding_read(tmp_path):
     np.testing.assert_array_equal(found['fpfh'], np.arange(99).reshape(3, 33))
 
 
+def test_the_number_of_points_may_be_that_of_the_rows(tmp_path):
+    header = HEADER.replace('POINTS 2\n', '')
+    (tmp_path / 'a.pcd').write_bytes(f'{header}DATA ascii\n1\n2\n'.encode())
+    assert read_points(tmp_path / 'a.pcd')['x'].tolist() == [1.0, 2.0]
+
+
 @pytest.mark.parametrize('num_zeros', [1, 12, 3906, 4096])
 def test_zeros_up_to_a_page_may_follow_the_points(tmp_path, num_zeros):
     content = HEADER.encode() + b'DATA binary\n' + np.array([1, 2], '<f4').tobytes()
@@ -141,6 +147,8 @@ UNSIZED = HEADER.replace('WIDTH 2', 'WIDTH 0')
         (HEADER.replace('TYPE F', 'TYPE Q') + 'DATA binary\n', 'inconsistent PCD header'),
         (HEADER.replace('COUNT 1', 'COUNT 0') + 'DATA binary\n', 'count 0'),
         (UNSIZED.replace('POINTS 2', 'POINTS -2') + 'DATA binary\n', '-2 points'),
+        (HEADER.replace('FIELDS', 'COLUMNS') + 'DATA binary\n', "header: no 'FIELDS'"),
+        (HEADER + 'DATA ascii\n1,2\n', 'could not convert string .*'),
         (HEADER.replace('FIELDS x', 'FIELDS x x') + 'DATA binary\n', 'inconsistent PCD header'),
     ],
 )

@@ -9,6 +9,7 @@ import pytest
 
 from surfel_mapper import libraries
 from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.scan_files import read_scan, scan_files
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test import extras
@@ -48,6 +49,16 @@ def check(path, *columns, atol=1e-12):
             ('intensity', 'rgb'),
         ),
         ('a.asc', 7, {'header': 'X Y Z intensity R G B', 'comments': '//'}, ('intensity', 'rgb')),
+        (
+            'a.csv',
+            4,
+            {
+                'delimiter': ',',
+                'header': 'é\nX (m),Y (m),z_m,intensity',
+                'encoding': 'latin-1',
+            },
+            ('intensity',),
+        ),
         ('a.pts', 7, {'header': str(N), 'comments': ''}, ('intensity', 'rgb')),
     ],
 )
@@ -69,6 +80,16 @@ def test_columns_of_a_header_may_come_in_any_order(tmp_path, header):
     assert [*columns] == (['intensity'] if header[0] != ',' else [])
 
 
+@pytest.mark.parametrize(('unit', 'factor'), [('mm', 1000.0), ('cm', 100.0)])
+def test_units_in_a_header_are_converted(tmp_path, unit, factor):
+    for at, header in enumerate(
+        (f'x_{unit},y_{unit},z_{unit}', f'X ({unit}), Y[{unit}], Z {unit}')
+    ):
+        path = tmp_path / f'{at}.csv'
+        np.savetxt(path, POINTS * factor, '%.17g', ',', header=header, comments='')
+        check(path)
+
+
 def test_intensities_of_pts_may_be_negative(tmp_path):
     rows = np.column_stack([POINTS, INTENSITY - 2000.0, COLOURS])
     np.savetxt(tmp_path / 'a.pts', rows, '%.17g', header=str(N), comments='')
@@ -86,6 +107,8 @@ def test_intensities_of_pts_may_be_negative(tmp_path):
         ('a.txt', '0 1 2 3 0 0 0 1\n', '8 columns'),
         ('a.csv', 't,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n', '8 columns t, x, y, z, qx'),
         ('a.csv', 'time,a,b\n0,1,2\n', '3 columns time, a, b'),
+        ('a.xyz', '0 1 2 3 4\n', '5 columns, expected a header'),
+        ('a.csv', '0,9,9,9\n1,8,8,8\n2,7,7,7\n', 'the first column counts the rows'),
         ('a.xyz', '1 2 3\n4 5\n', 'columns'),
         ('a.xyz', '1 2 3\n4 5 x\n', "'x'"),
     ],
@@ -111,6 +134,18 @@ def test_tables_and_arrays_are_scans_of_a_folder_if_they_are_points(tmp_path):
 
     np.savetxt(tmp_path / '4.xyz', POINTS)
     assert [file.name for file in scan_files(tmp_path)] == ['4.xyz']
+
+
+def test_tables_of_a_folder_with_one_ending_are_scans_that_state_their_fault(tmp_path):
+    for name in ('1.csv', '2.csv'):
+        (tmp_path / name).write_text('x;y;z\n1,5;2,5;3,5\n')
+    assert [file.name for file in scan_files(tmp_path)] == ['1.csv', '2.csv']
+    with pytest.raises(
+        FileFormatError, match=r'1\.csv: no row of numbers, expected a header with'
+    ):
+        read_scan(tmp_path / '1.csv')
+    (tmp_path / 'a.jpg').write_bytes(b'')
+    assert scan_files(tmp_path) == []
 
 
 def test_arrays_of_numpy_are_read(tmp_path):
@@ -142,6 +177,21 @@ def test_archives_of_numpy_are_read(tmp_path, save):
     check(tmp_path / 'b.npz', 'intensity')
     save(tmp_path / 'c.npz', POINTS)
     check(tmp_path / 'c.npz')
+    save(
+        tmp_path / 'd.npz', K=np.eye(3), boxes=np.ones((4, 7)), lidar=POINTS, flow=np.zeros((9, 3))
+    )
+    check(tmp_path / 'd.npz')
+    save(tmp_path / 'e.npz', normal=normals, points=POINTS, grid=np.zeros((2 * N, 3)))
+    check(tmp_path / 'e.npz')
+
+
+def test_halves_and_capitals_are_read(tmp_path):
+    np.save(tmp_path / 'half.npy', POINTS.astype('f2'))
+    check(tmp_path / 'half.npy', atol=3e-3)
+    upper = dict(zip('XYZ', POINTS.T, strict=True))
+    for module, name in ((ply, 'upper.ply'), (pcd, 'upper.pcd')):
+        module.write_points(tmp_path / name, {**upper, 'intensity': INTENSITY})
+        assert [*check(tmp_path / name, 'intensity')] == ['intensity']
 
 
 @pytest.mark.parametrize(
@@ -152,6 +202,11 @@ def test_archives_of_numpy_are_read(tmp_path, save):
         ('a.npy', lambda path: np.save(path, np.array([{}], object)), 'allow_pickle'),
         ('a.npy', lambda path: path.write_bytes(b'\x93NUMPY'), 'a.npy'),
         ('a.npz', lambda path: np.savez(path, a=np.zeros(5)), r'arrays a \(5,\), expected one of'),
+        (
+            'a.npz',
+            lambda path: np.savez(path, a=POINTS, b=POINTS),
+            r'arrays a \(50, 3\), b \(50, 3\), expected one of points',
+        ),
         ('a.npz', lambda path: path.write_bytes(b'PK'), 'a.npz'),
         ('a.npz', lambda path: SurfelMap(0.5).save(path), 'a map, expected points'),
     ],
