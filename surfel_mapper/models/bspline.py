@@ -290,10 +290,11 @@ def fit_cells(cells: Cells, patch: int, degree: int, smoothing: float | None) ->
     filled = used.reshape(num_x, num_y)
     origin = cells.origins[patch].copy()
     start = initial_field(float(cells.pitches[patch]), origin, heights, filled, degree)
-    xy, z = means[used, :2], means[used, 2]
     if smoothing is None:
-        return fit_nearest(start, xy, z)
-    return fit_pspline(start, xy, z, sums[used, 3], (smoothing, RIDGE))
+        return fit_nearest(start, means[used, :2], means[used, 2])
+    points, first = cells.points
+    own = points[first[patch] : first[patch + 1]]
+    return fit_pspline(start, own[:, :2], own[:, 2], np.ones(len(own)), (smoothing, RIDGE))
 
 
 def transposed(field: HeightField) -> HeightField:

@@ -129,6 +129,8 @@ class Cells:
         First cell of each patch.
     sums : (C, 4) float64
         Sums of x, y and z of the points in each cell, and their number.
+    points : tuple
+        Points in the frames of their patches, (N, 3) float64, m, and the first of each, (K + 1,).
     rim, corner, cuts : (C,) bool, (C,) uint8, (C, 3) uint8
         See Grid.
 
@@ -139,6 +141,7 @@ class Cells:
     sizes: Indices
     first: Indices
     sums: Array
+    points: tuple[Array, Indices]
     rim: npt.NDArray[np.bool_]
     corner: npt.NDArray[np.uint8]
     cuts: npt.NDArray[np.uint8]
@@ -193,7 +196,8 @@ class Cells:
             free_m = least[cut] - margin_m * np.array([1.0, 1.0, np.sqrt(2.0)])
             number = np.floor(free_m / (steps * np.array([1.0, 1.0, 2.0])))
             cuts[cut] = np.clip(CUT_STEP * number, 0.0, 255.0).astype(np.uint8)
-        return cls(pitches, origins, sizes, first, sums, rim, corner, cuts)
+        points = local, np.searchsorted(patch, np.arange(len(pitches) + 1))
+        return cls(pitches, origins, sizes, first, sums, points, rim, corner, cuts)
 
     def of(self, patch: int) -> slice:
         """Return the rows of a patch."""
