@@ -114,7 +114,7 @@ def test_an_independent_reader_agrees_within_the_tolerance(model):
     cuts = np.concatenate([patch.grid.cuts[patch.grid.rim] for patch in patches])
     np.testing.assert_array_equal(np.array(found.cuts)[:, :2], cuts[:, :2])
     for surface, control in zip(model.surfaces, found.control, strict=True):
-        np.testing.assert_allclose(control, surface.spline.control, rtol=0, atol=0.5001 * STEP)
+        np.testing.assert_allclose(control, surface.spline.control, rtol=0, atol=4.001 * STEP)
     root = np.zeros((len(gaussians), 3, 3))
     root[(slice(None), *np.tril_indices(3))] = found.roots[len(patches) :]
     again, sigma = (
