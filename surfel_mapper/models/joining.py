@@ -55,7 +55,13 @@ A surface that turns or bends less is a plane: tables sag a little. Sigmas are t
 far walls seem to bend by steps of disparity.
 """
 
-CURVED_GAIN = 9.0
+STEEPEST_DEG, STEEPEST_CLOSED_DEG = 78.0, 66.0
+"""
+Slope of a joined surface, at most. A scan has one side of an object, of which a surface may have
+all. A map has all sides; less steep surfaces continue each other better.
+"""
+
+CURVED_GAIN = 30.0
 """Gain of the criterion by which a curved surface is better than a plane, at least."""
 
 MOST_WORSE, UNRESOLVED_VOXELS = 1.25, 0.2
@@ -194,6 +200,8 @@ class Comparison:
         Noise of the sensor across them, and that of their points.
     floor : (K,) float64, m^2
         Square of the residuals that are not resolved.
+    steepest : float
+        Least cosine of the slope of a joined surface.
 
     """
 
@@ -206,6 +214,7 @@ class Comparison:
     noise: Array
     sigma: Array
     floor: Array
+    steepest: float
 
     @classmethod
     def of(
@@ -225,7 +234,9 @@ class Comparison:
         floor = np.clip(noise[1] * range_sq * cosine, *limits) ** 2
         extents = np.sqrt(3.0 * values[:, 2]) + size_m
         sigma = np.maximum(across, np.sqrt(np.maximum(values[:, 0], floor)))
-        return cls(pieces, number, means, covariances, extents, normals, across, sigma, floor)
+        steepest = math.cos(math.radians(STEEPEST_DEG if view.ndim == 1 else STEEPEST_CLOSED_DEG))
+        moments = number, means, covariances, extents
+        return cls(pieces, *moments, normals, across, sigma, floor, steepest)
 
     def with_layers(self, touching: Indices) -> tuple[Indices, Comparison]:
         """
@@ -289,7 +300,7 @@ class Comparison:
         points = pieces.starts, pieces.means, pieces.weights, self.normals
         tables = regions.normals, regions.middles, regions.extents, self.sigma
         columns = np.empty((4, len(pieces.means) + 1))
-        compare_regions(pairs, groups, points, tables, self.floor, columns, out)
+        compare_regions(pairs, groups, points, tables, (self.floor, self.steepest), columns, out)
         return out
 
     def described(

@@ -41,7 +41,7 @@ CREASE = math.cos(math.radians(35.0))
 STEEPEST = 0.5
 """Sine of the angle between a smooth continuation and the surface: 30 deg."""
 
-UPRIGHT = math.cos(math.radians(75.0))
+UPRIGHT = math.cos(math.radians(83.0))
 """Least cosine between a continuation and the mean normal: a height field cannot be vertical."""
 
 

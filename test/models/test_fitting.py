@@ -21,10 +21,12 @@ from surfel_mapper.models.thinning import thin
 from test.bench import tabletop
 from test.models.scenes import (
     A,
+    AXIS,
     BALL,
     BALL_RADIUS,
     CENTRE,
     CYLINDER,
+    CYLINDER_RADIUS,
     FLAT,
     room,
     sheet,
@@ -72,6 +74,21 @@ def test_round_objects_are_few_surfaces_within_7_mm(seen, which, most):
     own = [s for s in model.surfaces if owner(model, s, lies_on)[0] == which]
     assert 1 <= len(own) <= most
     assert max(surface.rms_m for surface in own) <= 0.007
+
+
+@pytest.mark.parametrize('size_m', [0.01, 0.02, 0.03])
+def test_a_camera_sees_a_round_object_as_one_surface(size_m):
+    points, lies_on = room(noise_per_range_sq=1.425e-3)
+    model = fit(points, ModelsConfig(voxel_size_m=size_m, noise_per_range_sq=1.425e-3), VIEW)
+    for which in (CYLINDER, BALL):
+        labels = model.labels[lies_on == which]
+        largest = np.bincount(labels[labels < len(model.patches)]).argmax()
+        assert largest >= len(model.planes)
+        assert (labels == largest).mean() > 0.9
+    xyz = model.surfaces[0].lifted(model.surfaces[0].grid.samples(size_m))
+    cylinder = np.linalg.norm(xyz[:, :2] - AXIS, axis=1) - CYLINDER_RADIUS
+    ball = np.linalg.norm(xyz - CENTRE, axis=1) - BALL_RADIUS
+    assert min(np.sqrt(np.mean(away**2)) for away in (cylinder, ball)) < 0.003
 
 
 def test_surfaces_lie_on_the_ball_and_their_normals_point_out(seen):

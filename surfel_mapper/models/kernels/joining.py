@@ -22,10 +22,7 @@ POWERS = np.array([(a, d - a) for d in range(3) for a in range(d, -1, -1)])
 RIDGE = 1e-10
 """Added to the normal equations of coordinates in [-1, 1], for points in one line."""
 
-JOIN_COSINE = math.cos(math.radians(50.0))
-"""Least cosine of the angle between the normals of joined regions at their means."""
-
-CHART_COSINE = math.cos(math.radians(50.0))
+CHART_COSINE = math.cos(math.radians(70.0))
 """Least cosine between the normal of a patch and the mean normal of the surface it joins."""
 
 COPLANAR_COSINE, COPLANAR_GROWTH = math.cos(math.radians(6.0)), 1.25
@@ -36,6 +33,12 @@ REACH = 2.0
 
 MOST_ROWS = 600
 """Points that are compared, at most; larger regions are subsampled."""
+
+ROUNDS = 3
+"""Fits of a round surface, each with the curvature of the previous one."""
+
+MOST_STEEP = 0.05
+"""Share of the points of a joined surface with a slope beyond the limit."""
 
 POINTS_PER_TERM = 3.0
 """A height field needs more points."""
@@ -183,38 +186,50 @@ def solve_heights(sums, right, reduced, matrix):
 
 
 @inlined(error_model='numpy')
-def solve_transposed(matrix, reduced):
-    """Solve for the coefficients, in place; matrix and reduced of solve_heights."""
-    for p in range(QUADRIC - 1, -1, -1):
-        for m in range(p + 1, QUADRIC):
+def solve_transposed(matrix, reduced, number):
+    """Solve for the first coefficients, in place; matrix and reduced of solve_heights."""
+    for p in range(number - 1, -1, -1):
+        for m in range(p + 1, number):
             reduced[p] -= matrix[m, p] * reduced[m]
         reduced[p] /= matrix[p, p]
 
 
 @inlined(error_model='numpy')
-def turn_of(local, terms):
+def round_heights(local, raw, terms, steepest):
     """
-    Return sqrt(12) times the root mean square angle of a quadric's normals to their mean.
+    Turn the heights of a round surface into those of a quadric; return its turn and steep share.
 
-    local  of local_points; shares are multiplied by the squared cosine of the slope
-    terms  (6,) float64, of the quadric
+    On a circle z = g (x^2 + z^2), so z - g z^2 of cylinders and balls is a quadric, with residuals
+    that are distances. g is half the larger curvature of the quadric of the previous round.
+
+    local     of local_points; heights, and shares times the squared cosine of the slope: out
+    raw       (2, n) float64, heights and shares
+    terms     (6,) float64, of the quadric
+    steepest  least cosine of the slope
+
+    The turn is sqrt(12) times the root mean square angle of the normals to their mean.
     """
     a, b, c, d, e = terms[1], terms[2], terms[3], terms[4], terms[5]
-    sum_x = sum_y = sum_z = 0.0
+    g = math.sqrt((c - e) * (c - e) + d * d)
+    g = 0.5 * (c + e + (g if c + e > 0.0 else -g))
+    sum_x = sum_y = sum_z = steep = 0.0
     for n in range(local.shape[1]):
-        x, y = local[0, n], local[1, n]
+        x, y, z = local[0, n], local[1, n], raw[0, n]
         slope_x, slope_y = a + 2.0 * c * x + d * y, b + d * x + 2.0 * e * y
-        length_sq = 1.0 + slope_x * slope_x + slope_y * slope_y
+        slope_z = 1.0 - 2.0 * g * z
+        length_sq = slope_z * slope_z + slope_x * slope_x + slope_y * slope_y
         up = 1.0 / math.sqrt(length_sq)
-        sum_x, sum_y, sum_z = sum_x + slope_x * up, sum_y + slope_y * up, sum_z + up
-        local[3, n] /= length_sq
+        steep += slope_z * up < steepest
+        sum_x, sum_y, sum_z = sum_x + slope_x * up, sum_y + slope_y * up, sum_z + slope_z * up
+        local[2, n] = z - g * z * z
+        local[3, n] = raw[1, n] / length_sq
     mean_sq = (sum_x * sum_x + sum_y * sum_y + sum_z * sum_z) / float(local.shape[1]) ** 2
     # unit normals: their mean square distance from the mean is 1 less its square
-    return math.sqrt(12.0 * max(1.0 - mean_sq, 0.0))
+    return math.sqrt(12.0 * max(1.0 - mean_sq, 0.0)), steep / local.shape[1]
 
 
 @kernel(error_model='numpy')
-def compare_regions(pairs, groups, pieces, regions, floor, columns, out):
+def compare_regions(pairs, groups, pieces, regions, rules, columns, out):
     """
     Compute by how much one height field of a pair of regions is better than two.
 
@@ -222,14 +237,15 @@ def compare_regions(pairs, groups, pieces, regions, floor, columns, out):
     groups   members (K,) int64 and first (K + 1,) int64: see above
     pieces   starts (K + 1,) int64, points (P, 3), weights (P,), patch normals (K, 3) float64
     regions  sums of normals (K, 3), middles (K, 3), extents (K,), m, noise across them (K,), m
-    floor    (K,) float64, square of the residuals that are not resolved, m^2
+    rules    floor (K,) float64, square of the residuals that are not resolved, m^2; least cosine
+             of the slope of a joined surface, see MOST_STEEP
     columns  (4, P + 1) float64, scratch
     out      (R, 4) float64, out: gain of a pair, 0 for none; of a region: gain of the best height
              field over a plane, turn, rad, and bend, m, of the quadric, rms from a plane, m
 
     (Longer than other kernels: the points of both regions are copied by one loop.)
     """
-    members, first = groups
+    (members, first), (floor, steepest) = groups, rules
     starts, points, weights, patch_normals = pieces
     totals, middles, extents, noise = regions
     normals, ends, zero = np.empty((3, 3)), np.zeros(3, np.int64), np.int64(0)
@@ -241,8 +257,7 @@ def compare_regions(pairs, groups, pieces, regions, floor, columns, out):
             normals[2, j] = totals[a, j] + totals[b, j]
         for i in range(3):
             normalise(normals[i])
-        cosine, is_single = dot(normals[0], normals[1]), a == b
-        is_chart, num = cosine >= JOIN_COSINE or is_single, zero
+        cosine, is_single, is_chart, num = dot(normals[0], normals[1]), a == b, True, zero
         small = a if extents[a] < extents[b] else b
         x, y, z = middles[small, 0], middles[small, 1], middles[small, 2]
         for side in range(1 if is_single else 2):
@@ -272,55 +287,62 @@ def compare_regions(pairs, groups, pieces, regions, floor, columns, out):
         if min(middle, end - middle) < 3 and not is_single:
             continue
         least = max(floor[a], floor[b])
-        both = heights(columns, zero, end, normals[2], least)
+        both = heights(columns, zero, end, normals[2], least, steepest)
         gain, out[r, 1], out[r, 2], out[r, 3] = both[1] - both[0], both[3], both[4], both[2]
         if not is_single:
             gain, rms_m = -both[0], max(noise[a], noise[b])
             for side in range(2):
                 low, high = (middle, end) if side else (zero, middle)
-                own = heights(columns, low, high, normals[side], least)
+                own = heights(columns, low, high, normals[side], least, steepest)
                 gain, rms_m = gain + own[0], max(rms_m, own[2])
             if cosine > COPLANAR_COSINE and both[2] < COPLANAR_GROWTH * rms_m:
                 gain = max(gain, float(min(middle, end - middle)))
+            elif both[5] > MOST_STEEP and both[0] < both[1]:
+                gain = 0.0
         out[r, 0] = max(gain, 0.0)
 
 
 @kernel(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
-def heights(points, low, high, normal, floor):
+def heights(points, low, high, normal, floor, steepest):
     """
     Fit a plane and a quadric over a plane to columns low to high - 1 of points (4, n).
 
-    Returns cost, cost of a plane, rms from a plane m, turn rad, and bend m of the quadric.
+    Returns cost, cost of a plane, rms from a plane m, and of the quadric turn rad, bend m, and the
+    share of points where it is too steep.
 
     The Cholesky factor of the quadric contains the plane's, so one solution is enough for both.
     The turn is that of the normals of the quadric, for a strip of constant curvature the angle
-    between its ends. Shares of the second pass are multiplied by the squared cosine of the slope
-    of the quadric, so that heights weigh as much as distances from the surface.
+    between its ends. After the first round the quadric is that of a round surface.
     """
     number = high - low
     local, powers = np.empty((4, number)), np.empty((5, number))
-    sums, right = np.empty((5, 5)), np.empty((3, 3))
+    sums, right, plane = np.empty((5, 5)), np.empty((3, 3)), np.empty(PLANE)
     terms, matrix = np.empty(QUADRIC), np.empty((QUADRIC, QUADRIC))
     scale = local_points(points, low, normal, local)
-    plane_sq = quadric_sq = turn = 0.0
-    for again in range(2):
-        plane_sq = height_sums(local, powers, sums, right)
+    raw = local[2:].copy()
+    plane_sq = quadric_sq = turn = steep = 0.0
+    for again in range(ROUNDS):
+        quadric_sq = height_sums(local, powers, sums, right)
         solve_heights(sums, right, terms, matrix)
         if not again:
-            solve_transposed(matrix, terms)
-            turn = turn_of(local, terms)
-    for p in range(PLANE):
-        plane_sq -= terms[p] * terms[p]
-    quadric_sq = plane_sq
-    for p in range(PLANE, QUADRIC):
-        quadric_sq -= terms[p] * terms[p]
+            plane_sq = quadric_sq
+            for p in range(PLANE):
+                plane[p] = terms[p]
+                plane_sq -= terms[p] * terms[p]
+            solve_transposed(matrix, plane, PLANE)
+            plane_sq /= 1.0 + plane[1] * plane[1] + plane[2] * plane[2]
+        for p in range(QUADRIC):
+            quadric_sq -= terms[p] * terms[p]
+        if again < ROUNDS - 1:
+            solve_transposed(matrix, terms, QUADRIC)
+            turn, steep = round_heights(local, raw, terms, steepest)
     plane_sq = max(plane_sq, 0.0) * scale * scale
     quadric_sq = max(quadric_sq, 0.0) * scale * scale
     best = plane = number * math.log(plane_sq + floor) + PLANE * math.log(number)
     if number > POINTS_PER_TERM * QUADRIC:
         best = min(best, number * math.log(quadric_sq + floor) + QUADRIC * math.log(number))
     bend = math.sqrt(12.0 * max(plane_sq - quadric_sq, 0.0))
-    return best, plane, math.sqrt(plane_sq + floor), turn, bend
+    return best, plane, math.sqrt(plane_sq + floor), turn, bend, steep
 
 
 @inlined(error_model='numpy')
