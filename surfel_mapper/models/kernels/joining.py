@@ -40,8 +40,8 @@ ROUNDS = 3
 MOST_STEEP = 0.05
 """Share of the points of a joined surface with a slope beyond the limit."""
 
-POINTS_PER_TERM = 3.0
-"""A height field needs more points."""
+POINTS_PER_TERM = 1.5
+"""A height field needs more points. Those are means by voxel: each is of many."""
 
 
 @kernel(error_model='numpy')
