@@ -36,6 +36,9 @@ DEFAULT = Config()
 USUAL = [types[0] for types in TYPES.values()]
 """Types of poses that a choice need not name."""
 
+NOT_READ = ('nav_msgs/msg/Path', 'geometry_msgs/msg/TransformStamped')
+"""Types that have poses too."""
+
 SETTING = {'file': 'pose'}
 """The pose.source of a choice that has another name."""
 
@@ -221,6 +224,8 @@ def registered(
     reader: BagReader, topics: Sequence[str], config: Config, reason: str
 ) -> PoseChoice:
     """Return registration of the clouds or depth images of a bag, for a reason."""
+    names = [f'{topic.name} ({topic.type})' for topic in reader.topics if topic.type in NOT_READ]
+    reason += f'; not read: {", ".join(names)}' if names else ''
     scans = [] if config.input.kind == 'depth' else first_scans(reader, topics)
     return PoseChoice(with_registration(config, scans), reason)
 
@@ -356,14 +361,13 @@ def times_error(scan: Scan) -> str:
 
 
 def why_not_deskewed(config: Config, scans: Sequence[Scan]) -> str:
-    """Return why scans whose points have times are not deskewed; empty if they are."""
-    if config.deskew.enabled:
+    """Return why scans whose points have times are not deskewed; empty if they are or rest."""
+    if config.deskew.enabled or config.pose.source == 'identity':
         return ''
     for scan in scans:
         if names := time_fields(scan.columns):
             reason = f'points have times ({", ".join(names)}), which deskew.enabled: true uses'
-            is_asked = config.pose.source == 'registration' and config.deskew == DEFAULT.deskew
-            return times_error(scan) or reason if is_asked else reason
+            return times_error(scan) or reason if config.deskew == DEFAULT.deskew else reason
     return ''
 
 

@@ -11,10 +11,10 @@ Only the headers of clouds are read.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain
 import math
+import re
 from typing import Any
 
 from surfel_mapper.bags.reader import BagMessage, BagReader
@@ -25,7 +25,7 @@ from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.messages.cdr import frame_name, stamp_ns
 from surfel_mapper.messages.poses import raw_poses, StampedPose
 from surfel_mapper.offline.pose_sources import shares_namespace, static_topics, TYPES
-from surfel_mapper.poses import TransformBuffer
+from surfel_mapper.poses import above, TransformBuffer
 
 SOURCES = {type_: source for source, types in TYPES.items() for type_ in types}
 """The pose.source that reads each type."""
@@ -36,6 +36,9 @@ ALL_TIME_S = 1e9
 """Buffer length of a survey, s: it holds every transform of a bag."""
 
 DEFAULTS = Config()
+
+FIXED_NAME = re.compile(r'(?:^|[_/])(?:odom|map|world)(?:$|[_/])')
+"""Names of fixed frames, as odom_lidar."""
 
 
 @dataclass(slots=True)
@@ -295,16 +298,18 @@ def tried(
 ) -> Offer:
     """Look the pose of every cloud up in one source."""
     if source.kind == 'tf':
-        fixed, base = fixed_frame([*source.poses, *static], frame), DEFAULTS.frames.base
+        fixed, base = fixed_frame(source.poses, static, frame), DEFAULTS.frames.base
     else:
         fixed, base = source.poses[0].parent, source.poses[0].child
     settings: dict[str, Any] = {'pose.source': source.kind, 'frames.fixed': fixed}
-    buffer, missing = transforms(source.poses, static), ''
+    (buffer, refused), missing = transforms(source.poses, static), ''
     if source.kind != 'tf' and base != frame:
         mount = mounting(static, base, frame)
         settings |= {'frames.base': base, 'frames.base_to_sensor': mount}
         if not mount:
             missing = f'the place of {frame} in {base} is not in the bag, measure it'
+            if frame == fixed:
+                missing = f'poses and clouds are in {fixed}; --poses-from identity maps them'
             frame = base
     covered = 0
     for stamp in stamps:
@@ -312,32 +317,37 @@ def tried(
             buffer.lookup(fixed, frame, stamp)
             covered += 1
         except PoseError as error:
-            missing = str(error)
+            missing = (not covered and refused) or str(error)
     return Offer(clouds, source.topic, covered, len(stamps), settings, missing)
 
 
-def transforms(poses: list[StampedPose], static: list[StampedPose]) -> TransformBuffer:
-    """Return a buffer of all poses but those that mapping would ignore."""
+def transforms(poses: list[StampedPose], static: list[StampedPose]) -> tuple[TransformBuffer, str]:
+    """Return a buffer of all poses but those that mapping would ignore, and why it would."""
+    refused = ''
     buffer = TransformBuffer(ALL_TIME_S, ALL_TIME_S, DEFAULTS.pose.max_gap_s or math.inf)
     for pose, is_static in [*((p, True) for p in static), *((p, False) for p in poses)]:
-        with suppress(PoseError, ValueError):
+        try:
             transform = pose_matrix(pose.xyz, pose.q_xyzw)
             if is_static:
                 buffer.add_static(pose.parent, pose.child, transform)
             else:
                 buffer.add(pose.parent, pose.child, pose.stamp_ns, transform)
-    return buffer
+        except (PoseError, ValueError) as error:
+            refused = f'pose of {pose.child} in {pose.parent}: {error}'
+    return buffer, refused
 
 
-def fixed_frame(poses: list[StampedPose], frame: str) -> str:
-    """Return the frame to map in: odom or map if the tree has it above a frame, else its root."""
-    parents = {pose.child: pose.parent for pose in poses}
-    above: list[str] = []
-    while frame in parents and parents[frame] not in above:
-        frame = parents[frame]
-        above.append(frame)
-    customary = [name for name in ('odom', 'map') if name in above]
-    return (customary or above[-1:] or [DEFAULTS.frames.fixed])[0]
+def fixed_frame(poses: list[StampedPose], static: list[StampedPose], frame: str) -> str:
+    """
+    Return the frame to map in: odom or map if the tree has it above a frame, else its root.
+
+    Some odometry is published upside down: the moving child of the root is then a frame like odom.
+    """
+    parents = {pose.child: pose.parent for pose in [*poses, *static]}
+    chain = above(parents, frame)
+    customary = [name for name in ('odom', 'map') if name in chain[1:]]
+    below = [p.child for p in poses if p.parent == chain[-1] and FIXED_NAME.search(p.child)]
+    return (customary or below or chain[1:][-1:] or [DEFAULTS.frames.fixed])[0]
 
 
 def mounting(static: list[StampedPose], base: str, frame: str) -> list[float]:
@@ -350,7 +360,7 @@ def mounting(static: list[StampedPose], base: str, frame: str) -> list[float]:
     if direct:
         return [*direct[-1].xyz, *direct[-1].q_xyzw]
     try:
-        transform = transforms([], static).lookup(base, frame, 0)
+        transform = transforms([], static)[0].lookup(base, frame, 0)
     except PoseError:
         return []
     return [float(value) for value in (*transform[:3, 3], *q_xyzw(transform))]

@@ -8,6 +8,7 @@ from surfel_mapper.poses.buffer import TransformBuffer as TransformBuffer
 from surfel_mapper.poses.clock_offset import ClockOffset as ClockOffset
 from surfel_mapper.poses.clock_offset import offset_s as offset_s
 from surfel_mapper.poses.mount_changes import MountChanges as MountChanges
+from surfel_mapper.poses.source_choice import above as above
 from surfel_mapper.poses.source_choice import AUTO as AUTO
 from surfel_mapper.poses.source_choice import choose_source as choose_source
 from surfel_mapper.poses.source_choice import has_chain as has_chain

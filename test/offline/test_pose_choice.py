@@ -13,8 +13,10 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.errors import BagError
 from surfel_mapper.files import pcd
 from surfel_mapper.files.trajectory import read_trajectory
+from surfel_mapper.offline.pose_choice import why_not_deskewed
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.request import Request
+from surfel_mapper.scan import Scan
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.bags.recorded import (
     CLOUD,
@@ -30,6 +32,8 @@ from test.bags.recorded import (
 )
 
 pytestmark = pytest.mark.usefixtures('undrawn')
+
+STAMPED = 'geometry_msgs/msg/TransformStamped'
 
 MOUNTED = {'frames.base_to_sensor': (*MOUNT_M, 0.0, 0.0, 0.0, 1.0)}
 
@@ -80,6 +84,41 @@ def test_the_first_source_that_covers_the_clouds_is_taken(tmp_path, kept, expect
 
     assert plain(settings) == expected
     assert says in reason
+
+
+def test_poses_of_types_that_are_not_read_are_named(tmp_path):
+    entries = drive()
+    entries += [
+        ('/vicon', STAMPED, stamp_ns, message.transforms[0])
+        for topic, _, stamp_ns, message in entries
+        if topic == '/tf'
+    ]
+
+    _, reason = chosen(bag_of(tmp_path, CLOUD, '/tf_static', STAMPED, entries=entries))
+
+    assert reason.endswith(f'not read: /vicon ({STAMPED})')
+
+
+@pytest.mark.parametrize(
+    ('source', 'times', 'says'),
+    [
+        ('tf', (0.0, 0.1), 'points have times (timestamp), which deskew.enabled: true uses'),
+        ('tf', (0.0, 0.0), 'all points have one time'),
+        ('tf', (614.0, 614.1), 'field timestamp: times from 614.0 to 614.1'),
+        ('identity', (614.0, 614.1), ''),  # points at rest
+    ],
+)
+def test_times_that_cannot_be_used_are_not_recommended(source, times, says):
+    scan = Scan(
+        points=np.ones((2, 3)),
+        stamp_ns=START_NS,
+        frame_id='',
+        columns={'timestamp': np.array(times)},
+    )
+
+    reason = why_not_deskewed(Config.from_mapping({'pose.source': source}), [scan])
+
+    assert reason.startswith(says) if says else reason == ''
 
 
 def test_a_tree_with_another_root_is_taken_with_its_root(tmp_path):

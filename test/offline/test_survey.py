@@ -137,6 +137,40 @@ def test_the_fixed_frame_is_odom_or_map_or_the_root(tmp_path, parents, fixed):
     assert offer.covered == NUM_SCANS
 
 
+@pytest.mark.parametrize(('base', 'fixed'), [('lidar', 'odom'), ('base_link', 'odom_lidar')])
+def test_odometry_that_is_published_upside_down_is_used(tmp_path, base, fixed):
+    entries = [row for row in drive() if row[0] == '/points']
+    tree = drive(num_scans=0)
+    tree.clear()
+    if base != 'lidar':
+        tree.transform('/tf_static', START_NS, base, 'lidar', (0.0, 0.0, 1.0))
+    for k in range(NUM_SCANS):
+        stamp_ns = START_NS + k * PERIOD_NS
+        for child, x in ((fixed, -0.1 * k), ('wheel', 0.0)):
+            tree.transform('/tf', stamp_ns, base, child, (x, 0.0, 0.0))
+
+    _, (offer,) = surveyed(write_rosbag2(tmp_path / 'a', [*tree, *entries]))
+
+    assert (offer.settings['frames.fixed'], offer.covered) == (fixed, NUM_SCANS)
+
+
+def test_refused_poses_and_clouds_in_the_fixed_frame_are_named(tmp_path):
+    entries = [row for row in drive() if row[0] in ('/points', '/odom', '/tf_static')]
+    for topic, _, _, message in entries:
+        if topic == '/odom':
+            message.pose.pose.orientation.w = 0.0
+    _, made = surveyed(write_rosbag2(tmp_path / 'a', entries))
+    (offer,) = (offer for offer in made if offer.poses == '/odom')
+    assert 'pose of base_link in odom: quaternion [0.0, 0.0, 0.0, 0.0] has norm' in offer.missing
+
+    entries = [row for row in drive() if row[0] in ('/points', '/odom')]
+    for topic, _, _, message in entries:
+        if topic == '/points':
+            message.header.frame_id = 'odom'
+    _, (offer,) = surveyed(write_rosbag2(tmp_path / 'b', entries))
+    assert offer.missing == 'poses and clouds are in odom; --poses-from identity maps them'
+
+
 def test_damaged_messages_are_counted(tmp_path):
     entries = drive()
     entries[4][3].fields[0].name = 'x'

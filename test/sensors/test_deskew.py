@@ -92,7 +92,8 @@ def test_near_time_zero_the_reference_nearer_to_the_stamp_is_used():
 
 
 NAMES = ['t', 'time', 'timestamp', 'offset_time', 'time_stamp', 'timeStamp', 'times', 'ts']
-NAMES += ['t_offset', 'time_offset_ns', 'point_time_offset', 'relative_timestamp', 'when']
+NAMES += ['offset_ns', 't_offset']
+NAMES += ['time_offset_ns', 'point_time_offset', 'relative_timestamp', 'when']
 
 
 @pytest.mark.parametrize('name', NAMES)
