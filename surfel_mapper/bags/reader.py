@@ -99,7 +99,7 @@ class BagReader:
             self.is_ros1 = {*map(serialization, readable)} == {'ros1'}
             self.topics = Topics(self.path, self._indexed_topics(), self._cloud_types())
             if not any(topic.count for topic in self.topics):
-                raise BagError(f'{self.path}: a bag without messages')
+                raise BagError('; '.join([f'{self.path}: a bag without messages', *self.cuts]))
             self._decoder = cache(self._new_decoder)
             self._files = files.pop_all()
         for cut in self.cuts:

@@ -14,6 +14,7 @@ import struct
 from typing import TYPE_CHECKING
 
 from surfel_mapper.bags._rosbags import import_rosbags, open_indexed
+from surfel_mapper.bags.compression import ZSTD_MAGIC
 from surfel_mapper.bags.paths import is_ros1, unpacked_name
 from surfel_mapper.bags.streamed_mcap import StreamedMcap
 from surfel_mapper.errors import BagError
@@ -37,6 +38,8 @@ Advice for a damaged file. The sqlite3 of Debian 12 cannot recover. A dump of a 
 all rows if the upper pages of its tree are behind the cut.
 """
 
+BEGINNINGS = {'.mcap': b'\x89MCAP', '.db3': b'SQLite format 3', '.bag': b'#ROSBAG'}
+"""First bytes of each kind of file."""
 
 HEADER = struct.Struct('>H10xI')
 """Size and number of the pages of a database, at byte 16."""
@@ -91,8 +94,13 @@ def is_short(path: Path) -> bool:
 
 
 def advice(path: Path) -> str:
-    """Return the advice for a damaged file."""
-    return MEND[suffix(path)].format(path)
+    """Return the advice for a damaged file, or the first bytes of a file of another kind."""
+    kind = suffix(path)
+    with open(path, 'rb') as file:
+        head = file.read(16)
+    if head.startswith((BEGINNINGS[kind], ZSTD_MAGIC)):
+        return MEND[kind].format(path)
+    return f'it begins with {head!r}, expected {BEGINNINGS[kind]!r}; was it downloaded whole?'
 
 
 def damaged(path: Path, problem: str, error: Exception) -> BagError:

@@ -118,7 +118,10 @@ class Topics(list[Topic]):
         if len(offered) == 1:
             return offered[0]
         if offered:
-            raise BagError(f'{self.path}: several topics to choose from, name one; {offers}')
+            option = '--topic' if type_ in (CLOUD, IMAGE) else '--pose-topic'
+            raise BagError(
+                f'{self.path}: several topics to choose from, name one with {option}; {offers}'
+            )
         every = ', '.join(f'{topic.name} ({topic.type})' for topic in self)
         advice = '; '.join(converters(self)) if type_ == CLOUD else ''
         raise BagError(

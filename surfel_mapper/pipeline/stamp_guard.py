@@ -171,8 +171,9 @@ class StampGuard:
             is_repeated = stamp_ns == last_ns or stamp_ns in self._recent_ns[source]
             if is_repeated or not takes_late:
                 cause = 'stamp_repeated' if is_repeated else 'stamp_back'
-                behind_s = (last_ns - stamp_ns) / 1e9
-                return Order(cause, f'its stamp is {behind_s:.3f} s before the one before it')
+                behind = f'{(last_ns - stamp_ns) / 1e9:.3f} s before that of the last scan'
+                problem = 'that of an earlier scan' if is_repeated else behind
+                return Order(cause, f'its stamp is {problem}')
             self._recent_ns[source].append(stamp_ns)
             return Order()
         if last_ns is not None:

@@ -5,6 +5,7 @@
 import logging
 import os
 from pathlib import Path
+import re
 import shutil
 import sqlite3
 
@@ -268,7 +269,11 @@ def test_a_topic_is_chosen_by_name_else_default_else_as_the_only_one(tmp_path):
 @pytest.mark.parametrize(
     ('type_', 'name', 'says'),
     [
-        (ODOMETRY, None, 'several topics .* Odometry topics: /odom, /wheel_odom'),
+        (
+            ODOMETRY,
+            None,
+            'several topics .* name one with --pose-topic; Odometry topics: /odom, /wheel_odom',
+        ),
         (CLOUD, '/pionts', 'no topic /pionts; PointCloud2 topics: /points'),
         (CLOUD, '/odom', '/odom is of type nav_msgs/msg/Odometry, not PointCloud2; .*: /points'),
         (
@@ -309,7 +314,9 @@ def test_a_path_without_a_bag_is_refused(tmp_path):
 def test_a_file_of_something_else_is_refused(tmp_path, name, tool, content):
     (tmp_path / name).write_bytes(content)
 
-    with pytest.raises(BagError, match=f'{name}: cannot be read: .*; .*`{tool} '):
+    is_of_kind = content[:4] == {'mcap': b'\x89MCA', 'rosbag': b'#ROS'}.get(tool)
+    says = f'`{tool} ' if is_of_kind else f'begins with {re.escape(repr(content[:16]))}, expected'
+    with pytest.raises(BagError, match=f'{name}: cannot be read: .*; .*{says}'):
         BagReader(tmp_path / name)
 
 

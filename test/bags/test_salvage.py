@@ -213,6 +213,29 @@ def test_messages_in_the_journal_give_a_warning(tmp_path):
         assert 'drive.db3-wal: journal with messages that are not read' in reader.cuts[0]
 
 
+def test_a_bag_with_all_messages_in_its_journal_is_refused_with_the_remedy(tmp_path):
+    path = write_rosbag2(tmp_path / 'drive', drive(), 'sqlite3')
+    with sqlite3.connect(path / 'drive.db3') as database:
+        rows = database.execute('SELECT topic_id, timestamp, data FROM messages').fetchall()
+        database.execute('DELETE FROM messages')
+        database.commit()
+        database.execute('PRAGMA journal_mode=WAL')
+        insert = 'INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)'
+        database.execute('PRAGMA wal_autocheckpoint=0')
+        database.executemany(insert, rows)
+        database.commit()
+        shutil.copytree(path, tmp_path / 'killed')
+    file = tmp_path / 'killed' / 'drive.db3'
+
+    with pytest.raises(BagError, match=r'without messages; .*-wal: journal with .* not read'):
+        BagReader(file)
+
+    with sqlite3.connect(file) as database:  # the remedy
+        database.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+    with BagReader(file) as reader:
+        assert sum(1 for _ in reader.messages()) == len(rows)
+
+
 @pytest.mark.parametrize(('storage', 'keep'), [('mcap', 1.0), ('mcap', 0.9), ('sqlite3', 1.0)])
 def test_latched_topics_are_found_with_and_without_index(tmp_path, storage, keep):
     pose = StampedPose('base_link', 'lidar', START_NS, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))

@@ -202,6 +202,7 @@ def test_a_scan_far_before_the_last_of_its_frame_is_judged_by_those_before_that(
     assert after == Order()
     *_, late, repeated = orders(100.0, 100.2, 100.1, 100.0)
     assert (late.cause, repeated.cause) == ('', 'stamp_repeated')
+    assert repeated.reason == 'its stamp is that of an earlier scan'
 
 
 def test_a_late_scan_is_dropped_if_its_pose_comes_from_registration():
