@@ -224,8 +224,8 @@ def trajectory_lines(result: dict[str, Any]) -> list[str]:
     lines = [f'poses {result["num_poses"]}']
     if result['on_a_line']:
         lines.append(
-            'straight drive: its positions do not determine the rotation about it, on which the '
-            'absolute rotation errors depend'
+            'straight drive, or one whose errors exceed its width: its positions do not determine '
+            'the rotation about it, on which the absolute rotation errors depend'
         )
     for kind in ('absolute', 'relative'):
         moved, turned = result[kind]['translation_m'], result[kind]['rotation_deg']

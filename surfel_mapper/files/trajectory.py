@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+import logging
 from pathlib import Path
 import re
 from textwrap import shorten
@@ -37,8 +38,13 @@ from surfel_mapper.files.text_table import is_comment, read_lines, Rows, table_r
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw, quaternions
 from surfel_mapper.poses.buffer import seconds
 
+logger = logging.getLogger(__name__)
+
 SUFFIXES = ('.tum', '.txt', '.csv', '.kitti', '.g2o')
 """Endings of trajectories."""
+
+LEVEL = 0.9
+"""Cosine of the inclination of a vehicle that is level."""
 
 FORMATS = ('tum', 'kitti', 'csv', 'g2o')
 
@@ -64,9 +70,6 @@ STAMP_COLUMN = re.compile(r'(?:.*_)?(?:u?time|(?:time)?stamp|t)(?:_(sec|[mun]?s)
 
 PARTS = ('(.*_)?secs?', '(.*_)?(nsecs?|nanosec)')
 """Names of the columns of a stamp in two numbers."""
-
-MOST_COMMENTS = 100
-"""Number of lines in which a header is looked for."""
 
 MOST_NUMBER = 10**9
 """Limit of the number of a scan; larger ones before a matrix are times."""
@@ -292,10 +295,13 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
 
     """
     commented = read_lines(path, comments=True)
-    headers = [header_of(text) for text in commented.texts[:MOST_COMMENTS]]
+    texts = commented.texts
+    num_comments = next(
+        (row for row, text in enumerate(texts) if not is_comment(text)), len(texts)
+    )
+    headers = [header_of(text) for text in texts[: num_comments + 1]]
     header = next(filter(None, headers), None)
     first = headers.index(header) + 1 if header else 0
-    texts = commented.texts
     lines = commented.at([row for row in range(first, len(texts)) if not is_comment(texts[row])])
     if header is None and not lines.texts:
         raise FileFormatError(f'{path}: no poses in it, expected a line for each')
@@ -340,7 +346,20 @@ def tum_poses(lines: TextLines) -> Trajectory:
     width = len(lines.texts[0].split())
     rows = table_rows(lines, width if width == RTABMAP else TUM, meaning=': stamp x y z q')
     stamp_ns = column_ns(rows, 0, unit_of_column(rows, 0))
-    return stamped_poses(lines, stamp_ns, quaternion_rows(rows, slice(1, TUM)))
+    poses = quaternion_rows(rows, slice(1, TUM))
+    if len(poses) and looks_scalar_first(poses[:, 3:]):
+        logger.warning(
+            '%s: read as x y z w, it rolls over; read as w x y z, it stays level. If that is '
+            'meant, begin the file with # stamp x y z qw qx qy qz',
+            lines.path,
+        )
+    return stamped_poses(lines, stamp_ns, poses)
+
+
+def looks_scalar_first(quaternions: npt.NDArray[np.float64]) -> bool:
+    """Return whether z stays up if quaternions (R, 4) are w x y z, and is down if x y z w."""
+    q0, q1, q2, _ = np.square(quaternions.T)
+    return bool((1 - 2 * (q1 + q2) > LEVEL).all() and (1 - 2 * (q0 + q1) < -LEVEL).any())
 
 
 def unit_of_column(rows: Rows, column: int) -> str:

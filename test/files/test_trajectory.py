@@ -287,6 +287,28 @@ def test_invalid_trajectories_are_refused_with_their_line(tmp_path, text, format
         read_trajectory(text_file(tmp_path, text), format_)
 
 
+def test_a_header_counts_before_the_first_pose_only(tmp_path):
+    text = '0 1 2 3 0.6 0 0 0.8\n# t x y z qw qx qy qz\n1 1 2 3 0.6 0 0 0.8\n'
+    assert read_trajectory(text_file(tmp_path, text)).q_xyzw.tolist() == [[0.6, 0, 0, 0.8]] * 2
+
+
+def test_a_level_drive_with_w_first_gives_a_warning(tmp_path, caplog):
+    yaw = np.linspace(0.0, 3.0, 7)
+    level = np.column_stack([np.zeros((7, 3)), 0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
+    camera = np.tile([0.0, 0.0, 0.0, -0.5, 0.5, -0.5, 0.5], (7, 1))  # z ahead
+    turned = level[:, [0, 1, 2, 6, 5, 3, 4]]  # upside down
+    for poses in (level, camera, turned):
+        read_trajectory(text_file(tmp_path, rows(range(7), map(tuple, poses))))
+    assert not caplog.text
+
+    path = text_file(tmp_path, rows(range(7), map(wxyz, map(tuple, level))))
+    read_trajectory(path)
+    assert 'poses.txt: read as x y z w, it rolls over' in caplog.text
+    header = '# stamp x y z qw qx qy qz\n'
+    path.write_text(header + path.read_text())  # the remedy
+    np.testing.assert_allclose(read_trajectory(path).q_xyzw, level[:, 3:])
+
+
 def test_a_number_of_times_other_than_that_of_poses_is_refused(tmp_path):
     text_file(tmp_path, '0\n', 'times.txt')
 
