@@ -124,9 +124,11 @@ class Topics(list[Topic]):
             )
         every = ', '.join(f'{topic.name} ({topic.type})' for topic in self)
         advice = '; '.join(converters(self)) if type_ == CLOUD else ''
+        images = type_ == CLOUD and self.of_type(IMAGE)
         raise BagError(
             f'{self.path}: no topic of type {type_}; its topics: {every}'
             f'{f"; to convert: {advice}" if advice else ""}'
+            f'{"; images are read if they are depth as 16UC1 or 32FC1" if images else ""}'
         )
 
 

@@ -15,7 +15,7 @@ CONVERTERS = {
     r'rslidar\w*/msg/': 'rslidar_sdk with msg_source 2',
     r'CompressedPointCloud2$': '`ros2 run point_cloud_transport republish`',
     r'LaserScan$': 'laserscan_to_pointcloud_node of pointcloud_to_laserscan',
-    r'sensor_msgs/msg/PointCloud$': 'point_cloud_converter of pcl_ros',
+    r'sensor_msgs/msg/PointCloud$': 'convertPointCloudToPointCloud2 of sensor_msgs, in C++',
     r' as \w+$': 'the packages mcap-protobuf-support and mcap-ros2-support of Python',
 }
 """Programs that make PointCloud2 of messages, by a regular expression of the type."""

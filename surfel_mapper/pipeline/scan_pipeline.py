@@ -185,7 +185,8 @@ class ScanPipeline:
         elif len(scan) == 0:
             self.drops.scan(scan, 'no_points', 'it has no points')
         elif self.map.columns and (missing := self._missing_columns(scan)):
-            reason = f'its points have no {" and no ".join(missing)}'
+            present = ', '.join(scan.columns) or 'none'
+            reason = f'its points have no {" and no ".join(missing)} among {present}'
             self.drops.scan(scan, 'missing_column', reason)
         elif self.config.deskew.enabled or clocks.time_offset_s or clocks.time_offsets_s:
             self._add_timed(scan)

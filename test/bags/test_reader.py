@@ -132,6 +132,12 @@ def test_another_encoding_is_named_with_the_packages_that_convert_it(tmp_path):
         reader.topics.choose_cloud()
 
 
+def test_a_bag_of_images_alone_is_refused_with_the_encodings_that_are_read():
+    topics = Topics(Path('drive'), [Topic('/rgb/image', 'sensor_msgs/msg/Image', 9)])
+    with pytest.raises(BagError, match=r'/rgb/image .*; images are read if they are .* 16UC1 or'):
+        topics.choose_cloud()
+
+
 @pytest.mark.parametrize(
     ('type_', 'program'),
     [
@@ -143,6 +149,7 @@ def test_another_encoding_is_named_with_the_packages_that_convert_it(tmp_path):
         ('rslidar_msg/msg/RslidarPacket', 'rslidar_sdk'),
         ('livox_ros_driver2/msg/CustomMsg', 'xfer_format 0'),
         ('sensor_msgs/msg/LaserScan', 'pointcloud_to_laserscan'),
+        ('sensor_msgs/msg/PointCloud', 'convertPointCloudToPointCloud2'),
     ],
 )
 def test_messages_to_be_converted_are_named_with_the_program(type_, program):

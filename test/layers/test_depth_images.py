@@ -144,6 +144,13 @@ def test_map_with_colours_drops_depth_images_without():
     assert mapper.map.num_voxels == 0
 
 
+def test_dropped_scan_without_colours_states_its_columns(caplog):
+    mapper = mapper_with(**{'map.color': True})
+    scan = replace(scan_of(steps_mm(), has_image=False), camera=())
+    mapper.add_scan(replace(scan, columns={'reflectivity': np.ones(len(scan))}))
+    assert 'its points have no rgb among reflectivity' in caplog.text
+
+
 def test_map_with_colours_refuses_lidar_scans_that_a_camera_sees_in_part():
     mapper = mapper_with(**{'map.color': True})
     mapper.add_scan(replace(scan_of(steps_mm(), has_image=False), camera=()))
