@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.filters.grids import KEY_BITS, ScanVoxels
+from surfel_mapper.models.frames import means_and_scatters
 from surfel_mapper.models.growth import VoxelPoints
 from surfel_mapper.models.kernels.voxel_means import (
     average_voxels,
     finite_ends,
-    merge_parts,
     spread_labels,
     voxel_keys,
 )
@@ -68,11 +68,12 @@ class Thinned:
 
     def whole_voxels(self) -> Thinned:
         """Return the means of parts as a cloud by voxel."""
-        number, cubed = len(self.keys), self.parts**3
-        first, keys, means = np.empty(number + 1, np.int64), self.keys.copy(), self.means.copy()
-        num = merge_parts(self.keys, self.starts, self.means, cubed, first, keys, means)
-        rows = np.arange(number, dtype=np.int32)
-        return Thinned(means[:num], self.means, rows, first[: num + 1], keys[:num], self.bits)
+        keys = self.keys // self.parts**3
+        first = np.flatnonzero(np.diff(keys, prepend=-1))
+        starts, counts = np.append(first, len(keys)), np.diff(self.starts).astype(np.float64)
+        means = means_and_scatters(self.means, counts, starts)[1]
+        rows = np.arange(len(keys), dtype=np.int32)
+        return Thinned(means, self.means, rows, starts, keys[first], self.bits)
 
     def point_labels(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """Return labels of all points from those of the means; -1 if not finite."""

@@ -96,34 +96,6 @@ def average_voxels(points, ordered, to_key, rows, starts, keys, means):
     return number
 
 
-@kernel(error_model='numpy')
-def merge_parts(keys, starts, means, parts, first, whole_keys, whole_means):
-    """
-    Merge the parts of each voxel; return the number of voxels.
-
-    keys, starts, means  of the parts, Q rows; see average_voxels
-    parts                of a voxel
-    first                (Q + 1,) int64, out: first part of each voxel, and Q
-    whole_keys           (Q,) int64, out: keys of the voxels
-    whole_means          (Q, 3) float64, out: means of their points
-    """
-    number, end = -1, np.int64(0)
-    for q in range(len(keys)):
-        if q == 0 or keys[q] >= end:
-            number += 1
-            first[number], whole_keys[number] = q, keys[q] // parts
-            end = (whole_keys[number] + 1) * parts
-            whole_means[number, 0] = whole_means[number, 1] = whole_means[number, 2] = 0.0
-        for axis in range(3):
-            whole_means[number, axis] += (starts[q + 1] - starts[q]) * means[q, axis]
-    number += 1
-    first[number] = len(keys)
-    for voxel in range(number):
-        for axis in range(3):
-            whole_means[voxel, axis] /= starts[first[voxel + 1]] - starts[first[voxel]]
-    return number
-
-
 @kernel()
 def spread_labels(labels, starts, rows, of_points):
     """Write the label of each voxel to its points, (N,) int32; starts and rows: see above."""
