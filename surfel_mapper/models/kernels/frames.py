@@ -4,7 +4,7 @@
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel
+from surfel_mapper.kernels.compiling import inlined, kernel
 from surfel_mapper.kernels.symmetric3 import decompose_one, write_frame
 
 LEAST_WIDTH = 0.04
@@ -34,6 +34,35 @@ def eigen_frames(matrices, values, vectors):
         eigen_frame(matrices[k], values[k], vectors[k])
 
 
+@inlined(error_model='numpy')
+def add_point(points, i, origin, weight, sums):
+    """Add a point to moments (10,) about an origin: 1, x, y, z, xx, xy, xz, yy, yz, zz."""
+    x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+    u, v, w = weight * x, weight * y, weight * z
+    sums[0] += weight
+    sums[1] += u
+    sums[2] += v
+    sums[3] += w
+    sums[4] += u * x
+    sums[5] += u * y
+    sums[6] += u * z
+    sums[7] += v * y
+    sums[8] += v * z
+    sums[9] += w * z
+
+
+@inlined(error_model='numpy')
+def scatter_of(sums, divisor, scatter):
+    """Compute the scatter (3, 3) about the mean of moments (10,), by a divisor."""
+    k = 4
+    for a in range(3):
+        for b in range(a, 3):
+            moment = sums[k] - sums[1 + a] * sums[1 + b] / sums[0]
+            moment = max(moment, 0.0) if a == b else moment
+            scatter[a, b] = scatter[b, a] = moment / divisor
+            k += 1
+
+
 @kernel(error_model='numpy')
 def plane_of(sums, divisor, value, axes):
     """
@@ -43,13 +72,8 @@ def plane_of(sums, divisor, value, axes):
     divisor  of the sums of squared deviations: the number, or one less
     value    (3,), axes (3, 3) float64, out
     """
-    scatter, n, k = np.empty((3, 3)), sums[0], 4
-    for a in range(3):
-        for b in range(a, 3):
-            moment = sums[k] - sums[1 + a] * sums[1 + b] / n
-            moment = max(moment, 0.0) if a == b else moment
-            scatter[a, b] = scatter[b, a] = moment / divisor
-            k += 1
+    scatter = np.empty((3, 3))
+    scatter_of(sums, divisor, scatter)
     eigen_frame(scatter, value, axes)
 
 
@@ -65,39 +89,16 @@ def group_scatters(points, weights, starts, totals, means, scatters):
     means     (K, 3) float64, out: 0 without weight
     scatters  (K, 3, 3) float64, out: weighted sums of outer products of deviations
     """
+    sums = np.empty(10)
     for k in range(len(starts) - 1):
-        low = starts[k]
-        s = sx = sy = sz = 0.0
-        xx = xy = xz = yy = yz = zz = 0.0
-        for i in range(low, starts[k + 1]):
-            x, y, z = (
-                points[i, 0] - points[low, 0],
-                points[i, 1] - points[low, 1],
-                points[i, 2] - points[low, 2],
-            )
-            w = weights[i]
-            u, v, t = w * x, w * y, w * z
-            s += w
-            sx += u
-            sy += v
-            sz += t
-            xx += u * x
-            xy += u * y
-            xz += u * z
-            yy += v * y
-            yz += v * z
-            zz += t * z
-        totals[k], means[k], scatters[k] = s, 0.0, 0.0
-        if s > 0.0:
-            x, y, z = sx / s, sy / s, sz / s
-            means[k, 0], means[k, 1] = points[low, 0] + x, points[low, 1] + y
-            means[k, 2] = points[low, 2] + z
-            scatters[k, 0, 0] = max(xx - sx * x, 0.0)
-            scatters[k, 1, 1] = max(yy - sy * y, 0.0)
-            scatters[k, 2, 2] = max(zz - sz * z, 0.0)
-            scatters[k, 0, 1] = scatters[k, 1, 0] = xy - sx * y
-            scatters[k, 0, 2] = scatters[k, 2, 0] = xz - sx * z
-            scatters[k, 1, 2] = scatters[k, 2, 1] = yz - sy * z
+        sums[:] = 0.0
+        for i in range(starts[k], starts[k + 1]):
+            add_point(points, i, points[starts[k]], weights[i], sums)
+        totals[k], means[k], scatters[k] = sums[0], 0.0, 0.0
+        if sums[0] > 0.0:
+            for a in range(3):
+                means[k, a] = points[starts[k], a] + sums[1 + a] / sums[0]
+            scatter_of(sums, 1.0, scatters[k])
 
 
 @kernel(error_model='numpy')

@@ -20,7 +20,7 @@ import math
 import numpy as np
 
 from surfel_mapper.kernels.compiling import inlined, kernel
-from surfel_mapper.models.kernels.frames import LEAST_WIDTH, plane_of
+from surfel_mapper.models.kernels.frames import add_point, LEAST_WIDTH, plane_of
 
 SLOTS = 4
 """Candidates of a voxel, at most: three faces meet in a corner."""
@@ -52,22 +52,6 @@ def plane_distance(points, i, plane):
     )
 
 
-@inlined(error_model='numpy')
-def add_point(points, i, origin, sums):
-    """Add a point to moments (10,) about an origin: 1, x, y, z, xx, xy, xz, yy, yz, zz."""
-    x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-    sums[0] += 1.0
-    sums[1] += x
-    sums[2] += y
-    sums[3] += z
-    sums[4] += x * x
-    sums[5] += x * y
-    sums[6] += x * z
-    sums[7] += y * y
-    sums[8] += y * z
-    sums[9] += z * z
-
-
 @kernel(error_model='numpy')
 def describe_free(points, starts, owner, rules, count, flat, mean, normal):
     """
@@ -89,7 +73,7 @@ def describe_free(points, starts, owner, rules, count, flat, mean, normal):
         sums[:] = 0.0
         for i in range(starts[v], starts[v + 1]):
             if owner[i] == FREE:
-                add_point(points, i, points[starts[v]], sums)
+                add_point(points, i, points[starts[v]], 1.0, sums)
         plane_of(sums, sums[0], value, axes)
         flat[v] = 36.0 * value[0] < rules[1] and value[1] > LEAST_WIDTH * value[2]
         for j in range(3):
@@ -113,7 +97,7 @@ def fit_layers(points, starts, widths, rounds, planes):
             sums[:] = 0.0
             for i in range(start, starts[k + 1]):
                 if plane_distance(points, i, planes[k]) < width:
-                    add_point(points, i, points[start], sums)
+                    add_point(points, i, points[start], 1.0, sums)
             if sums[0] == 0.0:
                 break
             plane_of(sums, sums[0], value, axes)
@@ -327,7 +311,7 @@ def grow_facet(
         head += 1
         for i in range(starts[u], starts[u + 1]):
             if owner[i] == FREE and plane_distance(points, i, plane) < tolerance:
-                add_point(points, i, mean[seed], sums)
+                add_point(points, i, mean[seed], 1.0, sums)
         if adapts and sums[0] >= refit:
             refit = 2.0 * sums[0]
             plane_of(sums, sums[0], value, axes)
