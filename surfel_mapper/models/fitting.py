@@ -31,11 +31,17 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse, SPARSE_SHARE
 from surfel_mapper.models.coverage import covered
 from surfel_mapper.models.frames import eigen
-from surfel_mapper.models.growth import grow, Grown, grown, owner_table, VoxelPoints
+from surfel_mapper.models.growth import Charts, grow, Grown, grown, owner_table, VoxelPoints
 from surfel_mapper.models.kernels.frames import LEAST_WIDTH, member_moments, split_members
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.noise import estimate_noise, NoiseSamples
-from surfel_mapper.models.patches import fit_patches, PatchPoints
+from surfel_mapper.models.patches import (
+    described,
+    fit_patches,
+    PatchPoints,
+    rms_across,
+    SURFACE_PITCH_VOXELS,
+)
 from surfel_mapper.models.seams import with_smooth_seams
 from surfel_mapper.models.segmentation import (
     Clusters,
@@ -137,7 +143,9 @@ def fit_means(
     laps.append(clock())
     surfaces = merge_clusters(clusters, config, view) if config.kinds == 'all' else []
     laps.append(clock())
-    patches = fitted_patches(clusters, surfaces, config, view)
+    kept, groups = chart_points(clusters, surfaces, config, view)
+    fitted = zip(fit_patches(groups, config, view), kept, strict=True)
+    patches = [(patch, members) for patch, members in fitted if patch is not None]
     model, labels = assembled(clusters, patches, config)
     return replace(model, labels=thinned.point_labels(labels))
 
@@ -162,16 +170,16 @@ def fit_points(parts: Thinned, config: ModelsConfig, view: Array, laps: list[flo
     )
     surfaces = merge_clusters(clusters, close, view)
     laps.append(clock())
-    patches = fitted_patches(clusters, surfaces, config, view, whole=False)
+    kept, groups = chart_points(clusters, surfaces, config, view)
+    charts = charts_of(clusters, groups, config, view)
     laps.append(clock())
-    label, group = np.empty((2, len(thinned.means)), np.int32)
+    group = np.empty(len(thinned.means), np.int32)
     group[clusters.order] = np.repeat(np.arange(len(clusters)), clusters.num_points)
     of_cluster = np.full(len(clusters), -1, np.int32)
-    for k, (_, members) in enumerate(patches):
+    for k, members in enumerate(kept):
         of_cluster[members] = k
-    label[clusters.order] = np.repeat(of_cluster, clusters.num_points)
-    planes = [patch for patch, _ in patches]
-    growth = grow(voxels, thinned.means, label, group, planes, config, view)
+    label = of_cluster[group]
+    growth = grow(voxels, thinned.means, label, group, charts, config, view)
     weights = np.diff(parts.starts) if is_parted else 1
     is_free = np.sum(weights * (growth.owner < 0)) >= max(SPARSE_SHARE * len(parts.rows), 1.0)
     joined = grow_sparse(thinned, voxels, growth, config, view) if is_free else growth
@@ -343,32 +351,36 @@ def group_moments(points: Array, group: Indices, counts: Indices) -> tuple[Array
     return mean, covariance
 
 
-def fitted_patches(
-    clusters: Clusters,
-    surfaces: list[Indices],
-    config: ModelsConfig,
-    viewpoint: Array,
-    *,
-    whole: bool = True,
-) -> list[tuple[Plane, Indices]]:
-    """Return the patches that could be fitted, each with its clusters; see fit_patches."""
+def chart_points(
+    clusters: Clusters, surfaces: list[Indices], config: ModelsConfig, viewpoint: Array
+) -> tuple[list[Indices], PatchPoints]:
+    """Return the charts with enough points, as lists of their clusters, and their points."""
     least = 1 if is_paper(config) else config.min_surface_points
     counts = clusters.num_points
     kept = [members for members in surfaces if counts[members].sum() >= least]
-    if not kept:
-        return []
-    starts = np.concatenate([[0], np.cumsum([counts[members].sum() for members in kept])])
-    ranges = clusters.rows[np.concatenate(kept)]
-    points = np.concatenate([clusters.points[start:stop] for start, stop in ranges])
+    starts = np.cumsum([0, *(counts[members].sum() for members in kept)])
+    ranges = clusters.rows[np.concatenate([np.empty(0, np.int64), *kept])]
+    points = [clusters.points[start:stop] for start, stop in ranges]
     means = np.array([counts[m] @ clusters.mean[m] / counts[m].sum() for m in kept])
     groups = PatchPoints(
-        points=points,
+        points=np.concatenate([np.empty((0, 3)), *points]),
         starts=starts,
-        normals=np.array([mean_normal(clusters, members) for members in kept]),
-        thickness=thickness(means, config, viewpoint),
+        normals=np.array([mean_normal(clusters, members) for members in kept]).reshape(-1, 3),
+        thickness=thickness(means.reshape(-1, 3), config, viewpoint),
     )
-    patches = fit_patches(groups, config, viewpoint, whole=whole)
-    return [(p, members) for p, members in zip(patches, kept, strict=True) if p is not None]
+    return kept, groups
+
+
+def charts_of(
+    clusters: Clusters, groups: PatchPoints, config: ModelsConfig, viewpoint: Array
+) -> Charts:
+    """Return the charts of points for growth."""
+    rules = groups.thickness, SURFACE_PITCH_VOXELS * config.voxel_size_m, True, True
+    means, covariances, frames, curved = described(groups, viewpoint, rules)
+    normals, axes = frames[:, 2], clusters.frames[:, 2]
+    rms_m = rms_across(covariances, normals, np.diff(groups.starts))
+    offsets = -np.einsum('ij,ij->i', axes, clusters.mean)
+    return Charts(means, normals, rms_m, curved, np.column_stack([axes, offsets]))
 
 
 def assembled(

@@ -36,7 +36,6 @@ from surfel_mapper.models.kernels.growth import (
     SLOTS,
 )
 from surfel_mapper.models.kernels.voxel_points import neighbour_table, owner_means, sort_owners
-from surfel_mapper.models.multi_model import Plane, Surface
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -129,6 +128,30 @@ class VoxelPoints:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Charts:
+    """
+    Planes and curved surfaces of clusters, before growth.
+
+    Attributes
+    ----------
+    means, normals : (K, 3) float64, m
+    rms_m : (K,) float64
+        Root mean square distances of the points along the normals.
+    curved : (K,) bool
+        Whether a chart is a curved surface.
+    tangents : (C, 4) float64
+        Plane of each cluster, to which a curved chart is tangential there.
+
+    """
+
+    means: Array
+    normals: Array
+    rms_m: Array
+    curved: npt.NDArray[np.bool_]
+    tangents: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Grown:
     """
     Points by patch.
@@ -163,7 +186,7 @@ def grow(
     means: Array,
     label: Owners,
     group: Owners,
-    patches: list[Plane],
+    charts: Charts,
     config: ModelsConfig,
     view: Array,
 ) -> Grown:
@@ -177,10 +200,10 @@ def grow(
     means : (V, 3) float64, m
         Their means by voxel.
     label : (V,) int32
-        Index of the patch of each voxel, -1 for none.
+        Index of the chart of each voxel, -1 for none.
     group : (V,) int32
-        Group of each voxel, for points on no patch.
-    patches : list of Plane
+        Cluster of each voxel, the group of points on no patch.
+    charts : Charts
         Planes and surfaces.
     config : ModelsConfig
         Settings, with the noise.
@@ -189,12 +212,14 @@ def grow(
 
     """
     size_m, noise = config.voxel_size_m, (config.noise_m, config.noise_per_range_sq)
-    sigma = noise_across(patches, noise, view)
-    planes: Array = np.array([(*patch.normal, patch.offset_m) for patch in patches])
-    planes = planes.reshape(-1, 4)
+    sigma = noise_across(charts, noise, view)
+    offsets = -np.einsum('ij,ij->i', charts.normals, charts.means)
+    planes: Array = np.column_stack([charts.normals, offsets])
     if noise[1] >= LEAST_DISPARITY_NOISE:
-        planes = largest_layers((means, label), patches, planes, sigma, size_m)
-    tangent = tangents(means, label, patches, planes)
+        planes = largest_layers((means, label), charts, planes, sigma, size_m)
+    tangent = np.append(planes, np.zeros((1, 4)), axis=0)[label]  # label -1: the last
+    bends = np.flatnonzero(np.append(charts.curved, False)[label])
+    tangent[bends] = charts.tangents[group[bends]]
     tolerance = tolerances(voxels, label, tangent, sigma, size_m)
     if len(tolerance):
         median_m = float(np.median(tolerance))
@@ -206,7 +231,8 @@ def grow(
     owner = np.repeat(label, np.diff(voxels.starts))
     free = free_surfels(voxels, owner, size_m, median_m)
     extend_patches(voxels, label, (tangent, tolerance), free, owner)
-    num = len(patches) + len(add_facets(voxels, owner, len(patches), (size_m, facet_m), config))
+    num = len(planes)
+    num += len(add_facets(voxels, owner, num, (size_m, facet_m), config))
     table = owner_table(voxels, owner)
     index, normals, curved = join_patches(pieces_of(voxels, table, num), view, noise, size_m)
     groups = -1 - np.repeat(group, np.diff(voxels.starts))
@@ -346,10 +372,10 @@ def add_facets(
 
 
 def largest_layers(
-    voxels: tuple[Array, Owners], patches: list[Plane], planes: Array, sigma: Array, size_m: float
+    voxels: tuple[Array, Owners], charts: Charts, planes: Array, sigma: Array, size_m: float
 ) -> Array:
     """
-    Return the plane (K, 4) of each patch, that of its largest layer if it has several.
+    Return the plane (K, 4) of each chart, that of its largest layer if it has several.
 
     Books thinner than a voxel are in the clusters of their table. Voxels of smaller layers become
     free, in place.
@@ -357,31 +383,27 @@ def largest_layers(
     Parameters
     ----------
     voxels : (V, 3) float64, m, and (V,) int32
-        Means of the points by voxel, and indices of their patches.
-    patches, planes : list of Plane, (K, 4) float64
-        Patches, and their planes.
+        Means of the points by voxel, and indices of their charts.
+    charts, planes : Charts, (K, 4) float64
+        Charts, and their planes.
     sigma : (K,) float64, m
-        Noise across the patches.
+        Noise across the charts.
     size_m : float
         Edge of the voxels, m.
 
     """
     means, label = voxels
-    rms, thick = np.array([patch.rms_m for patch in patches]), SEPARATE_SIGMAS * sigma
-    thick = np.maximum(thick, SEPARATE_VOXELS * size_m)
-    may = [
-        3.0 * a > b and not isinstance(p, Surface)
-        for a, b, p in zip(rms, thick, patches, strict=True)
-    ]
+    thick = np.maximum(SEPARATE_SIGMAS * sigma, SEPARATE_VOXELS * size_m)
+    may = ~charts.curved & (3.0 * charts.rms_m > thick)
     rows = np.flatnonzero(np.append(may, False)[label])
     rows = rows[np.argsort(label[rows], kind='stable')]
     points, patch = means[rows], label[rows]
-    starts = np.searchsorted(patch, np.arange(len(patches) + 1))
+    starts = np.searchsorted(patch, np.arange(len(planes) + 1))
     plane = planes.copy()
-    fit_layers(points, starts, np.stack([2.0 * rms, thick]), SEPARATE_ROUNDS, plane)
+    fit_layers(points, starts, np.stack([2.0 * charts.rms_m, thick]), SEPARATE_ROUNDS, plane)
     away = np.abs(plane_heights(points, plane[patch])) / thick[patch]
     on, far = (
-        np.bincount(patch[mask], minlength=len(patches)) for mask in (away < 1.0, away > 2.0)
+        np.bincount(patch[mask], minlength=len(planes)) for mask in (away < 1.0, away > 2.0)
     )
     is_layered = (on >= LEAST_LAYER) & (2 * far > np.diff(starts) - on)
     label[rows[is_layered[patch] & (away >= 1.0)]] = FREE
@@ -394,25 +416,11 @@ def plane_heights(points: Array, planes: Array) -> Array:
     return heights
 
 
-def tangents(means: Array, label: Owners, patches: list[Plane], planes: Array) -> Array:
-    """Return the plane (V, 4) of the patch of each voxel, that of a surface tangential there."""
-    tangent: Array = np.append(planes, np.zeros((1, 4)), axis=0)[label]  # label -1: the last
-    for k, patch in enumerate(patches):
-        if isinstance(patch, Surface):
-            rows = np.flatnonzero(label == k)
-            xy = patch.to_local(means[rows])[:, :2]
-            normals = patch.normals(xy)
-            tangent[rows, :3] = normals
-            tangent[rows, 3] = -np.einsum('ij,ij->i', normals, patch.lifted(xy))
-    return tangent
-
-
-def noise_across(patches: list[Plane], noise: tuple[float, float], view: Array) -> Array:
-    """Return sigma (K,) across each patch, m, of noise n0 + n2 range^2 along the ray."""
-    rays = np.array([patch.mean for patch in patches]).reshape(-1, 3) - view
-    normals = np.array([patch.normal for patch in patches]).reshape(-1, 3)
+def noise_across(charts: Charts, noise: tuple[float, float], view: Array) -> Array:
+    """Return sigma (K,) across each chart, m, of noise n0 + n2 range^2 along the ray."""
+    rays = charts.means - view
     range_sq = np.maximum(np.einsum('ij,ij->i', rays, rays), 1e-24)
-    cosine = np.abs(np.einsum('ij,ij->i', rays, normals)) / np.sqrt(range_sq)
+    cosine = np.abs(np.einsum('ij,ij->i', rays, charts.normals)) / np.sqrt(range_sq)
     result: Array = (noise[0] + noise[1] * range_sq) * np.maximum(cosine, LEAST_COSINE)
     return result
 

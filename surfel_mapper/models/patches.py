@@ -68,14 +68,8 @@ class PatchPoints:
     curved: npt.NDArray[np.bool_] | None = None
 
 
-def fit_patches(
-    groups: PatchPoints, config: ModelsConfig, viewpoint: Array, *, whole: bool = True
-) -> list[Plane | None]:
-    """
-    Return a Plane or Surface for every group, in order; None for multi-valued ones.
-
-    Without `whole`, their grids have no boundary: such patches are fitted again.
-    """
+def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> list[Plane | None]:
+    """Return a Plane or Surface for every group, in order; None for multi-valued ones."""
     number, by_paper = len(groups.thickness), is_paper(config)
     a = config.voxel_size_m
     thickness, bent = groups.thickness, not by_paper
@@ -85,8 +79,8 @@ def fit_patches(
     means, covariances, frames, curved = described(groups, viewpoint, rules)
     plane_pitch = PAPER_PLANE_PITCH_VOXELS if by_paper else config.plane_pitch_voxels
     pitches = np.where(curved, SURFACE_PITCH_VOXELS, plane_pitch) * a
-    margin_m = MARGIN_VOXELS * a if whole else None
-    cells, local = cells_of(groups, (means, frames, pitches), margin_m, snapped=not by_paper)
+    placed = means, frames, pitches
+    cells, local = cells_of(groups, placed, MARGIN_VOXELS * a, snapped=not by_paper)
     splines = splines_of(cells, np.flatnonzero(curved), config)
     numbers, grids = np.diff(groups.starts), cells.grids()
     rms_m = rms_across(covariances, frames[:, 2], numbers)
