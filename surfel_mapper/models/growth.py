@@ -337,8 +337,7 @@ def extend_planes(
     extend_patches(voxels, label, (planes[label], tolerance), free, grown)
     rows = np.flatnonzero((owner < 0) & (grown >= 0))
     on = grown[rows]
-    away = np.einsum('ij,ij->i', voxels.points[rows], planes[on, :3]) + planes[on, 3]
-    near = np.abs(away) < tolerance[on]
+    near = np.abs(plane_heights(voxels.points[rows], planes[on])) < tolerance[on]
     owner[rows[near]] = on[near]
 
 
@@ -431,10 +430,10 @@ def tolerances(
     """Return the distance (K,) up to which a point lies on each patch, m; noise (K,) across it."""
     number = len(noise)
     rows: Indices = np.arange(0, len(voxels.points), 1 + len(voxels.points) // SAMPLES)
-    voxel = np.searchsorted(voxels.starts, rows, side='right') - 1
+    voxel = np.repeat(np.arange(len(label)), np.diff(voxels.starts))[rows]
     rows, voxel = (array[label[voxel] >= 0] for array in (rows, voxel))
     who, plane = label[voxel], tangent[voxel]
-    distance = np.abs(np.einsum('ij,ij->i', voxels.points[rows], plane[:, :3]) + plane[:, 3])
+    distance = np.abs(plane_heights(voxels.points[rows], plane))
     scale = 0.5 / max(float(distance.max(initial=0.0)), 1e-12)
     ordered = np.append(np.sort(who + scale * distance), number)  # by patch, then by distance
     starts = np.searchsorted(ordered, np.arange(number + 1))
