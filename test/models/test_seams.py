@@ -54,6 +54,13 @@ def seams(surfaces, labels, points, size_m):
     return np.concatenate(gaps), np.concatenate(angles)
 
 
+def distances(surface, points):
+    """Return the signed distances of points from a surface along its normals, m."""
+    local = surface.to_local(points)
+    height = local[:, 2] - surface.heights(local[:, :2])
+    return height * (surface.normals(local[:, :2]) @ surface.normal)
+
+
 @pytest.mark.parametrize(
     ('points', 'most_deg'), [(cylinder(0.3, NOISE_M), 3.0), (ball(0.3, NOISE_M), 6.0)]
 )
@@ -65,8 +72,9 @@ def test_surfaces_meet_within_the_noise(points, most_deg):
     assert np.median(gap_m) < 0.5 * NOISE_M
     assert np.quantile(gap_m, 0.9) < NOISE_M
     assert np.median(angle_deg) < most_deg
-    # heights: at slopes of 60 deg twice the distances
-    assert np.mean([surface.rms_m for surface in model.surfaces]) < 1.7 * NOISE_M
+    owned = [(surface, points[model.labels == surface.id]) for surface in model.surfaces]
+    away_m = np.concatenate([distances(surface, own) for surface, own in owned])
+    assert np.sqrt(np.mean(away_m**2)) == pytest.approx(NOISE_M, rel=0.1)
 
 
 def live_labels(models, points):
