@@ -41,6 +41,12 @@ Tolerance of facets in coarser voxels, at least, and most of that in the finest 
 share of the median range of the free points: at 50 m a road sags more than near patches.
 """
 
+COARSE_STEEPEST_DEG = 50.0
+"""
+Slope of a surface that is joined here, at most. A map has all sides of an object, and less steep
+surfaces continue each other better. Coarse voxels join the walls of a hall otherwise.
+"""
+
 SPARSE_SHARE = 0.05
 """Share of points on no patch from which voxels of other sizes help."""
 
@@ -116,7 +122,9 @@ def grow_coarse(
     if joins:
         pieces = pieces_of(coarse, owner_table(coarse, new_owner), len(normals))
         view = beyond(pieces, normals) if rules.view is None else rules.view
-        index, normals, bent = join_patches(pieces, view, rules.noise, rules.finest_m)
+        index, normals, bent = join_patches(
+            pieces, view, rules.noise, rules.finest_m, COARSE_STEEPEST_DEG
+        )
         # coarse voxels resolve less: a curved patch stays so, unless a larger plane takes it
         counts = np.bincount(new_owner[new_owner >= 0], minlength=len(curved))
         total = np.bincount(index, counts, len(normals))

@@ -55,10 +55,10 @@ A surface that turns or bends less is a plane: tables sag a little. Sigmas are t
 far walls seem to bend by steps of disparity.
 """
 
-STEEPEST_DEG, STEEPEST_CLOSED_DEG = 78.0, 66.0
+STEEPEST_DEG = 81.0
 """
 Slope of a joined surface, at most. A scan has one side of an object, of which a surface may have
-all. A map has all sides; less steep surfaces continue each other better.
+all. Wider ones are no height fields.
 """
 
 CURVED_GAIN = 30.0
@@ -145,7 +145,11 @@ class Regions:
 
 
 def join_patches(
-    pieces: Pieces, view: Array, noise: tuple[float, float], size_m: float
+    pieces: Pieces,
+    view: Array,
+    noise: tuple[float, float],
+    size_m: float,
+    steepest_deg: float = STEEPEST_DEG,
 ) -> tuple[npt.NDArray[np.int32], Array, npt.NDArray[np.bool_]]:
     """
     Join patches.
@@ -160,6 +164,8 @@ def join_patches(
         Sigma of the points is n0 + n2 range^2, m.
     size_m : float
         Edge of the voxels, m.
+    steepest_deg : float
+        Slope of a joined surface, at most.
 
     Returns
     -------
@@ -168,6 +174,7 @@ def join_patches(
 
     """
     single, touching = Comparison.of(pieces, view, noise, size_m), pieces.touching()
+    single = replace(single, steepest=math.cos(math.radians(steepest_deg)))
     root, layered = single.with_layers(touching)
     root = layered.joined(root, touching)
     index, normals, curved, is_worse = layered.described(root, size_m)
@@ -214,7 +221,7 @@ class Comparison:
     noise: Array
     sigma: Array
     floor: Array
-    steepest: float
+    steepest: float = 0.0
 
     @classmethod
     def of(
@@ -234,9 +241,8 @@ class Comparison:
         floor = np.clip(noise[1] * range_sq * cosine, *limits) ** 2
         extents = np.sqrt(3.0 * values[:, 2]) + size_m
         sigma = np.maximum(across, np.sqrt(np.maximum(values[:, 0], floor)))
-        steepest = math.cos(math.radians(STEEPEST_DEG if view.ndim == 1 else STEEPEST_CLOSED_DEG))
         moments = number, means, covariances, extents
-        return cls(pieces, *moments, normals, across, sigma, floor, steepest)
+        return cls(pieces, *moments, normals, across, sigma, floor)
 
     def with_layers(self, touching: Indices) -> tuple[Indices, Comparison]:
         """

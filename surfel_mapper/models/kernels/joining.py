@@ -22,9 +22,6 @@ POWERS = np.array([(a, d - a) for d in range(3) for a in range(d, -1, -1)])
 RIDGE = 1e-10
 """Added to the normal equations of coordinates in [-1, 1], for points in one line."""
 
-CHART_COSINE = math.cos(math.radians(70.0))
-"""Least cosine between the normal of a patch and the mean normal of the surface it joins."""
-
 COPLANAR_COSINE, COPLANAR_GROWTH = math.cos(math.radians(6.0)), 1.25
 """Coplanar patches differ by less, and their common plane fits worse by less."""
 
@@ -40,7 +37,7 @@ ROUNDS = 3
 MOST_STEEP = 0.05
 """Share of the points of a joined surface with a slope beyond the limit."""
 
-POINTS_PER_TERM = 1.5
+POINTS_PER_TERM = 2.0
 """A height field needs more points. Those are means by voxel: each is of many."""
 
 
@@ -265,7 +262,7 @@ def compare_regions(pairs, groups, pieces, regions, rules, columns, out):
             limit_sq = np.inf if region == small or extents[region] < limit else limit * limit
             for m in range(first[region], first[region + 1]):
                 patch = members[m]
-                if not is_single and dot(patch_normals[patch], normals[2]) < CHART_COSINE:
+                if not is_single and dot(patch_normals[patch], normals[2]) < steepest:
                     is_chart = False
                 if not is_chart:
                     break
@@ -287,13 +284,13 @@ def compare_regions(pairs, groups, pieces, regions, rules, columns, out):
         if min(middle, end - middle) < 3 and not is_single:
             continue
         least = max(floor[a], floor[b])
-        both = heights(columns, zero, end, normals[2], least, steepest)
+        both = heights(columns, zero, end, normals[2], (least, steepest, end))
         gain, out[r, 1], out[r, 2], out[r, 3] = both[1] - both[0], both[3], both[4], both[2]
         if not is_single:
             gain, rms_m = -both[0], max(noise[a], noise[b])
             for side in range(2):
                 low, high = (middle, end) if side else (zero, middle)
-                own = heights(columns, low, high, normals[side], least, steepest)
+                own = heights(columns, low, high, normals[side], (least, steepest, end))
                 gain, rms_m = gain + own[0], max(rms_m, own[2])
             if cosine > COPLANAR_COSINE and both[2] < COPLANAR_GROWTH * rms_m:
                 gain = max(gain, float(min(middle, end - middle)))
@@ -303,7 +300,7 @@ def compare_regions(pairs, groups, pieces, regions, rules, columns, out):
 
 
 @kernel(error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
-def heights(points, low, high, normal, floor, steepest):
+def heights(points, low, high, normal, rules):
     """
     Fit a plane and a quadric over a plane to columns low to high - 1 of points (4, n).
 
@@ -312,9 +309,11 @@ def heights(points, low, high, normal, floor, steepest):
 
     The Cholesky factor of the quadric contains the plane's, so one solution is enough for both.
     The turn is that of the normals of the quadric, for a strip of constant curvature the angle
-    between its ends. After the first round the quadric is that of a round surface.
+    between its ends. After the first round the quadric is that of a round surface. Rules are the
+    square of the residuals that are not resolved, the least cosine of the slope, and the number
+    of points of both regions: by the criterion a term costs the same in one field and in two.
     """
-    number = high - low
+    number, (floor, steepest, every) = high - low, rules
     local, powers = np.empty((4, number)), np.empty((5, number))
     sums, right, plane = np.empty((5, 5)), np.empty((3, 3)), np.empty(PLANE)
     terms, matrix = np.empty(QUADRIC), np.empty((QUADRIC, QUADRIC))
@@ -338,9 +337,9 @@ def heights(points, low, high, normal, floor, steepest):
             turn, steep = round_heights(local, raw, terms, steepest)
     plane_sq = max(plane_sq, 0.0) * scale * scale
     quadric_sq = max(quadric_sq, 0.0) * scale * scale
-    best = plane = number * math.log(plane_sq + floor) + PLANE * math.log(number)
+    best = plane = number * math.log(plane_sq + floor) + PLANE * math.log(every)
     if number > POINTS_PER_TERM * QUADRIC:
-        best = min(best, number * math.log(quadric_sq + floor) + QUADRIC * math.log(number))
+        best = min(best, number * math.log(quadric_sq + floor) + QUADRIC * math.log(every))
     bend = math.sqrt(12.0 * max(plane_sq - quadric_sq, 0.0))
     return best, plane, math.sqrt(plane_sq + floor), turn, bend, steep
 

@@ -83,3 +83,17 @@ def test_a_rough_patch_that_bends_more_than_the_noise_is_curved():
     given = pieces(np.column_stack([xy, dome]), np.zeros(len(xy), np.int32))
     for noise_m, is_curved in ((0.01, True), (0.2, False)):
         assert join_patches(given, VIEW, (noise_m, 0.0), SIZE_M)[2].tolist() == [is_curved]
+
+
+@pytest.mark.parametrize('radius_m', [0.15, 0.2, 0.25])
+def test_strips_of_the_visible_side_of_a_small_cylinder_are_joined(radius_m):
+    rng = np.random.default_rng(8)
+    strip = np.repeat(np.arange(5, dtype=np.int32), 400)
+    angle = np.radians(32.0 * (strip + rng.uniform(0.0, 1.0, 2000)) - 80.0)
+    radius = radius_m + 0.003 * rng.standard_normal(2000)
+    along = rng.uniform(0.0, 3.0 * SIZE_M, 2000)
+    points = np.column_stack([radius * np.sin(angle), along, radius * np.cos(angle)])
+    above = np.array([0.0, 0.0, 6.0])
+    index, _, curved = join_patches(pieces(points, strip), above, (0.003, 0.0), SIZE_M)
+    assert index.tolist() == [0, 0, 0, 0, 0]
+    assert curved.tolist() == [True]
