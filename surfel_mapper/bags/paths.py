@@ -37,8 +37,8 @@ def readable() -> str:
 
     return (
         f'a bag: a directory with {METADATA} or files ending in .mcap or .db3 (perhaps .zstd), or '
-        f'a .bag of ROS 1; or scans: files ending in {", ".join(SUFFIXES)}, a folder of them, or '
-        'an Ouster .pcap'
+        f'a .bag of ROS 1; or scans: files ending in {", ".join(SUFFIXES)}, a folder of them, an '
+        'Ouster .pcap, or depth images in the layout of TUM RGB-D, 7-Scenes, Replica or ScanNet'
     )
 
 

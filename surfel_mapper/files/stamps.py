@@ -34,7 +34,7 @@ def nanoseconds(text: str, where: str, unit: str = '') -> int:
     try:
         number = Decimal(text.strip())
     except InvalidOperation as error:
-        raise FileFormatError(f'{where}: {text!r} is no time') from error
+        raise FileFormatError(f'{where}: {text!r} is no time, expected a number') from error
     if unit and unit not in UNITS_NS:
         raise FileFormatError(f'{where}: unit {unit!r}, expected one of {", ".join(UNITS_NS)}')
     most = MOST if unit else MOST_SECONDS

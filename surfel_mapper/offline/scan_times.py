@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import os
 from pathlib import Path
+import re
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,7 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.scan_files import SUFFIXES
 from surfel_mapper.files.stamps import column_ns, nanoseconds, read_dates
 from surfel_mapper.files.text_table import read_lines, table_rows
-from surfel_mapper.files.trajectory import KITTI_TIMES
+from surfel_mapper.files.trajectory import KITTI_TIMES, unit_of_column
 
 TIME_FILES = (KITTI_TIMES, 'timestamps.txt')
 """Names of files with the times of scans, as in KITTI odometry and raw."""
@@ -60,12 +61,12 @@ def unit_of(text: str) -> str:
 
 
 def stem(file: Path) -> str:
-    """Return the name of a file without its endings of scans."""
+    """Return the name of a file without its endings of scans, SECONDS_NANOSECONDS with a point."""
     text = file.name
     for suffix in ('.bin', *SUFFIXES):
         if text.lower().endswith(suffix):
             text = text[: -len(suffix)]
-    return text
+    return re.sub(r'^(\d{10})[_-](\d{9})$', r'\1.\2', text)
 
 
 def times_beside(folder: Path, files: Sequence[Path]) -> tuple[list[int], Path] | None:
@@ -113,7 +114,7 @@ def read_stamps(path: Path) -> npt.NDArray[np.int64]:
     if len(lines.texts[0].split()) == 2:
         return read_dates(path)
     rows = table_rows(lines, 1, meaning=': a time')
-    return column_ns(rows, 0, unit_of(lines.texts[0].strip()))
+    return column_ns(rows, 0, unit_of_column(rows, 0))
 
 
 def is_gapless(files: Sequence[Path]) -> bool:

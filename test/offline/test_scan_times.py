@@ -56,6 +56,7 @@ def test_times_in_names_are_those_of_the_scans_also_at_poses_without_times(tmp_p
     [
         ('times.txt', [f'{ns / 1e9:.6e}' for ns in AFTER_NS], AFTER_NS),
         ('times.txt', NANOSECONDS, TIMES_NS),
+        ('times.txt', [f'{ns:.18e}' for ns in TIMES_NS], [*map(int, map(float, TIMES_NS))]),
         ('timestamps.txt', DATES, TIMES_NS),
         ('timestamps.txt', ['# of the lidar', '', *MILLISECONDS], TIMES_NS),
     ],
@@ -103,6 +104,7 @@ def test_a_part_is_that_of_the_times(tmp_path):
         (['1532402927.25', '1532402927.50'], [1532402927250000000, 1532402927500000000]),
         (['1532402927.25000000'], [1532402927250000000]),  # as many characters as ns have digits
         (['9.95', '9.9', '10.0', '9.855'], [9855000000, 9900000000, 9950000000, 10000000000]),
+        (['1532402927_000000025', '1532402927-250000000'], [1532402927000000025, TIMES_NS[0]]),
         (['1532402927', '1532402928'], [1532402927000000000, 1532402928000000000]),
         (['0000000000', '0000000001'], []),
         (['000000', '000001'], []),
@@ -220,7 +222,7 @@ def test_poses_of_other_times_are_interpolated_at_those_of_a_file(tmp_path, numb
         (SECONDS[:5], 'times.txt: 5 times for 6 scans in .*scans, expected as many, or scans n'),
         ([*SECONDS, '1532402930'], 'times.txt: 7 times for 6 scans in .*, 0 to 6; rename it to'),
         (SECONDS[::-1], 'times.txt: row 2: time 1532402928250000000 ns is not after that of the'),
-        ([*SECONDS[:5], 'noon'], "times.txt:6: 'noon' is no time"),
+        ([*SECONDS[:5], 'noon'], "times.txt:6: 'noon' is no time, expected a number"),
         ([*SECONDS[:5], '1 2'], 'times.txt:6: 2 columns, expected 1: a time'),
         ([*DATES[:5], '2018-07-24 25:28:49.0'], 'times.txt:6: .* is no time'),
         (['1 2 3'], 'times.txt:1: 3 columns, expected 1'),
