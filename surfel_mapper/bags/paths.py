@@ -24,7 +24,9 @@ from surfel_mapper.files.atomic import by_number
 
 STORAGE_SUFFIXES = ('.mcap', '.db3')
 PACKED_SUFFIXES = ('.zstd', '.zst')
-STORAGE_MAGICS = (b'SQLite format 3', b'\x89MCAP')
+BEGINNINGS = {'.mcap': b'\x89MCAP', '.db3': b'SQLite format 3', '.bag': b'#ROSBAG'}
+"""First bytes of each kind of file."""
+
 ROS1_SUFFIXES = ('.bag', '.bag.active')
 METADATA = 'metadata.yaml'
 
@@ -79,7 +81,7 @@ def is_packed(path: Path) -> bool:
     """Return whether a file is compressed as a whole: by its first bytes, then by its name."""
     with open(path, 'rb') as file:
         head = file.read(16)
-    is_named = path.suffix in PACKED_SUFFIXES and not head.startswith(STORAGE_MAGICS)
+    is_named = path.suffix in PACKED_SUFFIXES and not head.startswith((*BEGINNINGS.values(),))
     return is_named or head.startswith(ZSTD_MAGIC)
 
 

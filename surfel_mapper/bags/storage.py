@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from surfel_mapper.bags._rosbags import import_rosbags, open_indexed
 from surfel_mapper.bags.compression import ZSTD_MAGIC
-from surfel_mapper.bags.paths import is_ros1, unpacked_name
+from surfel_mapper.bags.paths import BEGINNINGS, is_ros1, unpacked_name
 from surfel_mapper.bags.streamed_mcap import StreamedMcap
 from surfel_mapper.errors import BagError
 
@@ -38,8 +38,6 @@ Advice for a damaged file. The sqlite3 of Debian 12 cannot recover. A dump of a 
 all rows if the upper pages of its tree are behind the cut.
 """
 
-BEGINNINGS = {'.mcap': b'\x89MCAP', '.db3': b'SQLite format 3', '.bag': b'#ROSBAG'}
-"""First bytes of each kind of file."""
 
 HEADER = struct.Struct('>H10xI')
 """Size and number of the pages of a database, at byte 16."""

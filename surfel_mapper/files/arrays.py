@@ -89,15 +89,14 @@ def columns_of_arrays(path: str | Path, arrays: Mapping[str, npt.NDArray[Any]]) 
         shaped = {
             name: len(array)
             for name, array in arrays.items()
-            if array.ndim == 2 and 3 <= array.shape[1] <= MAX_COLUMNS and name not in TRIPLES
+            if (array.ndim == 2 or (array.ndim == 3 and name in NAMES)) and name not in TRIPLES
+            if 3 <= array.shape[-1] <= MAX_COLUMNS
         }
         longest = [name for name in shaped if shaped[name] == max(shaped.values())]
         named = [name for name in NAMES if name in shaped] or longest
         if not named or (len(named) > 1 and named == longest):
             shapes = ', '.join(f'{name} {array.shape}' for name, array in arrays.items())
-            raise FileFormatError(
-                f'{path}: arrays {shapes}, expected one of points (N, 3), or its name points'
-            )
+            raise FileFormatError(f'{path}: arrays {shapes}, expected one of (N, 3) named points')
         columns = columns_of(path, arrays[named[0]])
     number = len(columns['x'])
     for name, array in arrays.items():

@@ -133,9 +133,8 @@ def read_scan(path: str | Path, layout: RawLayout | None = None) -> Points:
 
 def scan_of(path: Path, columns: Columns) -> Points:
     """Return the points and the other columns of a file, named as elsewhere."""
-    for axis in 'xyz':
-        if axis not in columns and axis.upper() in columns:
-            columns[axis] = columns.pop(axis.upper())
+    upper = [name for name in 'XYZ' if name in columns and name.lower() not in columns]
+    columns |= {name.lower(): columns.pop(name) for name in upper}
     columns = {n: v.astype(np.float32) if v.dtype == np.float16 else v for n, v in columns.items()}
     missing = [name for name in 'xyz' if name not in columns]
     if missing:

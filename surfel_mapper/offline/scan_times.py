@@ -55,9 +55,8 @@ def name_ns(file: Path) -> int:
 
 def unit_of(text: str) -> str:
     """Return the unit of a whole number that is a time; empty for others."""
-    if not text.isdecimal() or (len(text) == 10 and text[0] == '0'):  # KITTI raw: 0000000123
-        return ''
-    return UNITS.get(len(text), '')
+    is_index = not text.isdecimal() or (len(text) == 10 and text[0] == '0')  # KITTI raw
+    return '' if is_index else UNITS.get(len(text), '')
 
 
 def stem(file: Path) -> str:

@@ -181,6 +181,8 @@ def test_archives_of_numpy_are_read(tmp_path, save):
         tmp_path / 'd.npz', K=np.eye(3), boxes=np.ones((4, 7)), lidar=POINTS, flow=np.zeros((9, 3))
     )
     check(tmp_path / 'd.npz')
+    save(tmp_path / 'grid.npz', pose=np.eye(4), xyz=POINTS.reshape(5, 10, 3))
+    check(tmp_path / 'grid.npz')
     save(tmp_path / 'e.npz', normal=normals, points=POINTS, grid=np.zeros((2 * N, 3)))
     check(tmp_path / 'e.npz')
 
@@ -205,7 +207,7 @@ def test_halves_and_capitals_are_read(tmp_path):
         (
             'a.npz',
             lambda path: np.savez(path, a=POINTS, b=POINTS),
-            r'arrays a \(50, 3\), b \(50, 3\), expected one of points',
+            r'arrays a \(50, 3\), b \(50, 3\), expected one of \(N, 3\) named points',
         ),
         ('a.npz', lambda path: path.write_bytes(b'PK'), 'a.npz'),
         ('a.npz', lambda path: SurfelMap(0.5).save(path), 'a map, expected points'),
