@@ -393,14 +393,14 @@ def separator_of(line: str) -> str | None:
 
 
 def header_of(line: str) -> PoseColumns | None:
-    """Return the columns of a stamp and a pose that a line names; None if one is missing."""
+    """Return the columns of a stamp and a pose that a line names once each, else None."""
     cells = [column_name(cell) for cell in line.lstrip('#%/ ').split(separator_of(line))]
 
     def named(pattern: str | re.Pattern[str]) -> list[int]:
         return [at for at, (name, _) in enumerate(cells) if re.fullmatch(pattern, name)]
 
     pose, halves, stamps = [*map(named, POSE_COLUMNS)], [*map(named, PARTS)], named(STAMP_COLUMN)
-    if not all(pose) or not (stamps or all(halves)):
+    if any(len(columns) != 1 for columns in pose) or not (stamps or all(halves)):
         return None
     columns = [numbers[0] for numbers in pose]
     if all(halves):
@@ -425,7 +425,7 @@ def unnamed_poses(lines: TextLines) -> Trajectory:
     names = ', '.join(map(str.strip, lines.texts[0].split(separator_of(lines.texts[0]))))
     raise FileFormatError(
         f'{lines.where(0)}: columns {shorten(names, MOST_SHOWN, placeholder=" ...")}; expected a '
-        'header with stamp_s or stamp_ns (or sec, nsec), x, y, z, qx, qy, qz, qw'
+        'header with stamp_s or stamp_ns (or sec, nsec), and one each of x, y, z, qx, qy, qz, qw'
     )
 
 

@@ -107,6 +107,8 @@ def test_csv_columns_are_found_by_name_and_stamps_by_unit(tmp_path, text):
 
 
 STAMPS = [1_403_636_580_838_555_648, 1_403_636_580_938_555_648]
+POSE = ('px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw')
+TWICE = ','.join(f'{who}_{name}' for who in ('est', 'gt') for name in POSE)
 QUATERNIONS = [(0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (1.5, 2.0, -1.0, 0.0, 0.0, 0.6, 0.8)]
 MATRICES = ['1 0 0 0.5 0 1 0 0 0 0 1 0', '0.28 -0.96 0 1.5 0.96 0.28 0 2 0 0 1 -1']
 
@@ -275,6 +277,7 @@ def test_poses_of_programs_and_data_sets_are_read_by_their_first_line(
         ('2 0 0 0 0 1 0 0 0 0 1 0', None, ':1: .* no rotation'),
         ('0.998 0 0 0 0 1 0 0 0 0 1 0', None, ':1: .* no rotation'),
         ('stamp,x,y,z\n0,0,0,0', None, ':1: columns stamp, x, y, z; expected a header'),
+        (f't,{TWICE}\n0,{"0," * 13}1', None, 'one each of x, y, z, qx, qy, qz, qw'),
         ('0,1,2,3,0,0,0,1', None, ':1: columns 0, 1, 2, 3, 0, 0, 0, 1; expected a header'),
         (f'[{"1, " * 200}]', None, r':1: columns \[1, (1, )+1? ?\.\.\.; expected a header'),
         ('stamp_s,x,y,z,qx,qy,qz,qw\n1,2', None, ':2: 2 columns, expected 8'),
