@@ -258,10 +258,9 @@ def owner_models(
 ) -> MultiModel:
     """Return patches, and Gaussians of groups of the points that have none."""
     number = len(patches)
-    order = [k for k, p in enumerate(patches) if p is not None and not isinstance(p, Surface)]
-    num_planes = len(order)
-    order += [k for k, patch in enumerate(patches) if isinstance(patch, Surface)]
-    kept = [replace(patch, id=i) for i, k in enumerate(order) if (patch := patches[k]) is not None]
+    order = [k for _, k in sorted((p.id, k) for k, p in enumerate(patches) if p is not None)]
+    kept = [patch for k in order if (patch := patches[k]) is not None]
+    num_planes = sum(not isinstance(patch, Surface) for patch in kept)
     starts = np.searchsorted(growth.owners, np.arange(number + 1))
     surfaces = with_smooth_seams(
         [patch for patch in kept if isinstance(patch, Surface)],
@@ -386,21 +385,18 @@ def charts_of(
 def assembled(
     clusters: Clusters, patches: list[tuple[Plane, Indices]], config: ModelsConfig
 ) -> tuple[MultiModel, npt.NDArray[np.int32]]:
-    """Return the model, with ids from 0, and the labels (M,) of the thinned points."""
-    planes = [patch for patch in patches if not isinstance(patch[0], Surface)]
-    surfaces = [patch for patch in patches if isinstance(patch[0], Surface)]
+    """Return the model and the labels (M,) of the thinned points."""
     of_cluster = np.full(len(clusters), -1, np.int64)
-    numbered: list[Plane] = []
-    for number, (patch, members) in enumerate([*planes, *surfaces]):
-        of_cluster[members] = number
-        numbered.append(replace(patch, id=number))
+    for patch, members in patches:
+        of_cluster[members] = patch.id
+    kept = sorted((patch for patch, _ in patches), key=lambda patch: patch.id)
     free = np.flatnonzero(of_cluster < 0)
-    of_cluster[free] = len(numbered) + np.arange(len(free))
+    of_cluster[free] = len(kept) + np.arange(len(free))
     labels = np.empty(len(clusters.points), np.int32)
     labels[clusters.order] = np.repeat(of_cluster, clusters.num_points)
     model = MultiModel(
-        planes=numbered[: len(planes)],
-        surfaces=[patch for patch in numbered if isinstance(patch, Surface)],
+        planes=[patch for patch in kept if not isinstance(patch, Surface)],
+        surfaces=[patch for patch in kept if isinstance(patch, Surface)],
         gaussians=Gaussians(
             id=of_cluster[free],
             num_points=clusters.num_points[free],

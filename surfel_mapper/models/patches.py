@@ -69,7 +69,11 @@ class PatchPoints:
 
 
 def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> list[Plane | None]:
-    """Return a Plane or Surface for every group, in order; None for multi-valued ones."""
+    """
+    Return a Plane or Surface for every group, in order; None for multi-valued ones.
+
+    Their ids are 0, 1, 2, ..., first those of the planes.
+    """
     number, by_paper = len(groups.thickness), is_paper(config)
     a = config.voxel_size_m
     thickness, bent = groups.thickness, not by_paper
@@ -85,9 +89,10 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     numbers, grids = np.diff(groups.starts), cells.grids()
     rms_m = rms_across(covariances, frames[:, 2], numbers)
     patches: list[Plane | None] = []
-    for k in range(number):
+    next_ids = [0, number - np.count_nonzero(curved)]
+    for k, kind in enumerate(curved.astype(np.int64).tolist()):
         plane = Plane(
-            id=k,
+            id=next_ids[kind],
             num_points=int(numbers[k]),
             mean=means[k],
             covariance=covariances[k],
@@ -97,7 +102,8 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
         )
         far_m = max(FAR_VOXELS * a, FAR_THICKNESS * float(groups.thickness[k]))
         points = local[groups.starts[k] : groups.starts[k + 1]]
-        patches.append(surface_of(plane, splines[k], points, far_m) if curved[k] else plane)
+        patches.append(surface_of(plane, splines[k], points, far_m) if kind else plane)
+        next_ids[kind] += patches[-1] is not None
     return patches
 
 
