@@ -3,7 +3,7 @@
 """
 Residuals of quadrics and quartics over the points of cubes.
 
-A cube has at most 64 points. In numpy, batches of so small matrices took three times as long.
+A cube has at most 64 points. In numpy, batches of such small matrices take three times as long.
 """
 
 import math
