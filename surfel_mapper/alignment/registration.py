@@ -129,6 +129,8 @@ class RegistrationResult:
         0 if there is none, or if the first start fitted and no search was needed.
     is_found : bool
         The place was found by a search and differs from that of the first start.
+    expected : RegistrationResult, optional
+        The place aligned from the first start, if a search found another.
     seen_through : float
         Share of the surfaces of the map in view that the scan sees through, in [0, 1]; nan if the
         pose is near the first start and no search was needed.
@@ -150,6 +152,7 @@ class RegistrationResult:
     radius_m: float
     rival: float = 0.0
     is_found: bool = False
+    expected: RegistrationResult | None = None
     seen_through: float = math.nan
     level: int = 0
     companions: float = 0.0
@@ -248,7 +251,9 @@ class Registration:
         ]
         results = self._at_one_level([result, *searched], cells, levels)
         chosen = self._chosen(results, starts, is_lost)
-        return replace(chosen, is_found=not self._is_near(chosen, result.T_map_sensor))
+        if self._is_near(chosen, result.T_map_sensor):
+            return chosen
+        return replace(chosen, is_found=True, expected=results[0])
 
     def determined(
         self,

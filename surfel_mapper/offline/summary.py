@@ -25,6 +25,7 @@ DOUBTFUL = {
     'surrounded': (5, 'most surfaces seem to move with the sensor'),
     'ambiguous': (5, 'two places fit about equally well'),
     'degenerate': (3, 'surfaces do not determine every direction of motion'),
+    'jumped': (1, 'a place far from the expected one was taken without being certain'),
     'rejoined': (1, 'only their separate map as a whole had a certain place'),
 }
 """States that put poses in doubt: the least number of scans, as right maps of halls and streets

@@ -154,6 +154,8 @@ class MapPart:
         Why its first scan was not mapped.
     follows_part : bool
         The scans before it were those of another part.
+    is_far : bool
+        Its first scan was refused because its place is far from the guess, which fits as well.
 
     """
 
@@ -174,7 +176,7 @@ class MapPart:
         self._T_map_part: Transform | None = None
         self._num_agreeing = 0
         self._refusal = ''
-        self.follows_part = False
+        self.follows_part = self.is_far = False
         self.scans: list[WaitingScan] = []
         self.tracker = Tracker(registration, np.eye(4))
 

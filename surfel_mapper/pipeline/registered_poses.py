@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from surfel_mapper.alignment.companions import LEAST_SHARE
 from surfel_mapper.alignment.place_search import PlaceSearch
-from surfel_mapper.alignment.registration import Registration, RegistrationResult
+from surfel_mapper.alignment.registration import is_near, Registration, RegistrationResult
 from surfel_mapper.alignment.surfel_planes import means
 from surfel_mapper.alignment.tracking import MORE_SEEN_THROUGH, Tracker
 from surfel_mapper.config import Config
@@ -43,9 +43,9 @@ from surfel_mapper.scan import PointTimes, Scan
 MOST_PARTS = 20
 """Number of parts whose maps are kept; of more, the oldest are forgotten."""
 
-STATES = ('lost', 'unconfirmed', 'ambiguous', 'degenerate', 'surrounded', 'rejoined')
-"""States of tracking; surrounded: most of a scan seems to move along, its pose may be wrong;
-rejoined: its part was matched to the map at the end of the input."""
+STATES = ('lost', 'unconfirmed', 'ambiguous', 'degenerate', 'jumped', 'surrounded', 'rejoined')
+"""States of tracking; jumped: far from the prediction, and uncertain; surrounded: most of a scan
+seems to move along; rejoined: its part was matched to the map at the end of the input."""
 
 UNKNOWN_START = 'its initial pose is unknown, and searched for in the map'
 
@@ -346,6 +346,7 @@ class RegisteredPoses:
                 self._tracker.max_seen_through(surfel_map, T_map_fixed),
             )
             map_part = self._begin_part(sighting, T_map_middle, twist, limits, str(error))
+            map_part.is_far = self._tracker.is_far
             if self._tracker.doubtful is not None:
                 map_part.set_place(self._tracker.doubtful, np.eye(4))
             return []
@@ -391,7 +392,10 @@ class RegisteredPoses:
         T_fixed_part = compose(inverse(T_map_fixed), T_map_part)
         T_fixed_middle = compose(T_fixed_part, T_part_middle)
         twist = map_part.tracker.twist
-        self._tracker.resume(T_fixed_middle, sighting.stamp_ns, twist, sighting.cells)
+        has_jumped = map_part.is_far and not is_near(
+            T_map_part, map_part.guess, self._config.registration.max_deviation_m
+        )
+        self._tracker.resume(T_fixed_middle, sighting.stamp_ns, twist, sighting.cells, has_jumped)
         return self._joined(map_part, T_fixed_part, result)
 
     def _joined(
@@ -504,6 +508,7 @@ class RegisteredPoses:
         elif placed and placed[-1].registration is not None:
             result = placed[-1].registration
             states += ['degenerate'] if len(result.degenerate) else []
+            states += ['jumped'] if self._tracker.has_jumped else []
         self._states.add(stamp_ns, states)
 
     def _cells(self, scan: Scan) -> npt.NDArray[np.float64]:

@@ -44,6 +44,7 @@ STATES = {
     'unconfirmed': 'placed again, not yet confirmed by the next scans',
     'ambiguous': 'with another pose that fits as well',
     'degenerate': 'without surfaces that fix every direction',
+    'jumped': 'far from the expected place, without being certain',
     'surrounded': 'with most surfaces moving with the sensor',
     'rejoined': 'placed at the end, with all scans of their part',
 }

@@ -19,6 +19,7 @@ from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.pipeline.registered_poses import StateTimes
 from surfel_mapper.scan import Scan
 from surfel_mapper.simulation import Lidar, Simulation, World
+from surfel_mapper.simulation.primitives import Primitive
 from test.alignment.test_registration import CORRIDOR, map_of, NOISE_M, points_on, ROOM, TRUE
 from test.fields import config_of
 
@@ -248,6 +249,53 @@ def test_degenerate_registrations_are_warned_about(caplog):
     assert '1 of 6 directions of motion are not determined' in caplog.text
 
 
+@pytest.mark.parametrize(('slip_m', 'num_jumped'), [(0.1, 0), (0.35, 1)])
+def test_a_large_correction_after_undetermined_motion_is_uncertain(slip_m, num_jumped):
+    mapper = mapper_with()
+    floor_and_long_walls = ROOM[:3]
+
+    for number, x_m in enumerate([0.0, 0.1, 0.2, 0.3, 0.4 + slip_m]):
+        pose = compose(se3_exp(np.array([x_m, 0.0, 0.0, 0.0, 0.0, 0.0])), TRUE)
+        feed(mapper, [scan_at(number, pose, floor_and_long_walls if number == 3 else ROOM)])
+
+    tracking = mapper.summary()['registration']['tracking']
+    assert (tracking['degenerate']['scans'], tracking['jumped']['scans']) == (1, num_jumped)
+
+
+def furnished_room(seed):
+    rng = np.random.default_rng(seed)
+    boxes = [((20.0, 10.0, 0.2), (0.0, 0.0, z)) for z in (-0.1, 4.1)]
+    boxes += [((20.0, 0.2, 4.0), (0.0, y, 2.0)) for y in (-5.0, 5.0)]
+    boxes += [((0.2, 10.0, 4.0), (x, 0.0, 2.0)) for x in (-10.0, 10.0)]
+    for _ in range(8):
+        size = rng.uniform((0.3, 0.3, 0.5), (2.0, 2.0, 3.5))
+        xy = rng.uniform(-9.0, 9.0), rng.choice([-1, 1]) * rng.uniform(2.0, 4.5)
+        boxes.append((size, (*xy, size[2] / 2.0)))
+    return World([Primitive(kind='box', size_m=size, xyz=xyz) for size, xyz in boxes])
+
+
+@pytest.mark.parametrize('seed', [2, 14, 28])
+def test_a_far_place_that_fits_hardly_better_is_searched_anew(seed):
+    world, lidar = furnished_room(seed), Lidar(beams=16, columns=360, range_noise_m=0.01)
+    mapper = Mapper(Config.from_mapping({'pose.source': 'registration'}))
+    poses, updates = [], []
+    for number in range(10):
+        way_m = 0.6 * number
+        yaw = 0.5 * np.sin(way_m / 3.0 + seed)
+        xyz, q = (way_m - 8.5, 0.5 * np.sin(way_m / 2.0), 1.0), (0.0, 0.0, np.sin(yaw / 2.0))
+        poses.append(pose_matrix(xyz, (*q, np.cos(yaw / 2.0))))
+        points = lidar.scan(world, poses[-1], stamp_ns=number, number=number).points
+        ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) < np.pi / 3.0
+        stamp_ns, points = number * STEP_NS, np.asfortranarray(points[ahead])
+        updates += feed(mapper, [Scan(points=points, stamp_ns=stamp_ns, frame_id='lidar')])
+
+    assert mapper.summary()['registration']['tracking']['lost']['scans'] >= 1
+    for update in updates:
+        truth = compose(inverse(poses[0]), poses[update.stamp_ns // STEP_NS])
+        np.testing.assert_allclose(update.T_map_sensor[:3, 3], truth[:3, 3], atol=0.08)
+    assert [update.stamp_ns // STEP_NS for update in updates] == list(range(10))
+
+
 def test_the_motion_gate_looks_at_the_pose_found():
     mapper = mapper_with(window__gate_distance_m=0.2)
 
@@ -404,6 +452,7 @@ def test_the_text_names_scans_by_their_state_of_tracking():
     [
         ('ambiguous', 5, 'two places fit about equally well'),
         ('degenerate', 3, 'surfaces do not determine every direction of motion'),
+        ('jumped', 1, 'a place far from the expected one was taken without being certain'),
     ],
 )
 def test_a_map_of_many_doubtful_scans_is_in_doubt(state, least, statement):
