@@ -28,7 +28,10 @@ SET_HELP = (
 )
 
 MAP_SHORTCUTS = {
-    '--voxel-size': ('map.voxel_size_m', 'edge of a voxel, m; the setting map.voxel_size_m (0.5)')
+    '--voxel-size': (
+        'map.voxel_size_m',
+        'edge of a voxel, m; the setting map.voxel_size_m (0.5; of depth images 0.08)',
+    )
 }
 """Options of verbs that map."""
 

@@ -26,6 +26,7 @@ from surfel_mapper.messages.cdr import stamp_ns
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import raw_poses, StampedPose
 from surfel_mapper.offline.clocks import clock_offsets
+from surfel_mapper.offline.depth_folders import for_depth_images
 from surfel_mapper.offline.pose_choice import (
     choose_for_bag,
     first_scans,
@@ -209,13 +210,13 @@ def with_depth(reader: BagReader, request: Request, config: Config) -> Config:
     if not topics:
         return config
     if request.topics or request.mounts or config.input.topics:
-        return config.replace({'input.kind': 'depth'})
+        return for_depth_images(config)
     if len(topics) > 1:
         raise BagError(
             f'{reader.path}: several topics of depth images, name one with --topic: '
             f'{", ".join(topics)}'
         )
-    return config.replace({'input.kind': 'depth', 'input.topics': topics})
+    return for_depth_images(config).replace({'input.topics': topics})
 
 
 def chosen_topics(reader: BagReader, request: Request, config: Config) -> list[str]:

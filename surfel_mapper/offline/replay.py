@@ -215,7 +215,7 @@ def map_recording(
     path : str or Path
         A bag, or a folder of scans.
     voxel_size_m : float, optional
-        Edge of the voxels, m; without, 0.5, of depth images DEPTH_VOXEL_M.
+        Edge of the voxels, m; without, 0.5, and 0.08 for depth images.
     bin_columns : int, optional
         Number of columns of .bin files; without, that which fits their values.
     progress : callable
@@ -234,8 +234,6 @@ def map_recording(
         open_recording(request, configured(None, options)) as recording,
     ):
         config = recording.config
-        if voxel_size_m is None and config.input.kind == 'depth':
-            voxel_size_m = DEPTH_VOXEL_M
         if voxel_size_m is not None:
             config = config.replace({'map.voxel_size_m': voxel_size_m})
         mapper = started_mapper(with_loops(config, options, Path(scratch)))
@@ -251,10 +249,6 @@ def map_recording(
         if uncertain := uncertain_text(figures):
             _log.warning('%s: %s', path, uncertain)
         return mapper.map
-
-
-DEPTH_VOXEL_M = 0.08
-"""Edge of the voxels of a map of depth images, m: twice that for models of one image."""
 
 
 def changed_settings(config: Config | str | Path | None) -> list[str]:

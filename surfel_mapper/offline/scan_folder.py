@@ -26,7 +26,12 @@ from surfel_mapper.errors import BagError, ConfigError, FileFormatError
 from surfel_mapper.files.scan_files import scan_files, scan_reader, SUFFIXES
 from surfel_mapper.offline import ouster_pcap
 from surfel_mapper.offline.datasets import Dataset, find_dataset
-from surfel_mapper.offline.depth_folders import DepthFolder, find_depth_folder, layout_of
+from surfel_mapper.offline.depth_folders import (
+    DepthFolder,
+    find_depth_folder,
+    for_depth_images,
+    layout_of,
+)
 from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.offline.pose_choice import (
     choose_for_folder,
@@ -106,7 +111,7 @@ class ScanFolder:
         else:
             self.dataset = find_dataset(self.path) or find_depth_folder(self.path)
         if isinstance(self.dataset, DepthFolder):
-            config = config.replace({'input.kind': 'depth'})
+            config = for_depth_images(config)
         if self.dataset is not None:
             self.files, self.format = self.dataset.files, self.dataset.format
         else:

@@ -57,11 +57,14 @@ def as_text(summary: Mapping[str, Any], written: Sequence[str]) -> str:
     )
     if summary.get('deskew_reason'):
         poses += f'not deskewed: {summary["deskew_reason"]}\n'
+    settings = summary.get('settings', {})
+    is_depth = settings.get('input.kind') == 'depth'  # with a voxel size of its own
+    voxels = f' in voxels of {settings["map.voxel_size_m"]:g} m' if is_depth else ''
     return (
         f'{poses}'
         f'scans {scans["received"]}{out}'
         f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
-        f'surfels {summary["surfels"]}\n'
+        f'surfels {summary["surfels"]}{voxels}\n'
         f'{stages_text(summary)}\n'
         f'{filters}{tracking_text(summary)}{aligned}{errors}{f"{apart}{chr(10)}" if apart else ""}'
         f'digest {summary["digest"]}\n'

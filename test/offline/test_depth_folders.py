@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 import pytest
 
-from surfel_mapper import Config, Mapper
+from surfel_mapper import Config, Mapper, SurfelMap
 from surfel_mapper.cli.main import main
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.trajectory import Trajectory
@@ -140,6 +140,18 @@ def test_images_without_poses_are_registered(tmp_path):
     with open_recording(Request(path=tmp_path), Config()) as recording:
         assert recording.config.pose.source == 'registration'
         assert recording.config.input.kind == 'depth'
+
+
+@pytest.mark.parametrize(('set_m', 'size_m'), [(0.5, 0.08), (0.2, 0.2)])
+def test_voxels_of_depth_images_are_small_if_no_size_is_set(tmp_path, capsys, set_m, size_m):
+    tum(tmp_path / 'images')
+    settings = ['--voxel-size', str(set_m)] if set_m != 0.5 else []
+
+    code = main(['replay', str(tmp_path / 'images'), '--output', str(tmp_path / 'out'), *settings])
+
+    assert code == 0
+    assert f'in voxels of {size_m} m' in capsys.readouterr().out
+    assert SurfelMap.load(tmp_path / 'out' / 'map.npz').voxel_size_m == size_m
 
 
 @pytest.mark.parametrize(
