@@ -88,6 +88,8 @@ def as_mapping(reader: BagReader, survey: Survey, made: list[Offer]) -> dict[str
     """Return the survey as plain values."""
     from surfel_mapper.offline.clocks import clock_offsets
 
+    clouds = reader.topics.of_type(*reader.topics.clouds)
+    leads_ns = itertools.chain.from_iterable(survey.leads_ns.get(name, []) for name in clouds)
     return {
         'bag': str(reader.path),
         'format': 'ROS 1' if reader.is_ros1 else 'ROS 2',
@@ -108,8 +110,9 @@ def as_mapping(reader: BagReader, survey: Survey, made: list[Offer]) -> dict[str
         'poses': [dataclasses.asdict(offer) for offer in made],
         'clock_offsets': [
             {**dataclasses.asdict(clock), 'text': str(clock)}
-            for clock in clock_offsets(survey, reader.topics.of_type(*reader.topics.clouds))
+            for clock in clock_offsets(survey, clouds)
         ],
+        'record_times_are_stamps': all(abs(lead) < 1e6 for lead in leads_ns),
     }
 
 
@@ -126,6 +129,11 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
     if content['undecodable']:
         lines.append(f'damaged: {counted(content["undecodable"], "message")} of clouds or poses')
     lines += [f'clocks: {clock["text"]}' for clock in content['clock_offsets']]
+    if made and content['record_times_are_stamps']:
+        lines.append(
+            'clocks: record times are the stamps and show no offset of clouds from poses; replay '
+            'measures it by the motion'
+        )
     is_choice = len({offer.clouds for offer in made}) > 1
     for clouds in dict.fromkeys(offer.clouds for offer in made):
         with_a_pose = f'clouds of {clouds} with a pose, and the settings for --config:'

@@ -75,6 +75,14 @@ def test_an_offset_names_topics_seconds_cause_and_option(seconds, text):
     assert text in str(ClockOffset('/points', '/tf', seconds))
 
 
+def test_info_names_record_times_that_are_the_stamps(tmp_path, capsys):
+    bags = {True: with_clouds_ahead(tmp_path / 'converted', 0)}
+    bags[False] = with_clouds_ahead(tmp_path / 'recorded', 37 * 10**9)
+    for are_stamps, bag in bags.items():
+        assert main(['info', str(bag)]) == 0
+        assert ('clocks: record times are the stamps' in capsys.readouterr().out) == are_stamps
+
+
 @pytest.mark.parametrize('seconds', [37, -3600, 1])
 def test_an_offset_is_named_and_the_option_that_corrects_it_gives_the_right_map(
     tmp_path, capsys, seconds
