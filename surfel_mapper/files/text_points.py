@@ -126,7 +126,8 @@ def read_points(path: str | Path) -> Columns:
             columns[axis[1] if axis else name] = METRES[axis[2]] * values if axis else values
         columns.pop('', None)  # pandas' index
         return columns
-    if len(table) > 2 and (np.diff(table[:, 0]) == 1.0).all():
+    num_rows, num_columns = table.shape
+    if num_columns > 3 and num_rows >= 10 and (np.diff(table[:, 0]) == 1.0).all():
         raise FileFormatError(
             f'{path}: the first column counts the rows, expected x; name the columns in a header'
         )

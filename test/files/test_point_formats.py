@@ -108,7 +108,11 @@ def test_intensities_of_pts_may_be_negative(tmp_path):
         ('a.csv', 't,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n', '8 columns t, x, y, z, qx'),
         ('a.csv', 'time,a,b\n0,1,2\n', '3 columns time, a, b'),
         ('a.xyz', '0 1 2 3 4\n', '5 columns, expected a header'),
-        ('a.csv', '0,9,9,9\n1,8,8,8\n2,7,7,7\n', 'the first column counts the rows'),
+        (
+            'a.csv',
+            ''.join(f'{row},9,8,7.5\n' for row in range(10)),
+            'the first column counts the rows',
+        ),
         ('a.xyz', '1 2 3\n4 5\n', 'columns'),
         ('a.xyz', '1 2 3\n4 5 x\n', "'x'"),
     ],
