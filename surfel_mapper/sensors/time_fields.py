@@ -10,7 +10,10 @@ import re
 FIELDS = ('t', 'time', 'timestamp', 'offset_time', 'time_stamp')
 """Names of the times of points: Ouster, Velodyne, Hesai, Livox, Autoware and Nebula."""
 
-TIME_NAME = re.compile(r'time|stamp|^(t|ts|dt|(t_?)?off(set)?)(_?[mun]?s(ec)?)?$', re.IGNORECASE)
+TIME_NAME = re.compile(
+    r'time|stamp|^(t|ts|dt|(t_?)?off(set)?)(_?[mun]?s(ec)?)?$|^([mun]|milli|micro|nano)?sec(s|onds)?$',
+    re.IGNORECASE,
+)
 """Names of further drivers; used if a cloud has one such field."""
 
 

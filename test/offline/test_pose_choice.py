@@ -121,6 +121,16 @@ def test_times_that_cannot_be_used_are_not_recommended(source, times, says):
     assert reason.startswith(says) if says else reason == ''
 
 
+def test_times_in_two_fields_are_named():
+    columns = {'sec': np.array([1, 1]), 'nsec': np.array([0, 10**8])}
+    scan = Scan(points=np.ones((2, 3)), stamp_ns=START_NS, frame_id='', columns=columns)
+
+    reason = why_not_deskewed(Config.from_mapping({'pose.source': 'tf'}), [scan])
+
+    assert reason.startswith('no field t or time or timestamp')
+    assert 'among sec, nsec' in reason
+
+
 def test_a_tree_with_another_root_is_taken_with_its_root(tmp_path):
     entries = drive()
     for topic, _, _, message in entries:

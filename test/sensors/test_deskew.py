@@ -108,7 +108,7 @@ def test_the_end_of_a_name_is_the_unit(unit, ns):
     assert point_times(sweep(np.array([0, 3]), f'dt_{unit}')).offsets.tolist() == [0, 3 * ns]
 
 
-@pytest.mark.parametrize('columns', [['ring'], ['sec_time', 'nsec_time'], ['intensity', 'tag']])
+@pytest.mark.parametrize('columns', [['ring'], ['sec', 'nsec'], ['intensity', 'second']])
 def test_no_field_is_guessed_among_several_or_none(columns):
     assert times_field(columns) == ''
 
