@@ -31,6 +31,9 @@ SUMMARY = (
     'Show the topics and poses of a bag or folder of scans, or the settings of node and replay.'
 )
 
+AT_ONCE_NS = 1_000_000
+"""Record times nearer to the stamps are of a converter: a cloud takes longer to arrive, ns."""
+
 EXAMPLE = 'surfel-mapper info street.mcap'
 
 CHOICE = ('poses_from', 'poses_reason', 'deskewed', 'deskew_reason')
@@ -112,7 +115,7 @@ def as_mapping(reader: BagReader, survey: Survey, made: list[Offer]) -> dict[str
             {**dataclasses.asdict(clock), 'text': str(clock)}
             for clock in clock_offsets(survey, clouds)
         ],
-        'record_times_are_stamps': all(abs(lead) < 1e6 for lead in leads_ns),
+        'record_times_are_stamps': all(abs(lead) < AT_ONCE_NS for lead in leads_ns),
     }
 
 
@@ -129,7 +132,7 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
     if content['undecodable']:
         lines.append(f'damaged: {counted(content["undecodable"], "message")} of clouds or poses')
     lines += [f'clocks: {clock["text"]}' for clock in content['clock_offsets']]
-    if made and content['record_times_are_stamps']:
+    if made and content['record_times_are_stamps'] and not content['clock_offsets']:
         lines.append(
             'clocks: record times are the stamps and show no offset of clouds from poses; replay '
             'measures it by the motion'

@@ -305,7 +305,7 @@ def heights(points, low, high, normal, rules):
     Fit a plane and a quadric over a plane to columns low to high - 1 of points (4, n).
 
     Returns cost, cost of a plane, rms from a plane m, and of the quadric turn rad, bend m, and the
-    share of points where it is too steep.
+    share of its points beyond the steepest slope.
 
     The Cholesky factor of the quadric contains the plane's, so one solution is enough for both.
     The turn is that of the normals of the quadric, for a strip of constant curvature the angle
