@@ -51,6 +51,10 @@ Largest difference of a time from the stamp, ns; a larger one has another unit o
 since 1970, read as nanoseconds since the stamp, are 1.7 s and more.
 """
 
+FRACTIONS_NS = 700_000_000, 1_001_000_000
+"""Sweep of fractions of a scan read as seconds, ns, shorter if a sector is missing; no usual lidar
+turns as slowly."""
+
 MIN_SWEEP_NS = 500_000
 """Shortest sweep of which a unit is likely, ns: microseconds read as ns are shorter."""
 
@@ -84,8 +88,8 @@ def point_times(
     Raises
     ------
     CloudFormatError
-        If there is no such column, none of its times is finite, or they are more than 1.5 s from
-        the stamp in every unit.
+        If there is no such column, none of its times is finite, they are more than 1.5 s from the
+        stamp in every unit, or they may be fractions of a scan.
     ValueError
         If the unit or the reference is none of these.
 
@@ -100,6 +104,9 @@ def point_times(
             'name the times of points in deskew.field'
         )
     column = np.asarray(scan.columns[name])
+    seconds = scan.columns.get(name.replace('nsec', 'sec')) if 'nsec' in name else None
+    if seconds is not None and seconds.dtype.kind in 'iu' and column.dtype.kind in 'iu':
+        column, unit = 10**9 * seconds.astype(np.int64) + column.astype(np.int64), 'ns'
     if unit == 'auto' and (named := NAMED_UNIT.search(name)):
         unit = named[1].lower()
     if column.dtype.kind not in 'iuf':
@@ -128,6 +135,12 @@ def point_times(
             'the stamp for the time of the first point'
         )
     first, last = _offsets(ends, *reading, scan.stamp_ns).tolist()
+    is_unsure = unit == 'auto' and reading[:2] == (UNITS_NS['s'], 'stamp')
+    if is_unsure and FRACTIONS_NS[0] <= last - first <= FRACTIONS_NS[1]:
+        raise CloudFormatError(
+            f'field {name}: times from {low:g} to {high:g} may be fractions of a scan, which are '
+            'not read; if they are seconds, set deskew.unit: s'
+        )
     offsets = _offsets(values, *reading, scan.stamp_ns)
     if num_untimed:
         offsets[~np.isfinite(column)] = UNTIMED

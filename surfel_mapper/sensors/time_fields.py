@@ -11,7 +11,7 @@ FIELDS = ('t', 'time', 'timestamp', 'offset_time', 'time_stamp')
 """Names of the times of points: Ouster, Velodyne, Hesai, Livox, Autoware and Nebula."""
 
 TIME_NAME = re.compile(
-    r'time|stamp|^(t|ts|dt|(t_?)?off(set)?)(_?[mun]?s(ec)?)?$|^([mun]|milli|micro|nano)?sec(s|onds)?$',
+    r'time|stamp|^(t|ts|dt|(t_?)?off(set)?)(_?[mun]?s(ec)?)?$|(^|_)([mun]|milli|micro|nano)?sec(s|onds)?$',
     re.IGNORECASE,
 )
 """Names of further drivers; used if a cloud has one such field."""
@@ -24,7 +24,13 @@ def times_field(columns: Iterable[str]) -> str:
 
 
 def time_fields(columns: Iterable[str]) -> list[str]:
-    """Return the columns that may hold the times of points: the first usual name, else others."""
+    """
+    Return the columns that may hold the times of points: the first usual name, else others.
+
+    Of seconds and nanoseconds in two columns (sec, nsec) the nanoseconds stand for both.
+    """
     names = [*columns]
     usual = [name for name in FIELDS if name in names]
+    seconds = {name.replace('nsec', 'sec') for name in names if 'nsec' in name}
+    names = [name for name in names if name not in seconds]
     return usual[:1] or [name for name in names if TIME_NAME.search(name)]

@@ -122,13 +122,13 @@ def test_times_that_cannot_be_used_are_not_recommended(source, times, says):
 
 
 def test_times_in_two_fields_are_named():
-    columns = {'sec': np.array([1, 1]), 'nsec': np.array([0, 10**8])}
+    columns = {'sec': np.array([1, 1]), 'usec': np.array([0, 10**5])}
     scan = Scan(points=np.ones((2, 3)), stamp_ns=START_NS, frame_id='', columns=columns)
 
     reason = why_not_deskewed(Config.from_mapping({'pose.source': 'tf'}), [scan])
 
     assert reason.startswith('no field t or time or timestamp')
-    assert 'among sec, nsec' in reason
+    assert 'among sec, usec' in reason
 
 
 def test_a_tree_with_another_root_is_taken_with_its_root(tmp_path):

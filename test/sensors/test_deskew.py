@@ -108,9 +108,34 @@ def test_the_end_of_a_name_is_the_unit(unit, ns):
     assert point_times(sweep(np.array([0, 3]), f'dt_{unit}')).offsets.tolist() == [0, 3 * ns]
 
 
-@pytest.mark.parametrize('columns', [['ring'], ['sec', 'nsec'], ['intensity', 'second']])
+@pytest.mark.parametrize('columns', [['ring'], ['sec', 'usec'], ['intensity', 'second']])
 def test_no_field_is_guessed_among_several_or_none(columns):
     assert times_field(columns) == ''
+
+
+@pytest.mark.parametrize('name', ['sec', 'lidar_sec'])
+@pytest.mark.parametrize('first_ns', [START_NS, START_NS // 10**9 * 10**9 - MS])
+def test_seconds_and_nanoseconds_in_two_fields_are_one_time(name, first_ns):
+    times = first_ns + OFFSETS_NS
+    columns = {name: (times // 10**9).astype(np.uint32), 'ring': np.zeros(3)}
+    columns[name.replace('sec', 'nsec')] = (times % 10**9).astype(np.uint32)
+    scan = Scan(points=np.ones((3, 3)), stamp_ns=START_NS, frame_id='lidar', columns=columns)
+    assert point_times(scan).offsets.tolist() == (times - START_NS).tolist()
+
+
+@pytest.mark.parametrize('ends', [(0.0, 1.0), (0.0, 0.9994), (-1.0, 0.0), (-0.5, 0.5), (0.1, 0.9)])
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_fractions_of_a_scan_are_not_believed_as_seconds(ends, dtype):
+    scan = sweep(np.linspace(*ends, 5, dtype=dtype))
+    with pytest.raises(CloudFormatError, match=r'may be fractions of a scan.* deskew\.unit: s'):
+        point_times(scan)
+    seconds = point_times(scan, unit='s')
+    assert abs(seconds.last_ns - seconds.first_ns - (ends[1] - ends[0]) * 1e9) < 100
+
+
+def test_a_second_of_stamps_is_no_fraction():
+    times = point_times(sweep(START_NS / 1e9 + np.linspace(0.0, 1.0, 5)))
+    assert abs(times.last_ns - times.first_ns - 10**9) < 500
 
 
 def test_invalid_points_do_not_affect_the_times():
