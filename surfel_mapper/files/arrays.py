@@ -20,8 +20,9 @@ import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError, refusing
-from surfel_mapper.files.point_columns import Columns, named_columns, NORMALS, RGB
+from surfel_mapper.files.point_columns import Columns, named_columns, NORMALS
 from surfel_mapper.files.state import MANIFEST
+from surfel_mapper.mapping.channels import RGB
 
 SUFFIXES = ('.npy', '.npz')
 

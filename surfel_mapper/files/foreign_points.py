@@ -19,8 +19,9 @@ import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError, refusing
-from surfel_mapper.files.point_columns import Columns, NORMALS, RGB
+from surfel_mapper.files.point_columns import Columns, NORMALS
 from surfel_mapper.libraries import library
+from surfel_mapper.mapping.channels import RGB
 
 E57_COLUMNS = {
     **{f'cartesian{axis.upper()}': axis for axis in 'xyz'},

@@ -20,8 +20,9 @@ import numpy.typing as npt
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.files.point_columns import Columns, RGB, shape_columns
+from surfel_mapper.files.point_columns import Columns, shape_columns
 from surfel_mapper.libraries import library
+from surfel_mapper.mapping.channels import RGB
 from surfel_mapper.mapping.surfels import quality_columns
 
 if TYPE_CHECKING:

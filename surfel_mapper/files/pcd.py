@@ -31,9 +31,10 @@ from surfel_mapper.arguments import MAX_SQUARE_ERROR
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import check_names, replace_file
-from surfel_mapper.files.point_columns import Columns, RGB, table_of
+from surfel_mapper.files.point_columns import Columns, table_of
 from surfel_mapper.files.text_table import read_table
 from surfel_mapper.libraries import library
+from surfel_mapper.mapping.channels import RGB
 from surfel_mapper.mapping.surfels import file_positions, packed_rgb, surfel_columns
 
 if TYPE_CHECKING:

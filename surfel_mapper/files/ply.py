@@ -29,8 +29,9 @@ import numpy.typing as npt
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import check_names, replace_file
-from surfel_mapper.files.point_columns import Columns, RGB, shape_columns, table_of
+from surfel_mapper.files.point_columns import Columns, shape_columns, table_of
 from surfel_mapper.files.text_table import read_table
+from surfel_mapper.mapping.channels import RGB
 from surfel_mapper.mapping.surfels import covariance_columns, file_positions, quality_columns
 
 if TYPE_CHECKING:

@@ -15,15 +15,12 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.mapping.channels import joined, RGB, three_channels
+
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
 
 Columns = dict[str, npt.NDArray[Any]]
-
-RGB = ('red', 'green', 'blue')
-
-COLOURS = (RGB, tuple(f'diffuse_{name}' for name in RGB), ('r', 'g', 'b'))
-"""Names of the channels, in lower case."""
 
 PACKED = ('rgb', 'rgba')
 
@@ -95,11 +92,9 @@ def is_colour(channels: npt.NDArray[Any]) -> bool:
 def with_one_colour(columns: Mapping[str, npt.NDArray[Any]]) -> Columns:
     """Return columns with ``rgb``, (N, 3) uint8, instead of any form of colour."""
     renamed = dict(columns)
-    names = {name.lower(): name for name in columns}
-    for triple in COLOURS:
-        if names.keys() >= {*triple}:
-            channels = np.stack([renamed.pop(names[name]) for name in triple], axis=1)
-            return {**renamed, 'rgb': as_bytes(channels)}
+    if names := three_channels(columns):
+        uncoloured = {name: values for name, values in columns.items() if name not in names}
+        return {**uncoloured, 'rgb': joined(columns, names)}
     for name in PACKED:
         packed = columns.get(name)
         if packed is not None and packed.ndim == 1 and packed.dtype.itemsize == 4:
@@ -107,16 +102,3 @@ def with_one_colour(columns: Mapping[str, npt.NDArray[Any]]) -> Columns:
             channels = np.stack([bits >> shift & 255 for shift in (16, 8, 0)], axis=1)
             return {**renamed, 'rgb': channels.astype(np.uint8)}
     return renamed
-
-
-def as_bytes(channels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
-    """Return a colour (N, 3) as bytes: floats up to 1 times 255, the upper of 16 bits."""
-    if channels.dtype == np.uint8:
-        return channels
-    values = np.nan_to_num(channels.astype(np.float64))
-    top = values.max(initial=0.0)
-    if top > 255.0:
-        values = np.floor(values / 256.0)
-    elif top <= 1.0 and channels.dtype.kind == 'f':
-        values = 255.0 * values
-    return np.rint(np.clip(values, 0.0, 255.0)).astype(np.uint8)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from surfel_mapper.config import Config, TsdfConfig
 from surfel_mapper.errors import PoseError
 from surfel_mapper.geometry import Transform
-from surfel_mapper.mapping.channels import quantised
+from surfel_mapper.mapping.channels import missing_columns, quantised
 from surfel_mapper.poses.buffer import TransformBuffer
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
@@ -156,7 +156,7 @@ def range_image(
     depth, columns = scan.depth, scan.columns
     if (
         depth is None
-        or (has_color and depth.color is None and ('rgb' in columns or 'rgba' in columns))
+        or (has_color and depth.color is None and not missing_columns(columns, ('rgb',)))
         or (has_label and depth.label is None and 'label' in columns)
     ):
         points, channels = measured_channels(
@@ -205,10 +205,10 @@ def colors_of(scan: Scan) -> npt.NDArray[np.uint8] | None:
     Alpha marks the points that have a colour, unless it is 0 everywhere, as some drivers leave it.
     """
     columns = scan.columns
-    if not {'rgb', 'rgba'} & columns.keys():
+    if missing_columns(columns, ('rgb',)):
         return None
     colors = quantised(columns, ('rgb',), len(scan)).astype(np.uint8)
-    packed = columns['rgba'] if 'rgb' not in columns else None
+    packed = columns.get('rgba') if 'rgb' not in columns else None
     if packed is None or packed.dtype != np.uint32 or not (packed >> 24).any():
         return colors
     return np.column_stack([colors, (packed >> 24).astype(np.uint8)])

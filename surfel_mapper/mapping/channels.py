@@ -9,13 +9,18 @@ thousands); colours are integers from 0 to 255. nan counts as 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-CHANNELS = {'intensity': ('intensity',), 'rgb': ('red', 'green', 'blue')}
+RGB = ('red', 'green', 'blue')
+
+COLOURS = (RGB, tuple(f'diffuse_{name}' for name in RGB), ('r', 'g', 'b'))
+"""Names of the channels of a colour in three columns, in lower case."""
+
+CHANNELS = {'intensity': ('intensity',), 'rgb': RGB}
 """Columns of a scan that a map can sum, and the channels of each."""
 
 UNITS = {'intensity': 256.0, 'red': 1.0, 'green': 1.0, 'blue': 1.0}
@@ -43,15 +48,44 @@ def channel_names(columns: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def missing_columns(columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, ...]) -> list[str]:
-    """Return the named columns that are missing; ``rgba`` can replace ``rgb``."""
-    return [n for n in names if n not in columns and not (n == 'rgb' and 'rgba' in columns)]
+    """Return the named columns that are missing; ``rgba`` or r, g, b can replace ``rgb``."""
+    is_coloured = 'rgba' in columns or three_channels(columns)
+    return [n for n in names if n not in columns and not (n == 'rgb' and is_coloured)]
 
 
 def summed_columns(
     columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, ...]
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the named columns, none of them missing; ``rgba`` takes the name ``rgb``."""
-    return {n: columns['rgba' if n == 'rgb' and n not in columns else n] for n in names}
+    """Return the named columns, none of them missing; any colour takes the name ``rgb``."""
+    return {name: summed_column(columns, name) for name in names}
+
+
+def summed_column(columns: Mapping[str, npt.NDArray[Any]], name: str) -> npt.NDArray[Any]:
+    """Return a named column that is not missing; ``rgb`` may be in other columns."""
+    if name in columns:
+        return columns[name]
+    return columns['rgba'] if 'rgba' in columns else joined(columns, three_channels(columns))
+
+
+def three_channels(columns: Collection[str]) -> list[str]:
+    """Return the columns red, green and blue of a colour in three columns; empty without."""
+    names = {name.lower(): name for name in columns}
+    triple: Collection[str] = next((triple for triple in COLOURS if names.keys() >= {*triple}), ())
+    return [names[name] for name in triple]
+
+
+def joined(columns: Mapping[str, npt.NDArray[Any]], names: list[str]) -> npt.NDArray[np.uint8]:
+    """Return three channels as bytes (N, 3): floats up to 1 times 255, the upper of 16 bits."""
+    channels = np.stack([columns[name] for name in names], axis=1)
+    if channels.dtype == np.uint8:
+        return channels
+    values = np.nan_to_num(channels.astype(np.float64))
+    top = values.max(initial=0.0)
+    if top > 255.0:
+        values = np.floor(values / 256.0)
+    elif top <= 1.01 and channels.dtype.kind == 'f':
+        values = 255.0 * values
+    return np.rint(np.clip(values, 0.0, 255.0)).astype(np.uint8)
 
 
 def quantised(
@@ -64,7 +98,8 @@ def quantised(
     ----------
     columns : mapping of str to (N,) array
         ``intensity``: numbers. ``rgb``: three bytes packed into float32 or uint32, as in PCL and
-        RViz, or an (N, 3) array of 0 to 255 with any further columns; ``rgba`` can replace it.
+        RViz, or an (N, 3) array of 0 to 255 with any further columns; ``rgba`` can replace it,
+        or the three columns r, g, b or red, green, blue.
     names : tuple of str
         Columns to quantise.
     num_points : int
@@ -93,7 +128,7 @@ def checked_channels(
     """Return a named column; raise ValueError if ``quantised`` cannot take it."""
     if missing_columns(columns, (name,)):
         raise ValueError(f'column {name}: missing, expected one row for {num_points} points')
-    column = np.asarray(columns['rgba' if name not in columns else name])
+    column = np.asarray(summed_column(columns, name))
     if len(column) != num_points:
         raise ValueError(
             f'column {name}: of length {len(column)}, expected one row for {num_points} points'

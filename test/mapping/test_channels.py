@@ -94,6 +94,17 @@ def test_colours_may_be_packed_into_integers_or_lie_side_by_side():
     assert surfel_map == expected
 
 
+@pytest.mark.parametrize('names', ['rgb', ('red', 'green', 'blue'), 'RGB'])
+@pytest.mark.parametrize(('dtype', 'top'), [('u1', 255), ('f4', 255), ('f4', 1), ('u2', 65535)])
+def test_colours_may_be_three_columns(names, dtype, top):
+    points, columns, colors = coloured(5)
+    expected, surfel_map = SurfelMap(0.5, columns=('rgb',)), SurfelMap(0.5, columns=('rgb',))
+    expected.add(points, columns=columns)
+    channels = (colors.astype(np.float64) * (top / 255)).astype(dtype)
+    surfel_map.add(points, columns=dict(zip(names, channels.T, strict=True)))
+    assert surfel_map == expected
+
+
 def test_a_missing_or_short_column_is_refused_and_changes_nothing():
     surfel_map = SurfelMap(0.5, columns=('intensity',))
     with pytest.raises(ValueError, match='column intensity: missing'):
