@@ -412,6 +412,15 @@ def test_one_stray_parent_leaves_a_gap_of_one_sample():
     assert buffer.num_transforms == 6
 
 
+@pytest.mark.parametrize('num', [4, 5])
+def test_parents_in_turn_are_named_if_no_single_stray_message_makes_them(num):
+    buffer = TransformBuffer()
+    for second in range(num):
+        buffer.add(('odom', 'map')[second % 2], 'base', EPOCH + second * S, moved(0.0))
+    says = not_yet(buffer, 'map', 'base', EPOCH)
+    assert ('base has in turn the parents map and odom: two pub' in says) == (num == 5)
+
+
 def test_a_span_across_a_new_parent_is_refused():
     buffer = TransformBuffer()
     for second, parent in enumerate(['odom', 'odom', 'wrong', 'odom']):

@@ -48,6 +48,9 @@ MAX_TRANSFORMS = 500_000
 SAME_MOUNT = 1e-5
 """Static transforms whose entries differ by less are the same; 10 um and 10 urad."""
 
+ALTERNATING = 4
+"""Changes of parent that one restarted publisher, or one stray message, cannot make."""
+
 MAX_NAMES = 12
 """Number of frames named in a message."""
 
@@ -469,6 +472,7 @@ class TransformBuffer:
                 return up[:row], down[: rows[frame]]
         raise PoseNotYetError(
             f'{_request(target, source, stamp_ns)}: {self._why_not_connected(target, source)}'
+            f'{"".join(map(_parents_in_turn, [*up, *down]))}'
         )
 
     def _above(self, frame: str, stamp_ns: int | None = None) -> tuple[list[PoseTrack], list[str]]:
@@ -488,6 +492,17 @@ class TransformBuffer:
         if unseen:
             return f'no transform of {unseen} yet; frames seen: {names or "none"}'
         return f'no transforms lead from one to the other yet; frames seen: {names}'
+
+
+def _parents_in_turn(edge: PoseTrack) -> str:
+    """Return that publishers contradict each other in the parent of a frame; empty if not."""
+    changes = sum(older != newer for older, newer in pairwise(edge.parents))
+    if changes < ALTERNATING:
+        return ''
+    parents = ' and '.join(sorted({*edge.parents}))
+    return (
+        f'; {edge.child} has in turn the parents {parents}: two publishers contradict each other'
+    )
 
 
 def _request(target: str, source: str, stamp_ns: int) -> str:

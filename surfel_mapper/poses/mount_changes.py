@@ -10,10 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from surfel_mapper.poses.buffer import FrameMove
-
-ALTERNATING = 4
-"""Changes between two parents that one restarted publisher, or one stray message, cannot make."""
+from surfel_mapper.poses.buffer import ALTERNATING, FrameMove
 
 MAX_FRAMES = 100
 """Frames whose changes are kept."""
