@@ -218,6 +218,8 @@ def checked_fields(msg: Any, topic: str) -> dict[str, Field]:
         first = fields.setdefault(field.name, field) if field.name else field
         if field != first and field.name in ('x', 'y', 'z'):
             raise CloudFormatError(f'{topic}: two fields {field.name!r} that differ, expected one')
+        if field != first:
+            warn_of_layout(topic, f'two fields {field.name!r} that differ, the first is read')
     return fields
 
 

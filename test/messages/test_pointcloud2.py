@@ -216,6 +216,14 @@ def test_bytes_after_the_points_are_ignored_with_a_warning(height, row_step, cap
     assert len(caplog.records) == 1
 
 
+def test_fields_that_repeat_a_name_are_named_and_the_first_is_read(caplog):
+    warn_of_layout.cache_clear()
+    assert_decodes(message([*XYZ, ('intensity', 12, 7), ('intensity', 16, 4)], 18))
+    assert [r.message for r in caplog.records] == [
+        "points: two fields 'intensity' that differ, the first is read"
+    ]
+
+
 def test_fields_are_appended_to_packed_points_whatever_row_step_says():
     msg, words = message(XYZ, 12, width=4, height=2), np.arange(8, dtype=np.uint32)[:, None]
     expected = append_fields(msg, words, [('n', 6, 1)])
