@@ -31,7 +31,15 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse, SPARSE_SHARE
 from surfel_mapper.models.coverage import covered
 from surfel_mapper.models.frames import eigen
-from surfel_mapper.models.growth import Charts, grow, Grown, grown, owner_table, VoxelPoints
+from surfel_mapper.models.growth import (
+    Charts,
+    grow,
+    Grown,
+    grown,
+    LEAST_DISPARITY_NOISE,
+    owner_table,
+    VoxelPoints,
+)
 from surfel_mapper.models.kernels.frames import LEAST_WIDTH, member_moments, split_members
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.noise import estimate_noise, NoiseSamples
@@ -181,8 +189,9 @@ def fit_points(parts: Thinned, config: ModelsConfig, view: Array, laps: list[flo
     label = of_cluster[group]
     growth = grow(voxels, thinned.means, label, group, charts, config, view)
     weights = np.diff(parts.starts) if is_parted else 1
-    is_free = np.sum(weights * (growth.owner < 0)) >= max(SPARSE_SHARE * len(parts.rows), 1.0)
-    joined = grow_sparse(thinned, voxels, growth, config, view) if is_free else growth
+    is_sparse = np.sum(weights * (growth.owner < 0)) >= max(SPARSE_SHARE * len(parts.rows), 1.0)
+    is_sparse &= config.noise_per_range_sq < LEAST_DISPARITY_NOISE
+    joined = grow_sparse(thinned, voxels, growth, config, view) if is_sparse else growth
     laps.append(clock())
     fitted = owner_patches(joined, config, view)
     lost = np.array([patch is None for patch in fitted], np.bool_)

@@ -61,8 +61,9 @@ voxels. Its plane is refitted in this number of rounds. It has this number of vo
 
 LEAST_DISPARITY_NOISE = 3e-4
 """
-Sigma by range^2, 1/m, from which on layers are separated: that of depth cameras is 1e-3 1/m, of
-lidars less than 1e-4 1/m. Roads that a lidar sees are cambered, and have no layers.
+Sigma by range^2, 1/m, from which on a cloud is of a depth camera: theirs is 1e-3 1/m, of lidars
+less than 1e-4 1/m. Layers are separated there, as roads that a lidar sees are cambered. Patches in
+voxels of other sizes are not grown: pixels leave no gaps.
 """
 
 FAR_SIGMAS = 2.0

@@ -285,6 +285,16 @@ def test_rings_of_a_lidar_on_a_floor_are_one_plane():
     assert abs(model.patches[int(counts.argmax())].normal[2]) == pytest.approx(1.0, abs=1e-4)
 
 
+def test_clutter_before_a_depth_camera_is_on_no_plane():
+    rng = np.random.default_rng(5)
+    wall = sheet(1.0, 1.6, 0.008, centre=(0.0, 0.0, 1.0), sigma=1e-3)
+    clutter = rng.uniform([-0.5, 0.5, 0.6], [0.5, 1.0, 1.2], (len(wall) // 10, 3))
+    config = ModelsConfig(voxel_size_m=0.03, noise_per_range_sq=1e-3)
+    model = fit(np.concatenate([wall, clutter]), config)
+    assert len(model.planes) == 1
+    assert (model.labels[: len(wall)] == 0).all()
+
+
 def crates():
     """Return points of 36 cubes of 0.7 m, and the face of each point."""
     rng, parts = np.random.default_rng(3), []
