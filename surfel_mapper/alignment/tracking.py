@@ -214,8 +214,8 @@ class Tracker:
         if not refusal:
             off_m = self._off_m(pose, stamp_ns, reach_m)
             refusal = self._doubt(result, surfel_map, T_map_fixed, off_m)
-        self.has_jumped = False
         if refusal:
+            self.has_jumped = False
             self._deviations.clear()
             self.twist = 0.5 * self.twist  # after several failures the prediction is at rest
             raise AlignmentError(refusal)
@@ -223,9 +223,10 @@ class Tracker:
         self._has_companions = result.companions >= LEAST_SHARE
         self._cells = cells
         was_degenerate, self._is_degenerate = self._is_degenerate, len(result.degenerate) > 0
-        if is_moving and (was_degenerate or self._is_degenerate):
-            correction_m = np.linalg.norm(compose(inverse(predicted), pose)[:3, 3])
-            self.has_jumped = bool(correction_m >= CORRECTED_M)
+        is_undetermined = is_moving and (was_degenerate or self._is_degenerate)
+        is_corrected = math.hypot(*compose(inverse(predicted), pose)[:3, 3]) >= CORRECTED_M
+        is_far = off_m > self._registration.config.max_deviation_m and not self._is_better(result)
+        self.has_jumped = (is_undetermined and is_corrected) or is_far
         self.advance(pose, stamp_ns, reach_m)
         return result
 
