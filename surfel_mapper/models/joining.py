@@ -67,7 +67,8 @@ CURVED_GAIN = 30.0
 MOST_WORSE, UNRESOLVED_VOXELS = 1.25, 0.2
 """
 A plane of several patches has at most MOST_WORSE times their residual, or UNRESOLVED_VOXELS. Joins
-are compared near the smaller patch, so a chain of them may be a tree crown.
+are compared near the smaller patch, so a chain of them may be a tree crown. Its patches are joined
+again, without joins that make planes worse: one ditch does not divide a road.
 """
 
 
@@ -184,6 +185,8 @@ def join_patches(
         normals = np.where(undone[:, None], single.normals, layered.normals)
         sigma = np.where(undone, single.sigma, layered.sigma)
         separated = replace(layered, normals=normals, sigma=sigma)
+        again = touching[undone[touching[:, :2]].all(axis=1)]
+        root = separated.joined(root, again, UNRESOLVED_VOXELS * size_m)
         index, normals, curved, _ = separated.described(root, size_m)
     return index, normals, curved
 
@@ -274,8 +277,12 @@ class Comparison:
         rows = np.diff(self.pieces.starts)
         return Regions(rows, normals, self.means.copy(), self.extents.copy())
 
-    def joined(self, root: Indices, touching: Indices) -> Indices:
-        """Return the region (K,) of each patch, given those of layers and touching patches."""
+    def joined(self, root: Indices, touching: Indices, plane_m: float | None = None) -> Indices:
+        """
+        Return the region (K,) of each patch, given those of layers and touching patches.
+
+        plane_m: residual of a plane that is not resolved, m; if given, regions stay planes.
+        """
         number, regions = len(root), self.regions()
         layer = np.flatnonzero(root != np.arange(number))
         regions.join(layer, root[layer])
@@ -284,6 +291,8 @@ class Comparison:
         while len(pairs):
             again = is_stale[pairs].any(axis=1)
             gains[again] = self.compared(pairs[again], root, regions)[:, 0]
+            if plane_m is not None:
+                gains[self.worse_planes(pairs, root, plane_m)] = 0.0
             small, large = chosen_joins(pairs, gains, regions.rows)
             if not len(small):
                 break
@@ -297,6 +306,21 @@ class Comparison:
             row = row[pairs[row, 0] != pairs[row, 1]]
             pairs, gains = pairs[row], gains[row]
         return root
+
+    def worse_planes(self, pairs: Indices, root: Indices, plane_m: float) -> npt.NDArray[np.bool_]:
+        """Return which pairs (R, 2) of regions fit one plane worse than their patches."""
+        homogeneous = np.column_stack([self.means, np.ones(len(root))])
+        products = homogeneous[:, :, None] * homogeneous[:, None]
+        products[:, :3, :3] += self.covariances
+        rows = np.column_stack([products.reshape(-1, 16), (MOST_WORSE * self.sigma) ** 2])
+        table = np.zeros((len(root), 17))
+        np.add.at(table, root, self.num_points[:, None] * rows)
+        both = table[pairs].sum(axis=1)
+        both /= both[:, 15:16]
+        mean, product = both[:, 3:12:4], both[:, :16].reshape(-1, 4, 4)[:, :3, :3]
+        values, _ = eigen(product - mean[:, :, None] * mean[:, None])
+        worse: npt.NDArray[np.bool_] = values[:, 0] > np.maximum(both[:, 16], plane_m**2)
+        return worse
 
     def compared(self, pairs: Indices, root: Indices, regions: Regions) -> Array:
         """Return gains of pairs of regions, or descriptions: (R, 4), see compare_regions."""

@@ -75,6 +75,21 @@ def test_joins_that_are_much_worse_planes_than_their_patches_are_undone():
     assert np.bincount(index).max() <= 3
 
 
+def test_a_long_bend_is_a_few_planes_instead_of_all_its_patches():
+    """Every tile continues the last one by 1 deg: a bend of 12 m, radius 57 m, sagitta 0.31 m."""
+    rng = np.random.default_rng(9)
+    radius_m, sigma_m = np.degrees(1.0), 0.015
+    x, y = rng.uniform(-6.0, 6.0, 40_000), rng.uniform(0.0, 1.0, 40_000)
+    z = radius_m - np.sqrt(radius_m**2 - x**2) + sigma_m * rng.standard_normal(len(x))
+    tile, points = np.floor(x + 6.0).astype(np.int32), np.column_stack([x, y, z])
+    index, _, curved = join_patches(pieces(points, tile), VIEW, (sigma_m, 0.0), SIZE_M)
+    assert not curved.any()
+    assert 3 <= len(curved) <= 6
+    for region in range(len(curved)):
+        own = points[index[tile] == region]
+        assert np.linalg.eigvalsh(np.cov(own.T))[0] < (1.25 * 1.02 * sigma_m) ** 2
+
+
 def test_a_rough_patch_that_bends_more_than_the_noise_is_curved():
     """Leaves of 5 cm on a dome were a plane: roughness of patches was taken for noise."""
     rng = np.random.default_rng(7)
