@@ -63,12 +63,15 @@ SEVEN_SCENES: Intrinsics = (585.0, 585.0, 320.0, 240.0)
 
 REPLICA: Intrinsics = (600.0, 600.0, 599.5, 339.5)
 
+USUAL_M = 0.8, 12.0
+"""Limits of the depth below which nine tenths of an image are, m: cameras measure 0.4 to 10 m."""
+
 INTRINSICS = (
+    'cam_params.json',
     'intrinsic_depth.txt',
     'intrinsics.txt',
     'camera-intrinsics.txt',
     'intrinsic/intrinsic_depth.txt',
-    'cam_params.json',
 )
 """Files of a matrix of 3 x 3 or 4 x 4, or of fx fy cx cy, in the folder or the one above."""
 
@@ -136,6 +139,16 @@ class DepthFolder:
             camera=astuple(camera),
             depth=DepthImage(points=points, depth=depth),
         )
+
+    def check_scale(self, scan: Scan) -> None:
+        """Warn if the depth of a scan is unusual for a camera, as if its unit were another."""
+        depth_m = float(np.quantile(scan.points[:, 2], 0.9)) if len(scan) else USUAL_M[0]
+        if not USUAL_M[0] <= depth_m <= USUAL_M[1]:
+            logger.warning(
+                '%s: 90%% of the depth is below %.2f m, which is unusual: is a metre not %g '
+                'values (%s)? State others as scale in cam_params.json, with fx, fy, cx, cy',
+                *(self.files[0], depth_m, self.units_per_m, self.format),
+            )
 
 
 def find_depth_folder(path: Path) -> DepthFolder | None:

@@ -133,6 +133,8 @@ class ScanFolder:
         first = self.first_scan()
         if first is None and len(self.files) == 1:
             raise FileFormatError(self.first_error)
+        if isinstance(self.dataset, DepthFolder) and first is not None:
+            self.dataset.check_scale(first)
         choice = choose_for_folder(request, config, poses is not None, first, missing)
         self.config, self.pose_reason = choice.config, choice.reason or rows_reason or reason
         is_alone = self.config.pose.source == 'identity' or (len(self.files) == 1 and is_free)

@@ -120,6 +120,35 @@ def test_a_folder_gives_the_wall_at_its_poses(tmp_path, make, capsys):
     assert 'replay takes poses from file' in printed
 
 
+def in_json(path, scale):
+    fx, fy, cx, cy = K
+    camera = {'fx': fx, 'fy': fy, 'cx': cx, 'cy': cy, 'scale': scale}
+    (path / 'cam_params.json').write_text(json.dumps({'camera': camera}))
+
+
+@pytest.mark.parametrize(('make', 'written', 'scale'), [(scannet, 1000.0, 1e4), (tum, 5e3, 1e3)])
+def test_an_unusual_depth_is_named_and_the_scale_of_a_file_corrects_it(
+    tmp_path, caplog, make, written, scale
+):
+    make(tmp_path)
+    mapped(tmp_path)
+    assert not caplog.records
+    for file in sorted(tmp_path.glob('depth/*.png')):
+        values = np.array(Image.open(file))
+        Image.fromarray(np.uint16(values * (scale / written))).save(file)
+    mapped(tmp_path)
+    unusual_m = WALL_M * scale / written
+    (warning,) = caplog.records
+    assert f'90% of the depth is below {unusual_m:.2f} m, which is unusual' in warning.message
+    assert f'is a metre not {written:g} values' in warning.message
+    assert 'scale in cam_params.json' in warning.message
+    caplog.clear()
+    in_json(tmp_path, scale)
+    surfels = mapped(tmp_path).map.surfels(5)
+    assert not caplog.records
+    np.testing.assert_allclose(surfels.position[:, 2], WALL_M, atol=1e-3)
+
+
 @pytest.mark.parametrize('make', [seven_scenes, scannet])
 def test_images_whose_pose_is_lost_are_dropped(tmp_path, make):
     make(tmp_path)
