@@ -201,12 +201,22 @@ def trajectories(args: argparse.Namespace) -> dict[str, Any]:
     """Return the errors of a trajectory."""
     from surfel_mapper.evaluation.trajectory_errors import compare
     from surfel_mapper.evaluation.truth import read_poses, true_poses
-    from surfel_mapper.files.trajectory import read_trajectory
+    from surfel_mapper.files.trajectory import read_trajectory, Trajectory
+    from surfel_mapper.offline.motion_clock import path_shift_s
 
     files = [path for path in (args.map, args.truth) if not path.is_dir()]
     by_number = len(files) == 2 and all(read_trajectory(f).stamp_ns is None for f in files)
     estimated_ns, estimated = read_poses(args.map, by_number=by_number)
     true_ns, true = true_poses(args.truth, estimated_ns, by_number=by_number)
+    if not by_number and not args.truth.is_dir():
+        shift_s = path_shift_s(Trajectory.from_matrices(true, true_ns), estimated_ns, estimated)
+        if shift_s is not None:
+            _log.warning(
+                '%s: by the motion, its times are %.3f s %s those of %s; errors compare poses of '
+                'other times. Add %.3f s to its times',
+                *(args.map, abs(shift_s), 'ahead of' if shift_s < 0 else 'behind', args.truth),
+                shift_s,
+            )
     try:
         return compare(
             estimated_ns,

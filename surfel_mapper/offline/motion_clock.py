@@ -170,6 +170,27 @@ class MotionClock:
         return PosedMotions(path, stamps_ns[np.array(self._pairs)], motions).shift_s()
 
 
+def path_shift_s(
+    path: Trajectory, stamps_ns: npt.NDArray[np.int64], poses: FloatArray
+) -> float | None:
+    """
+    Return the shift of stamps by which a path has the motions of poses; None if unknown.
+
+    Spans of time that do not overlap are compared from their first stamps on.
+    """
+    assert path.stamp_ns is not None, 'poses by number have no clock'
+    rows = np.unique(np.linspace(0, len(poses) - 1, 4 * PAIRS).astype(np.int64))
+    ends = np.searchsorted(stamps_ns, stamps_ns[rows] + APART_NS)
+    rows, ends = rows[ends < len(poses)], ends[ends < len(poses)]
+    if len(rows) < LEAST_PAIRS:
+        return None
+    is_apart = stamps_ns[0] > path.stamp_ns[-1] or stamps_ns[-1] < path.stamp_ns[0]
+    start_ns = int(path.stamp_ns[0] - stamps_ns[0]) if is_apart else 0
+    spans_ns = np.stack([stamps_ns[rows], stamps_ns[ends]], axis=1)
+    motions = np.linalg.inv(poses[rows]) @ poses[ends]
+    return PosedMotions(path, spans_ns, motions).shift_s(start_ns / 1e9)
+
+
 class PosedMotions:
     """
     Motions of scans, to be compared with those of poses at other times.
@@ -213,11 +234,17 @@ class PosedMotions:
         misfits = np.minimum(np.hypot(turned, moved_m), MOST_MISFIT)
         return np.where(is_posed, misfits.reshape(is_posed.shape), np.nan)
 
-    def shift_s(self) -> float | None:
-        """Return the shift of the stamps by which the poses have the motions; None if unknown."""
-        shifts_s = np.arange(-MOST_OFFSET_S, MOST_OFFSET_S + STEP_S, STEP_S)
+    def shift_s(self, start_s: float = 0.0) -> float | None:
+        """
+        Return the shift of the stamps by which the poses have the motions; None if unknown.
+
+        It is sought up to ``MOST_OFFSET_S`` from a start. Without a shift there may be no poses.
+        """
+        shifts_s = start_s + np.arange(-MOST_OFFSET_S, MOST_OFFSET_S + STEP_S, STEP_S)
         misfits = self.misfits(shifts_s)
         is_posed = np.isfinite(misfits).mean(axis=1) >= LEAST_SHARE
+        if not is_posed.any():
+            return None
         shifts_s, misfits = shifts_s[is_posed], misfits[is_posed]
         coarse_s = float(shifts_s[np.nanmean(misfits, axis=1).argmin()])
         fine_s = coarse_s + np.arange(-STEP_S, STEP_S, FINE_STEP_S)
@@ -230,5 +257,7 @@ class PosedMotions:
         most_s = min(0.5 * abs(shift_s), SAME_S)
         is_unique = np.abs(rivals_s - shift_s).max(initial=0.0) <= most_s
         unshifted = self.misfits(np.zeros(1))[0]
-        is_better = np.nanmean(unshifted - best) >= (BETTER - 1.0) * np.nanmean(best)
+        is_better = not np.isfinite(unshifted).any() or np.nanmean(unshifted - best) >= (
+            BETTER - 1.0
+        ) * np.nanmean(best)
         return shift_s if abs(shift_s) >= LEAST_OFFSET_S and is_unique and is_better else None

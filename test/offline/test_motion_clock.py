@@ -137,6 +137,22 @@ def test_the_shift_is_the_time_between_equal_motions(seconds):
     assert shift_s == pytest.approx(seconds, abs=0.01)
 
 
+@pytest.mark.parametrize('seconds', [0.0, 0.2, -37.0, 3600.0])
+def test_the_clocks_of_two_trajectories_are_compared_by_the_motion(tmp_path, caplog, seconds):
+    path = course()
+    truth = Trajectory.from_matrices(path.matrices, path.stamp_ns + 10**12)
+    estimated = Trajectory.from_matrices(
+        path.matrices[20:], truth.stamp_ns[20:] + round(S * seconds)
+    )
+    truth.save(tmp_path / 'true.tum')
+    estimated.save(tmp_path / 'estimated.tum')
+    main(['evaluate', str(tmp_path / 'estimated.tum'), '--truth', str(tmp_path / 'true.tum')])
+    said = ''.join(record.message for record in caplog.records)
+    side = 'ahead of' if seconds > 0.0 else 'behind'
+    assert (f'its times are {abs(seconds):.3f} s {side} those of' in said) == bool(seconds)
+    assert (f'Add {-seconds:.3f} s to its times' in said) == bool(seconds)
+
+
 def test_motions_of_another_drive_determine_no_offset():
     path, other = course(), course(rate_hz=9.1)
     rows = np.array([(row, row + 5) for row in range(60, 340, 7)])
