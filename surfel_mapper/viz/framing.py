@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.viz.discs import DrawnDiscs
 from surfel_mapper.viz.rendering import direction
 
@@ -24,8 +25,8 @@ UPRIGHT_DEG = (35.0, 20.0, 10.0, 5.0)
 LEAST_LEVEL = 0.05
 """Smallest share of the surface that is level ground."""
 
-ABOVE_SENSOR_M, LEAST_CEILING = 0.3, 0.2
-"""Height of a ceiling above the sensor, and its smallest area relative to that of the floor."""
+ABOVE_SENSOR_M, SQUARE_M, LEAST_COVERED = 0.3, 1.0, 0.5
+"""Height of a ceiling above the sensor; the smallest share of the floor in squares below it."""
 
 BINS, SPARSE, MOST_OUTSIDE = 96, 0.45, 0.1
 """
@@ -61,6 +62,12 @@ def upright(discs: DrawnDiscs) -> Array:
     return np.stack([np.cross(across, up), across, up])
 
 
+def levelled(surfels: Surfels) -> Array:
+    """Return the rotation (3, 3) to z up of a map in the frame of a camera; of others, none."""
+    R = upright(DrawnDiscs.of(surfels))
+    return R if R[2, 2] < 0.7 else np.eye(3)
+
+
 def ground_m(level: DrawnDiscs) -> float:
     """Return the height of the ground of upright discs: of the lower of the level surfaces."""
     heights = level.position[level.normal[:, 2] > 0.9, 2]
@@ -71,9 +78,11 @@ def ground_m(level: DrawnDiscs) -> float:
 def ceiling_m(level: DrawnDiscs, sensor_m: float) -> float:
     """Return the height at which upright discs are cut below a ceiling; inf without one."""
     area, height = level.radius_m**2, level.position[:, 2]
-    floor = area[level.normal[:, 2] > 0.7].sum()
+    floor = level.normal[:, 2] > 0.7
     above = (level.normal[:, 2] < -0.7) & (height > sensor_m + ABOVE_SENSOR_M)
-    if not above.any() or area[above].sum() < LEAST_CEILING * floor:
+    square = np.floor(level.position[:, :2] / SQUARE_M) @ np.array([1.0, 1.0j])
+    covered = floor & np.isin(square, square[above])
+    if not above.any() or area[covered].sum() < LEAST_COVERED * area[floor].sum():
         return np.inf
     order = np.argsort(height[above])
     total = np.cumsum(area[above][order])

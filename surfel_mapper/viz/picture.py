@@ -253,7 +253,7 @@ def draw_key(page: Axes, scene: MapScene, camera: Camera) -> None:
     text: dict[str, Any] = {'fontsize': TEXT_PT, 'color': INK, 'va': 'center'}
     side, left, low = square_m(camera), BORDER + 4, NOTE_PX
     page.plot([left, left + side * camera.px_per_m], [low + 66] * 2, color=INK, linewidth=2.5)
-    page.text(left, low + 36, f'{side:g} m, a square of the ground', **text)
+    page.text(left, low + 36, f'{side:g} m, one square of the grid', **text)
     arrow = {'arrowstyle': '->', 'color': INK, 'shrinkA': 0.0, 'shrinkB': 0.0}
     x, y = BORDER + 450, low + 46
     for name, (right, up) in zip('xyz', camera.R_view_map[:2].T.tolist(), strict=True):

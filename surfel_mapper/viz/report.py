@@ -29,6 +29,7 @@ from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.charts import histogram, lines, NO_DATA, short
+from surfel_mapper.viz.framing import levelled
 from surfel_mapper.viz.history import History
 from surfel_mapper.viz.markup import as_html, html_figures, html_table
 from surfel_mapper.viz.turning_view import turning_view
@@ -164,7 +165,7 @@ def figures(summary: Mapping[str, Any], history: History, surfels: Surfels) -> s
     shown = {
         'scans mapped': f'{scans["mapped"]:,} of {scans["received"]:,}',
         'surfels': f'{len(surfels):,}',
-        'points in them': short(int(surfels.num_points.sum())),
+        'points in surfels': short(int(surfels.num_points.sum())),
         'points of all scans': short(summary['points']),
         'voxel size': f'{summary["voxel_size_m"]:g} m',
     }
@@ -206,7 +207,7 @@ def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str
         stage: np.array(history.milliseconds[stage])
         for stage in sorted(history.milliseconds, key=stage_order)
     }
-    slope = np.degrees(np.arccos(np.clip(np.abs(surfels.normal[:, 2]), 0.0, 1.0)))
+    slope = np.degrees(np.arccos(np.clip(np.abs(surfels.normal @ levelled(surfels)[2]), 0, 1)))
     dropped = {'dropped': history.dropped}
     charts = {
         'Voxels over time': lines(seconds, {'voxels': history.voxels}, 'time (s)', 'voxels'),
@@ -237,11 +238,11 @@ def points_left_out(summary: Mapping[str, Any]) -> dict[str, int]:
 
 
 def fates(summary: Mapping[str, Any]) -> dict[str, int]:
-    """Return the number of scans mapped, and of others by cause."""
+    """Return the number of scans that were not mapped, by cause."""
     scans = summary['scans']
     gated = {'scans left out, too near to the last': scans['gated']} if scans['gated'] else {}
     dropped = {f'scans dropped: {cause}': n for cause, n in named(scans['dropped']).items()}
-    return {'scans mapped': scans['mapped'], **gated, **dropped}
+    return {**gated, **dropped}
 
 
 def named(counts: Mapping[str, int]) -> dict[str, int]:
@@ -268,9 +269,10 @@ def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
 
 
 def times_table(summary: Mapping[str, Any]) -> str:
-    """Return a table of the median and 99th percentile of every stage."""
-    stages = sorted(summary['milliseconds'].items(), key=lambda item: stage_order(item[0]))
-    rows = [(stage, f'{ms["median"]:.2f}', f'{ms["p99"]:.2f}') for stage, ms in stages]
+    """Return a table of the median and 99th percentile of every stage of a scan."""
+    stages = sorted(summary['milliseconds'], key=stage_order)
+    times = [(stage, summary['milliseconds'][stage]) for stage in stages if stage != 'loops']
+    rows = [(stage, f'{ms["median"]:.2f}', f'{ms["p99"]:.2f}') for stage, ms in times]
     return html_table(('stage', 'median', 'p99'), rows)
 
 
@@ -292,7 +294,5 @@ def settings_table(settings: Mapping[str, Any], chosen: Sequence[str] | None = N
         return html_table((), rows, num_texts=2)
 
     changed = table(ours) if ours else '<p class="none">No setting was changed.</p>'
-    return (
-        f'<h2>Settings</h2>{changed}'
-        f'<details><summary>{counted(len(usual), "other")}</summary>{table(usual)}</details>'
-    )
+    unchanged = f'<summary>{counted(len(usual), "setting")} not changed</summary>{table(usual)}'
+    return f'<h2>Settings</h2>{changed}<details>{unchanged}</details>'

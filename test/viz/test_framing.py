@@ -2,12 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The view of a map is level on its ground, below its ceiling, and without outliers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from surfel_mapper.viz.discs import DrawnDiscs
-from surfel_mapper.viz.framing import best_direction, ceiling_m, ground_m, mass_box, upright
+from surfel_mapper.viz.framing import (
+    best_direction,
+    ceiling_m,
+    ground_m,
+    levelled,
+    mass_box,
+    upright,
+)
 from test.viz.test_picture import sheet
 from test.viz.test_rendering import disc, joined
 
@@ -47,6 +56,17 @@ def test_the_ground_of_a_camera_is_where_its_y_points():
     np.testing.assert_allclose(R @ R_camera @ [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], atol=1e-9)
 
 
+def test_only_maps_in_the_frame_of_a_camera_are_levelled():
+    floor = sheet(0.0, 1.0, 1.0)
+    np.testing.assert_array_equal(levelled(floor), np.eye(3))
+    R_tilted = Rotation.from_euler('x', 20.0, degrees=True).as_matrix()
+    tilted = replace(floor, normal=floor.normal @ R_tilted.T)
+    np.testing.assert_array_equal(levelled(tilted), np.eye(3))
+    R_camera = Rotation.from_euler('x', 80.0, degrees=True).as_matrix()  # pitched by 10 deg
+    camera = replace(floor, normal=floor.normal @ R_camera.T)
+    np.testing.assert_allclose(levelled(camera)[2], R_camera[:, 2], atol=1e-9)
+
+
 def test_a_map_without_ground_stays_as_it_is():
     wall = disc((0.0, 0.0, 0.0), normal=(1.0, 0.0, 0.0))
     np.testing.assert_allclose(upright(wall), np.eye(3))
@@ -60,6 +80,8 @@ def test_a_ceiling_is_cut_and_a_floor_seen_from_below_is_not():
     assert ceiling_m(street, 1.5) == np.inf
     sign = disc((0.0, 0.0, 4.0), normal=(0.0, 0.0, -1.0))
     assert ceiling_m(joined(street, sign), 1.5) == np.inf
+    balconies = DrawnDiscs.of(sheet(4.0, -1.0, 1.0, centre=(15.0, 0.0)))  # over a quarter
+    assert ceiling_m(joined(street, balconies), 1.5) == np.inf
 
 
 def test_the_ground_is_the_lower_level_surface():

@@ -13,7 +13,8 @@
 // they come in random order, so the first are as good as any.
 // In the place of the surfels the mesh of a TSDF or the models can be shown, where there are any: 16
 // bytes a vertex (place, colour, normal), drawn whole, and lit from where the eye is.
-// The view has z up; it turns about a point that panning moves.
+// Up is the third row of data.level: z, but in the frame of a camera away from the ground. The view
+// turns about a point that panning moves.
 'use strict';
 
 (() => {
@@ -24,7 +25,7 @@
     in vec3 normal;
     in vec3 paint;
     uniform mat4 camera;
-    uniform vec3 low, size, eye, grid;
+    uniform vec3 low, size, eye, grid, light;
     uniform float largest, hide, until, lamp, cell, margin;
     out vec3 colour;
     void main() {
@@ -46,7 +47,7 @@
       float facing = dot(n, normalize(eye - centre));
       bool gone = look.y > until || facing < -hide;
       gl_Position = gone ? vec4(2, 2, 2, 1) : camera * vec4(at, 1);
-      float lit = 0.725 + 0.275 * dot(n, vec3(-0.40, -0.55, 0.73)); // as in viz/discs.py
+      float lit = 0.725 + 0.275 * dot(n, light);
       colour = paint * mix(0.62 + 0.38 * abs(facing), lit, lamp);
     }`;
   const FRAGMENT = `#version 300 es
@@ -85,7 +86,7 @@
   const OUTER = 1 / Math.cos(Math.PI / CORNERS); // of an octagon about a circle of radius 1
   const FREE = 1e9; // margin of discs that no cell limits, m
   const FACING = 0.05; // discs are hidden that face away by more than this
-  const RED = [0.86, 0.16, 0.13], MARK = [1, 0.55, 0];
+  const RED = [0.86, 0.16, 0.13], GREEN = [0.17, 0.63, 0.17], MARK = [1, 0.55, 0];
   const FAN = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5, 0, 5, 6, 0, 6, 7];
   const canvas = document.getElementById('surfels');
   const data = JSON.parse(document.getElementById('map').textContent);
@@ -207,22 +208,44 @@
 
   // All places are about the middle of the map, so that float32 is precise enough anywhere.
   const half = data.size.map((side) => side / 2);
-  // The view begins with the box of the surfels that do not face down, without the farthest of them.
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  const cross = (a, b) => [
+    a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
+  ];
+  const unit = (a) => a.map((value) => value / Math.hypot(...a));
+  const levelled = (a) => data.level.map((row) => dot(row, a));
+  const unlevelled = (a) => [0, 1, 2].map((i) => dot(data.level.map((row) => row[i]), a));
+  const LIGHT = unlevelled([-0.40, -0.55, 0.73]); // as in viz/discs.py
+  // The view begins with the surfels that do not face down, without the farthest of them.
   const words = new DataView(surfels.buffer);
+  const normalOf = (row) => unit([0, 1, 2].map((i) => words.getInt8(row * BYTES + 8 + i)));
   const placeOf = (row, axis) => (
     words.getUint16(row * BYTES + 2 * axis, true) / 65535 * data.size[axis] - half[axis]
   );
+  const corner = (number) => half.map((side, axis) => (number >> axis & 1 ? side : -side));
+  let framed = [0, 1, 2, 3, 4, 5, 6, 7].map((number) => [...levelled(corner(number)), 0]);
+  const upper = Array.from({ length: count }, (_, row) => row)
+    .filter((row) => dot(data.level[2], normalOf(row)) > -0.2)
+    .map((row) => [
+      ...levelled([0, 1, 2].map((axis) => placeOf(row, axis))),
+      surfels[row * BYTES + 6] / 255 * data.largest,
+    ]);
   const box = [0, 1, 2].map((axis) => {
-    const all = [];
-    for (let row = 0; row < count; row++) {
-      if (words.getInt8(row * BYTES + 10) > -25) all.push(placeOf(row, axis));
-    }
-    const sorted = Float32Array.from(all).sort();
-    return all.length ? [0.03, 0.97].map((part) => sorted[Math.floor(part * (all.length - 1))])
-      : [-half[axis], half[axis]];
+    const sorted = Float64Array.from(upper.length ? upper : framed, (at) => at[axis]).sort();
+    return upper.length ? [0.03, 0.97].map((part) => sorted[Math.round(part * (upper.length - 1))])
+      : [sorted[0], sorted[7]];
   });
-  const middle = box.map(([low, high]) => (low + high) / 2);
+  if (upper.length) { // in random order
+    framed = upper.filter((at) => box.every(([low, high], i) => at[i] >= low && at[i] <= high))
+      .slice(0, 1000);
+  }
+  const centre = box.map(([low, high]) => (low + high) / 2), middle = unlevelled(centre);
   const reach = box.map(([low, high]) => (high - low) / 2 + data.largest);
+  for (let pose = 0; pose < path.length; pose += 3) {
+    const at = levelled(path.subarray(pose, pose + 3));
+    const isNear = at.every((value, i) => Math.abs(value - centre[i]) < 1.5 * reach[i]);
+    if (isNear) framed.push([...at, 0]);
+  }
   const radius = Math.max(Math.hypot(...reach), 0.5);
   const across = reach[0] >= reach[1];
   const start = { yaw: across ? -Math.PI / 2 : 0, pitch: 0.75 };
@@ -241,47 +264,32 @@
     redraw();
   }
 
-  // Whether all corners of the box of the map are in view, on telephones too.
+  // Whether the map is in view, on telephones too.
   function isWhole() {
     const eye = eyeOf();
     const [right, up, back] = axes();
     const wide = MARGIN * Math.tan(0.35) * (canvas.clientWidth || 1) / (canvas.clientHeight || 1);
-    for (let corner = 0; corner < 8; corner++) {
-      const from = [0, 1, 2].map((axis) => (
-        middle[axis] + (corner >> axis & 1 ? 1 : -1) * reach[axis] - eye[axis]
-      ));
+    return framed.every(([x, y, z, size]) => {
+      const from = unlevelled([x, y, z]).map((value, i) => value - eye[i]);
       const ahead = -dot(back, from);
-      if (ahead <= 0 || Math.abs(dot(right, from)) > wide * ahead) return false;
-      if (Math.abs(dot(up, from)) > MARGIN * Math.tan(0.35) * ahead) return false;
-    }
-    return true;
+      return ahead > 0 && Math.abs(dot(right, from)) + size <= wide * ahead
+        && Math.abs(dot(up, from)) + size <= MARGIN * Math.tan(0.35) * ahead;
+    });
   }
 
   function eyeOf() {
-    const flat = Math.cos(view.pitch) * view.distance;
-    return [
-      view.target[0] + flat * Math.cos(view.yaw),
-      view.target[1] + flat * Math.sin(view.yaw),
-      view.target[2] + Math.sin(view.pitch) * view.distance,
-    ];
+    return axes()[2].map((value, i) => view.target[i] + value * view.distance);
   }
 
   function axes() {
-    const back = [
+    const back = unlevelled([
       Math.cos(view.pitch) * Math.cos(view.yaw),
       Math.cos(view.pitch) * Math.sin(view.yaw),
       Math.sin(view.pitch),
-    ];
-    const right = [-Math.sin(view.yaw), Math.cos(view.yaw), 0];
-    const up = [
-      back[1] * right[2] - back[2] * right[1],
-      back[2] * right[0] - back[0] * right[2],
-      back[0] * right[1] - back[1] * right[0],
-    ];
-    return [right, up, back];
+    ]);
+    const right = unlevelled([-Math.sin(view.yaw), Math.cos(view.yaw), 0]);
+    return [right, cross(back, right), back];
   }
-
-  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
   function camera(eye) {
     const [right, up, back] = axes();
@@ -333,6 +341,8 @@
     gl.useProgram(line);
     gl.bindVertexArray(lineArrays);
     gl.uniformMatrix4fv(gl.getUniformLocation(line, 'camera'), false, matrix);
+    gl.uniform3f(gl.getUniformLocation(line, 'ink'), ...GREEN);
+    gl.drawArrays(gl.POINTS, 0, 1);
     gl.uniform3f(gl.getUniformLocation(line, 'ink'), ...RED);
     const last = Math.round(until() * (poses - 1));
     gl.drawArrays(gl.LINE_STRIP, 0, last + 1);
@@ -377,11 +387,6 @@
       length < 0.01 ? `${+(length * 1000).toPrecision(1)} mm` : `${+length.toPrecision(1)} m`;
   }
 
-  const cross = (a, b) => [
-    a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
-  ];
-  const unit = (a) => a.map((value) => value / Math.hypot(...a));
-  const normalOf = (row) => unit([0, 1, 2].map((i) => words.getInt8(row * BYTES + 8 + i)));
   const hides = () => document.getElementById('hide').checked;
   const growth = () => Number(document.getElementById('discs').value);
   const radiusOf = (row) => surfels[row * BYTES + 6] / 255 * data.largest * growth();
@@ -462,7 +467,7 @@
   }
 
   function measured(first, second) {
-    const away = second.at.map((value, i) => value - first.at[i]);
+    const away = levelled(second.at.map((value, i) => value - first.at[i]));
     const cos = Math.min(Math.abs(dot(normalOf(first.row), normalOf(second.row))), 1);
     return `distance ${Math.hypot(...away).toFixed(3)} m\n`
       + `horizontal ${Math.hypot(away[0], away[1]).toFixed(3)} m\n`
@@ -493,7 +498,9 @@
     return `${column.whole || column.name === 'size' ? value : +text}`
       + `${column.unit ? ` ${column.unit}` : ''}`;
   }
-  const slopeOf = (row) => Math.acos(Math.min(Math.abs(normalOf(row)[2]), 1)) * 180 / Math.PI;
+  const slopeOf = (row) => (
+    Math.acos(Math.min(Math.abs(dot(data.level[2], normalOf(row))), 1)) * 180 / Math.PI
+  );
 
   function valuesOf(row) {
     const place = [0, 1, 2].map((i) => (placeOf(row, i) + data.middle[i]).toFixed(2));
@@ -506,15 +513,15 @@
   }
 
   // What discs can be coloured by: a paint (red, green, blue) or a value of a scale, of each row.
-  const heights = box[2].map((value) => value + data.middle[2]);
+  const ground = dot(data.level[2], data.middle);
   const colourings = [
     {
       name: 'normal', legend: 'normal: red x, green y, blue z',
       paint: (row) => normalOf(row).map((value) => 255 * (0.484 + 0.45 * (0.5 + 0.5 * value))),
     },
     {
-      name: 'height', unit: 'm', shown: heights,
-      value: (row) => placeOf(row, 2) + data.middle[2],
+      name: 'height', unit: 'm', shown: box[2].map((value) => value + ground),
+      value: (row) => levelled([0, 1, 2].map((i) => placeOf(row, i)))[2] + ground,
     },
     { name: 'slope', unit: '\u00b0', shown: [0, 90], value: slopeOf },
     ...columns.map((column) => ({ ...column, value: (row) => valueOf(column, row) })),
@@ -555,6 +562,7 @@
     gl.uniform3f(at('low'), -half[0], -half[1], -half[2]);
     gl.uniform3f(at('size'), ...data.size);
     gl.uniform3f(at('eye'), ...eye);
+    gl.uniform3f(at('light'), ...LIGHT);
     gl.uniform3f(at('grid'), ...data.grid);
     gl.uniform1f(at('cell'), data.cell);
     gl.uniform1f(at('margin'), drawn < count ? FREE : margin());
