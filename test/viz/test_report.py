@@ -209,7 +209,7 @@ def test_settings_of_the_user_are_named_first(tmp_path):
     parsed = report(tmp_path, settings=settings, settings_set=['map.voxel_size_m'])
     cells = [text for tag, _, text in parsed.text if tag == 'td']
     assert cells.index('map.voxel_size_m') < cells.index('pose.source')
-    assert ['2 settings not changed'] == [t for tag, _, t in parsed.text if tag == 'summary']
+    assert [t for tag, _, t in parsed.text if tag == 'summary'] == ['2 settings not changed']
 
 
 def test_doubtful_poses_are_stated_in_words(tmp_path):
