@@ -69,9 +69,11 @@ def open_indexed(path: Path) -> IndexedBag | None:
 
 
 def is_indexed(mcap: McapReader) -> bool:
-    """Return whether each chunk has an index; of others rosbags yields nothing."""
-    is_empty = not mcap.metadata.message_count
-    return is_empty or (bool(mcap.chunks) and all(c.channel_count for c in mcap.chunks))
+    """Return whether the summary has each chunk and channel; of others rosbags yields nothing."""
+    counts = [chunk.channel_count for chunk in mcap.chunks]
+    return bool(counts) and all(
+        channels and channels.keys() <= mcap.channels.keys() for channels in counts
+    )
 
 
 def ros2_connection(

@@ -12,8 +12,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from itertools import pairwise
 import logging
 from pathlib import Path
+import re
 from textwrap import shorten
 from typing import Any
 
@@ -136,7 +138,13 @@ def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
         raise BagError(
             f'{directory / METADATA}: lists {", ".join(foreign)}, expected .mcap or .db3 files'
         )
-    return files if all(map(Path.is_file, files)) else replaced_files(directory, files)
+    if not all(map(Path.is_file, files)):
+        return replaced_files(directory, files)
+    names = {unpacked_name(file) for file in files}
+    if extra := [f.name for f in loose_files(directory) if unpacked_name(f) not in names]:
+        unlisted = ', '.join(extra)
+        _log.warning('%s: %s is not in its %s and not read', directory, unlisted, METADATA)
+    return files
 
 
 def replaced_files(directory: Path, files: list[Path]) -> list[Path]:
@@ -178,7 +186,21 @@ def loose_files(directory: Path) -> list[Path]:
         if folders := sorted(file.name for file in directory.iterdir() if file.is_dir()):
             listed += f'; its folders: {shorten(", ".join(folders), 80)}'
         raise BagError(f'{directory}: {listed}; expected {readable()}')
-    return sorted(files, key=by_number)
+    files = sorted(files, key=by_number)
+    for older, newer in pairwise(files):
+        (stem, number), (name, following) = (split_number(f) for f in (older, newer))
+        if stem == name and following > number + 1:
+            _log.warning(
+                '%s: no file between %s and %s: is a part of the bag missing?',
+                *(directory, older.name, newer.name),
+            )
+    return files
+
+
+def split_number(file: Path) -> tuple[str, int]:
+    """Return the name of a file of a split bag without its number, and the number; -1 without."""
+    match = re.fullmatch(r'(.*_)(\d+)\.\w+', unpacked_name(file))
+    return (match[1], int(match[2])) if match else (file.name, -1)
 
 
 def damaged_metadata(path: Path, error: Exception) -> BagError:

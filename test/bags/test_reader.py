@@ -234,6 +234,36 @@ def test_a_recording_without_metadata_yields_all_its_files_in_order(tmp_path):
     assert_is_the_drive(read(path))
 
 
+@pytest.mark.parametrize(('number', 'is_whole'), [(1, True), (2, False)])
+def test_a_gap_in_the_numbers_of_files_without_metadata_is_named(
+    tmp_path, caplog, number, is_whole
+):
+    messages, path = drive(), tmp_path / 'drive'
+    path.mkdir()
+    for name, rows in (
+        ('a_0', messages[:9]),
+        (f'a_{number}', messages[9:]),
+        ('b_9', messages[:1]),
+    ):
+        write_rosbag2(tmp_path / name, rows)
+        shutil.copy(tmp_path / name / f'{name}.mcap', path)
+    read(path)
+    assert [record.message for record in caplog.records] == (
+        []
+        if is_whole
+        else [f'{path}: no file between a_0.mcap and a_2.mcap: is a part of the bag missing?']
+    )
+
+
+def test_a_file_that_metadata_does_not_list_is_named(tmp_path, caplog):
+    path = write_rosbag2(tmp_path / 'drive', drive())
+    shutil.copy(path / 'drive.mcap', path / 'drive_1.mcap')
+    assert_is_the_drive(read(path))
+    assert [record.message for record in caplog.records] == [
+        f'{path}: drive_1.mcap is not in its metadata.yaml and not read'
+    ]
+
+
 def test_files_that_overlap_in_time_are_merged(tmp_path):
     messages = drive()
     path = tmp_path / 'drive'

@@ -44,6 +44,7 @@ LAYOUTS = {
         'repeat_channels': False,
         'repeat_schemas': False,
     },
+    'no channels in the summary': {'repeat_channels': False, 'repeat_schemas': False},
     'chunks without message index': {'index_types': IndexType.CHUNK},
 }
 
