@@ -459,6 +459,22 @@ def test_moves_are_new_parents_and_other_static_transforms():
     assert (buffer.move.child, buffer.move.parents) == ('base', ('odom', 'wrong'))
 
 
+@pytest.mark.parametrize(
+    ('step_m', 'seconds', 'is_jump'),
+    [
+        *[(0.19, 0.0, False), (0.21, 0.0, True), (1.1, 0.02, False), (1.3, 0.02, True)],
+        *[(5.0, 0.09, False), (5.5, 0.09, True), (500.0, 0.1, False)],
+    ],
+)
+def test_a_step_that_no_robot_makes_is_a_move(step_m, seconds, is_jump):
+    buffer = drive()
+    buffer.add('odom', 'base', EPOCH + 3 * S + round(seconds * S), moved(30.0 - step_m))
+    assert (buffer.move is not None) == is_jump
+    if is_jump:
+        assert buffer.move.parents == ('odom', 'odom')
+        assert buffer.move.positions == ((30.0, 0.0, 0.0), (30.0 - step_m, 0.0, 0.0))
+
+
 def test_new_parents_without_end_do_not_fill_the_memory(monkeypatch):
     monkeypatch.setattr(buffer_module, 'MAX_EDGES', 5)
     buffer = TransformBuffer()

@@ -370,7 +370,7 @@ class Mapper:
     @property
     def mount_changes(self) -> str:
         """Sensors that have moved on the robot since the oldest scan of the map, in words."""
-        oldest = next(iter(self.window), None)
+        oldest = next(iter(self.window), None) if self.window.keeps_scans else None
         return self._pipeline.poses.mounts.warning(0 if oldest is None else oldest.stamp_ns)
 
     def align(self) -> Alignment:
@@ -577,6 +577,7 @@ class Mapper:
             'voxel_size_m': self.map.voxel_size_m,
             'origin_m': self.map.origin_m.tolist(),
             'window_scans': len(self.window),
+            'mount_changes': self.mount_changes,
             'voxels': self.map.num_voxels,
             'surfels': len(self.map.surfels(self.config.map.min_points)),
             'digest': self.map.digest(),

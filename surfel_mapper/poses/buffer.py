@@ -51,6 +51,10 @@ SAME_MOUNT = 1e-5
 ALTERNATING = 4
 """Changes of parent that one restarted publisher, or one stray message, cannot make."""
 
+JUMP_M, JUMP_M_S, JUMP_NS = 0.2, 60.0, 100_000_000
+"""Least step, m, and speed, m/s, of a jump between two poses at most this far apart, ns. Odometry
+that restarts jumps, and two publishers of one transform. Poses without times have 0.1 s each."""
+
 MAX_NAMES = 12
 """Number of frames named in a message."""
 
@@ -58,7 +62,7 @@ MAX_NAMES = 12
 @dataclass(frozen=True, slots=True)
 class FrameMove:
     """
-    A frame that got a new parent, or another static transform in its parent.
+    A frame that got a new parent, or another static transform in its parent, or jumped.
 
     Attributes
     ----------
@@ -295,8 +299,8 @@ class TransformBuffer:
         if edge.stamps and stamp_ns < edge.stamps[-1] - self._reset_after_ns:
             edge.forget_oldest(num_before)
             is_back = edge is self._newest
-        if not edge.stamps or (edge.parent != parent and stamp_ns >= edge.stamps[-1]):
-            self._note_move(edge, parent, T_parent_child)
+        if not edge.stamps or stamp_ns >= edge.stamps[-1]:
+            self._note_move(edge, parent, T_parent_child, stamp_ns)
         edge.insert(stamp_ns, parent, T_parent_child)
         edge.forget_before(edge.stamps[-1] - self._history_ns)
         self.num_transforms += len(edge.stamps) - num_before
@@ -406,16 +410,20 @@ class TransformBuffer:
             self.num_transforms -= len(former.stamps)
             self._newest = self._edge_of_newest()
 
-    def _note_move(self, edge: PoseTrack, parent: str, transform: Transform) -> None:
-        """Set ``move`` if an edge had another parent, or another static transform."""
+    def _note_move(
+        self, edge: PoseTrack, parent: str, transform: Transform, stamp_ns: int = 0
+    ) -> None:
+        """Set ``move`` if an edge had another parent, or another static transform, or jumps."""
         former = self._edges.get(edge.child)
         if former is None or not former.parents:
             return
         T_former = former.transforms[-1]
-        is_same = former.parent == parent and former.is_static == edge.is_static
-        if is_same and (not edge.is_static or np.allclose(T_former, transform, 0.0, SAME_MOUNT)):
-            return
         positions = tuple(T_former[:3, 3].tolist()), tuple(transform[:3, 3].tolist())
+        if former.parent == parent and former.is_static == edge.is_static:
+            if edge.is_static and np.allclose(T_former, transform, 0.0, SAME_MOUNT):
+                return
+            if not edge.is_static and not is_jump(positions, stamp_ns - former.stamps[-1]):
+                return
         self.move = FrameMove(edge.child, (former.parent, parent), positions)
 
     def _edge_of_newest(self) -> PoseTrack | None:
@@ -492,6 +500,12 @@ class TransformBuffer:
         if unseen:
             return f'no transform of {unseen} yet; frames seen: {names or "none"}'
         return f'no transforms lead from one to the other yet; frames seen: {names}'
+
+
+def is_jump(positions: tuple[tuple[float, ...], ...], duration_ns: int) -> bool:
+    """Return whether no robot moves so far in so short a time."""
+    least_m = max(JUMP_M, JUMP_M_S * duration_ns / NS_PER_S)
+    return duration_ns < JUMP_NS and math.dist(*positions) > least_m
 
 
 def _parents_in_turn(edge: PoseTrack) -> str:

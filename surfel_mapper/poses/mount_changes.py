@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-MountChanges: sensors that have moved on the robot while they were mapped, in words.
+MountChanges: sensors that moved on the robot while mapping, and jumps of poses, in words.
 
-The map then holds scans of the old mount, at poses that the new one contradicts.
+The map then holds scans of the old place, at poses that the new one contradicts.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class MountChanges:
         self._changes.clear()
 
     def warning(self, oldest_ns: int) -> str:
-        """Return the changes after the oldest scan of the map, and the remedy; empty if none."""
+        """Return the changes after the oldest scan of the map; empty if there are none."""
         texts = [
             _described(change.move, change.number)
             for change in self._changes.values()
@@ -63,7 +63,7 @@ class MountChanges:
         ]
         if not texts:
             return ''
-        return f'{"; ".join(texts)}; the map holds scans of the old mount until ~/clear'
+        return f'{"; ".join(texts)}; the map holds scans of the old place'
 
 
 def _described(move: FrameMove, number: int) -> str:

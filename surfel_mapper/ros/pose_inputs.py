@@ -174,7 +174,11 @@ class PoseInputs:
 
     def mount_changes(self, changes: str) -> str:
         """Return changes of mounts with the nodes that publish them; empty if there are none."""
-        return f'{changes} ({self._subscriptions.eager_publishers()})' if changes else ''
+        return (
+            f'{changes} until ~/clear ({self._subscriptions.eager_publishers()})'
+            if changes
+            else ''
+        )
 
     def note_cloud(self, frame_id: str) -> None:
         """Take the frame of the first cloud; the waits begin with it."""

@@ -26,7 +26,7 @@ from surfel_mapper.offline.replay import ReplayOptions
 from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import as_text
 from test import extras
-from test.bags.recorded import drive, NUM_SCANS, START_NS, write_rosbag2
+from test.bags.recorded import drive, NUM_SCANS, PERIOD_NS, START_NS, write_rosbag2
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 
@@ -195,3 +195,33 @@ def test_the_trajectory_is_that_of_the_map_if_time_was_set_back():
         trajectory.add(update)
     assert trajectory.stamps_ns == [50 * 10**9, 52 * 10**9]
     assert (len(trajectory.poses), mapper.map.num_points) == (2, 10)
+
+
+@pytest.mark.parametrize(
+    ('change', 'says'),
+    [
+        (
+            lambda entries, at_ns: entries.transform(
+                '/tf_static', at_ns, 'base_link', 'lidar', (1.0, 0.0, 0.25)
+            ),
+            "'lidar' has moved from (0.000, 0.000, 0.250) m in 'base_link' to (1.000, 0.000",
+        ),
+        (
+            lambda entries, at_ns: entries.transform(
+                '/tf', at_ns, 'odom', 'base_link', (-2.0, 0.0, 0.75)
+            ),
+            "'base_link' has moved from (1.000, 0.000, 0.750) m in 'odom' to (-2.000, 0.000",
+        ),
+    ],
+)
+def test_a_map_with_another_mount_or_a_jump_of_the_poses_is_in_doubt(
+    tmp_path, capsys, change, says
+):
+    entries = drive()
+    change(entries, START_NS + 2 * PERIOD_NS + 20_000_000)
+    entries.sort(key=lambda entry: entry[2])
+    bag = write_rosbag2(tmp_path / 'bag', entries)
+    assert main(['replay', str(bag), '-o', str(tmp_path / 'out')]) == 4
+    said = capsys.readouterr()
+    assert f'surfel-mapper: {says}' in said.err
+    assert 'the map holds scans of the old place' in said.out
