@@ -109,59 +109,6 @@ class SurfelIndex:
         rows[is_finite] = np.where(number < len(self.surfels), number, -1)
         return rows, distance
 
-    def best_planar(
-        self, points: npt.ArrayLike, k: int, max_distance_m: float
-    ) -> npt.NDArray[np.int64]:
-        """
-        Return the most planar surfels around each point.
-
-        Parameters
-        ----------
-        points : (N, 3) float, m
-            In the frame of the map.
-        k : int
-            Number of surfels for each point.
-        max_distance_m : float
-            Maximum distance from point to surfel position.
-
-        Returns
-        -------
-        (N, k) int64
-            Rows of ``surfels``, the most planar first, padded with -1. Surfels without a
-            planarity are ignored.
-
-        Raises
-        ------
-        ValueError
-            If k is not positive.
-
-        """
-        if k < 1:
-            raise ValueError(f'k: {k}, expected 1 or more')
-        xyz, radius_m = _as_xyz(points), _as_radius('max_distance_m', max_distance_m)
-        rows, planarity = np.full((len(xyz), k), -1), self.surfels.planarity
-        is_finite = np.isfinite(xyz).all(axis=1)
-        for number in np.flatnonzero(is_finite):
-            around = np.array(self._tree.query_ball_point(xyz[number], radius_m), np.int64)
-            around = around[~np.isnan(planarity[around])]
-            best = around[np.lexsort((around, -planarity[around]))][:k]
-            rows[number, : len(best)] = best
-        return rows
-
-    def in_box(self, low: npt.ArrayLike, high: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """Return the rows of the surfels in a box, m, including its faces, ascending."""
-        position = self.surfels.position
-        lowest, highest = np.asarray(low, np.float64), np.asarray(high, np.float64)
-        if lowest.shape != (3,) or highest.shape != (3,):
-            raise ValueError('low, high: expected the corners of a box, x y z each')
-        return np.flatnonzero(((position >= lowest) & (position <= highest)).all(axis=1))
-
-    def in_radius(self, center: npt.ArrayLike, radius_m: float) -> npt.NDArray[np.int64]:
-        """Return the rows of the surfels within a distance of a point, ascending."""
-        _as_radius('radius_m', radius_m)
-        step = self.surfels.position - _as_xyz(np.reshape(np.asarray(center), (1, 3)))
-        return np.flatnonzero((step * step).sum(axis=1) <= radius_m * radius_m)
-
     def plane_distance(
         self, points: npt.ArrayLike, max_distance_m: float = 0.0
     ) -> npt.NDArray[np.float64]:

@@ -32,10 +32,9 @@ for number in range(6):
         'position', 'normal', 'planarity', 'curvature', 'eigenvalues', 'num_points'))
     print(len(surfels), hashlib.sha256(bits).hexdigest())
 coarse = surfel_map.coarsen(2, within=(np.array([44950, -35, -5]), np.array([45050, 5, 12])))
-index, low, high = coarse.index(2), [8990.0, -8.0, -1.0], [9009.0, 1.0, 3.0]
+index = coarse.index(2)
 points = index.surfels.position + rng.normal(size=(len(index.surfels), 3))
 print(coarse.digest(), index.at(points).tolist(), index.nearest(points, 0.7)[0].tolist())
-print(index.best_planar(points, 3, 1.5).tolist(), index.in_box(low, high).tolist())
 print(len(surfel_map.surfels_changed(since=surfel_map.version - 3)))
 window = [WindowedScan(moments=each, stamp_ns=n, T_map_sensor=pose) for n, each in enumerate(live)]
 few = surfel_map.surfels(1, at_most=100).voxel_index

@@ -50,23 +50,6 @@ def test_nearest_is_nearest_of_all(index, points, radius_m):
             assert distance_m == pytest.approx(every.min(), abs=1e-12)
 
 
-@pytest.mark.parametrize('k', [1, 4, 200])
-def test_best_planar_ranks_those_within_the_radius(index, points, k):
-    planarity = index.surfels.planarity
-    for point, rows in zip(points, index.best_planar(points, k, 1.1), strict=True):
-        within = np.flatnonzero((distances(index, point) <= 1.1) & ~np.isnan(planarity))
-        expected = within[np.lexsort((within, -planarity[within]))][:k]
-        assert rows.tolist() == expected.tolist() + [-1] * (k - len(expected))
-
-
-def test_in_box_and_in_radius_find_all_surfels(index):
-    position = index.surfels.position
-    inside = [i for i, p in enumerate(position) if all(p >= (-1, 0, -2)) and all(p <= (1, 3, 0))]
-    assert index.in_box((-1.0, 0.0, -2.0), (1.0, 3.0, 0.0)).tolist() == inside != []
-    near = np.flatnonzero(distances(index, (1.0, 1.0, 0.0)) <= 1.5).tolist()
-    assert index.in_radius((1.0, 1.0, 0.0), 1.5).tolist() == near != []
-
-
 def test_plane_distance_is_positive_on_the_side_of_the_sensor():
     rng = np.random.default_rng(6)
     floor = np.c_[rng.uniform(0.0, 2.0, (500, 2)), np.full(500, 0.2)]
@@ -98,9 +81,7 @@ def test_an_empty_map_finds_nothing():
     index = SurfelMap(VOXEL_M).index()
     assert index.at([[0.0, 0.0, 0.0]]).tolist() == [-1]
     assert index.nearest([[0.0, 0.0, 0.0]], 1.0)[0].tolist() == [-1]
-    assert index.best_planar([[0.0, 0.0, 0.0]], 2, 1.0).tolist() == [[-1, -1]]
     assert np.isnan(index.plane_distance([[0.0, 0.0, 0.0]])).all()
-    assert index.in_box((-1, -1, -1), (1, 1, 1)).tolist() == []
 
 
 def test_invalid_points_have_no_surfel(index):
@@ -112,9 +93,7 @@ def test_invalid_points_have_no_surfel(index):
 def test_invalid_queries_are_refused(index):
     with pytest.raises(ValueError, match=r'points: shape \(3,\)'):
         index.at([0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match='k: 0'):
-        index.best_planar([[0.0, 0.0, 0.0]], 0, 1.0)
     with pytest.raises(ValueError, match='max_distance_m: nan'):
         index.nearest([[0.0, 0.0, 0.0]], float('nan'))
-    with pytest.raises(ValueError, match=r'radius_m: -5\.0, expected zero or more'):
-        index.in_radius([0.0, 0.0, 0.0], -5.0)
+    with pytest.raises(ValueError, match=r'max_distance_m: -5\.0, expected zero or more'):
+        index.nearest([[0.0, 0.0, 0.0]], -5.0)
