@@ -1,23 +1,50 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Checks of the arguments of public functions; errors name argument, value and expectation.
+Checks of the arguments of public functions, and short texts of the records that they return.
 
-Callers catch ValueError, TypeError and the errors of this package; NumPy, kernels and missing
-attributes raise others, or name variables that the caller does not know.
+Errors name argument, value and expectation. Callers catch ValueError, TypeError and the errors of
+this package; NumPy, kernels and missing attributes raise others, or name variables that the caller
+does not know.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 MAX_SQUARE_ERROR = 1e-2
 """Tolerance of the squared norm of a quaternion, that of tf2: 0.71 0.71 of launch files passes."""
+
+MOST_LETTERS = 80
+"""Limit of the text of a collection in a record, a line of a terminal."""
+
+
+class Record:
+    """A dataclass whose text has types and shapes of its arrays, and sizes of collections."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        """Return all fields in one line."""
+        named = ((field.name, getattr(self, field.name)) for field in fields(cast(Any, self)))
+        texts = [f'{name}={sized(value)}' for name, value in named]
+        return f'{type(self).__name__}({", ".join(texts)})'
+
+
+def sized(value: object) -> str:
+    """Return an array as its type and shape, a long collection as its size, others in full."""
+    if isinstance(value, np.ndarray):
+        return f'{value.dtype} {value.shape}'
+    text = repr(value)
+    if isinstance(value, (list, tuple, dict)) and len(text) > MOST_LETTERS:
+        return f'{type(value).__name__} of {len(value)}'
+    return text
 
 
 def as_array(name: str, values: npt.ArrayLike) -> npt.NDArray[Any]:
@@ -53,7 +80,7 @@ def as_numbers(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     except (TypeError, ValueError, OverflowError):
         shown = repr(values) if isinstance(values, str) else f'a {type(values).__name__}'
         if isinstance(values, np.ndarray):
-            shown = f'{array.dtype} {array.shape}'
+            shown = sized(array)
         raise ValueError(f'{name}: {shown}, expected numbers') from None
 
 

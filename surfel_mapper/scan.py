@@ -18,12 +18,12 @@ from typing import Any, cast, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_array, as_numbers, check_kind, check_rows
+from surfel_mapper.arguments import as_array, as_numbers, check_kind, check_rows, Record
 from surfel_mapper.errors import counted
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PointTimes:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class PointTimes(Record):
     """
     Measurement times of the points of a scan.
 
@@ -41,8 +41,8 @@ class PointTimes:
     last_ns: int
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class DepthImage:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class DepthImage(Record):
     """
     A rectified depth image, for layers that need no points.
 

@@ -31,6 +31,7 @@ from surfel_mapper import (
 )
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import SurfelMapperError
+from surfel_mapper.models import fit
 
 POINTS = np.random.default_rng(0).uniform(-2.0, 2.0, (300, 3))
 
@@ -122,3 +123,13 @@ def test_complex_numbers_are_refused():
     """Their imaginary part was left out, with a warning."""
     with pytest.raises(ValueError, match='origin: a list, expected numbers'):
         SurfelMap(0.5).reduce(POINTS, origin=[1j, 0.0, 0.0])
+
+
+def test_records_are_one_line_with_the_shapes_of_their_arrays():
+    model = fit(np.random.default_rng(0).uniform(-1.0, 1.0, (2000, 3)) * [1.0, 1.0, 0.0])
+    plane = model.planes[0]
+    assert repr(plane).startswith(
+        f'Plane(id=0, num_points={plane.num_points}, mean=float64 (3,), '
+    )
+    assert 'labels=int32 (2000,)' in repr(model)
+    assert max(len(repr(record)) for record in (model, plane, model.gaussians)) < 500

@@ -25,6 +25,7 @@ from surfel_mapper.alignment.angles import poses_of, transforms
 from surfel_mapper.alignment.correspondences import moved
 from surfel_mapper.alignment.lum import LUM
 from surfel_mapper.alignment.window import ANCHORS
+from surfel_mapper.arguments import Record
 from surfel_mapper.errors import AlignmentError, counted
 from surfel_mapper.geometry import compose, inverse, Transform
 
@@ -75,8 +76,8 @@ class Loop:
     votes: int = 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopSolution:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoopSolution(Record):
     """
     Poses that agree with the loops.
 

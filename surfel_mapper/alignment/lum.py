@@ -34,6 +34,7 @@ from surfel_mapper.alignment.edge_terms import (
 from surfel_mapper.alignment.graph import Graph, Points
 from surfel_mapper.alignment.kernels.edges import COUNT
 from surfel_mapper.alignment.solver import components, exact_step, pcl_step, pose_covariances
+from surfel_mapper.arguments import Record
 from surfel_mapper.errors import AlignmentError
 
 _log = logging.getLogger(__name__)
@@ -44,8 +45,8 @@ Ends = tuple[int, int]
 JACOBIANS = ('exact', 'pcl')
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class EdgeEstimate:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class EdgeEstimate(Record):
     """
     Estimate of an edge from its pairs at the final poses, in the frame of vertex 0.
 
@@ -66,8 +67,8 @@ class EdgeEstimate:
     information: Floats
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class LumResult:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class LumResult(Record):
     """
     Result of an alignment.
 

@@ -26,6 +26,7 @@ import numpy.typing as npt
 from surfel_mapper.alignment.kernels.steps import solve_step
 from surfel_mapper.alignment.scan_view import ScanView
 from surfel_mapper.alignment.surfel_planes import means, PlaneLevels, SurfelPlanes
+from surfel_mapper.arguments import Record
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import (
     compose,
@@ -98,8 +99,8 @@ SAME_PLACE_DEG = 10.0
 """Poses of the search that differ by less, and by less than a voxel, are one place."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class RegistrationResult:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class RegistrationResult(Record):
     """
     Pose of a scan, and measures of its reliability.
 

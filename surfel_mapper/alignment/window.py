@@ -35,6 +35,7 @@ from surfel_mapper.alignment.correspondences import (
 from surfel_mapper.alignment.edge_terms import MIN_PAIRS
 from surfel_mapper.alignment.lum import LUM, LumResult
 from surfel_mapper.alignment.solver import components
+from surfel_mapper.arguments import Record
 from surfel_mapper.config import AlignConfig
 from surfel_mapper.errors import AlignmentError, counted
 from surfel_mapper.geometry import compose, interpolate, inverse, rotation_angle, Transform
@@ -65,8 +66,8 @@ STEPS_A_ROUND = 2
 LITTLE_OVERLAP = 'too few of their surfels belong together'
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class WindowAlignment:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class WindowAlignment(Record):
     """
     Poses of the scans of a window, and measures of their reliability.
 

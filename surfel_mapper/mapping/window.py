@@ -22,15 +22,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_whole, check_kind
+from surfel_mapper.arguments import as_whole, check_kind, Record
 from surfel_mapper.config import settings_of, WindowConfig
 from surfel_mapper.errors import counted
 from surfel_mapper.mapping.moments import point_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class WindowedScan:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class WindowedScan(Record):
     """
     A scan in the window.
 
@@ -81,8 +81,8 @@ VOXEL_BYTES = 132
 the hash table."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Eviction:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Eviction(Record):
     """
     A scan that was evicted from the window.
 

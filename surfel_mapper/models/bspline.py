@@ -21,6 +21,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import Record
 from surfel_mapper.models.bspline_solvers import FieldSamples, is_direct, relax, solve_band
 from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.kernels.splines import basis_functions, tensor_heights
@@ -97,8 +98,8 @@ def basis(u: Array, knot: Array, degree: int) -> tuple[npt.NDArray[np.int64], Ar
     return first, values, slopes
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeightField:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class HeightField(Record):
     """
     A surface z(x, y) over a grid of cells.
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import Record
 from surfel_mapper.models.kernels.coverage import box_patches, cut_rims, mark_rims, sum_cells
 
 Array = npt.NDArray[np.float64]
@@ -23,8 +24,8 @@ CUT_STEP = 16.0
 """Cuts are multiples of this byte: a sixteenth of a cell. Finer ones make files larger by 2 %."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Grid:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Grid(Record):
     """
     Cells over the plane of a patch, in its frame.
 

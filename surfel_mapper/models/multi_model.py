@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_real
+from surfel_mapper.arguments import as_real, Record
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.models.evaluation import Evaluation, nearest, p95, POINT_BYTES, rms
@@ -28,8 +28,8 @@ MOST_BYTES = 1 << 28
 """Size limit of files of models: 15 million Gaussians."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MultiModel:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class MultiModel(Record):
     """
     Planes, surfaces and Gaussians of one cloud.
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import Record
 from surfel_mapper.models.bspline import HeightField
 from surfel_mapper.models.grid import Grid
 
@@ -29,8 +30,8 @@ one: 88 if it fills one voxel evenly. A thinned cloud, one point a voxel, has fe
 """
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Plane:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Plane(Record):
     """
     A bounded piece of a plane.
 
@@ -97,7 +98,7 @@ class Plane:
         return Surface(**{**values, 'rms_m': rms_m}, spline=spline)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Surface(Plane):
     """A bounded piece of a curved surface: a height field over its frame."""
 
@@ -116,8 +117,8 @@ class Surface(Plane):
         return normals
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Gaussians:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Gaussians(Record):
     """
     Gaussians of the points on neither plane nor surface, G rows.
 

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.loop_search import LoopClosure, LoopSearch, Refusal
+from surfel_mapper.arguments import Record
 from surfel_mapper.config import Config
 from surfel_mapper.errors import AlignmentError, counted
 from surfel_mapper.files.scan_spool import ScanSpool
@@ -36,8 +37,8 @@ LISTED = 20
 """Maximum number of refused loops in a summary."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class LoopMove:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class LoopMove(Record):
     """
     The loops of a drive and the motion of its scans.
 

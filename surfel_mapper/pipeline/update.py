@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.registration import RegistrationResult
+from surfel_mapper.arguments import Record
 from surfel_mapper.layers import names as layer_names
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction
@@ -20,8 +21,8 @@ from surfel_mapper.pipeline.window_aligner import Alignment
 from surfel_mapper.scan import Scan
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Update:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Update(Record):
     """
     The changes that one scan made to the map.
 

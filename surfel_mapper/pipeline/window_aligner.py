@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from surfel_mapper.alignment import align_scans, Samples, WindowAlignment
 from surfel_mapper.alignment.window import extent
+from surfel_mapper.arguments import Record
 from surfel_mapper.config import AlignConfig, Config
 from surfel_mapper.errors import AlignmentError, counted
 from surfel_mapper.geometry import compose, inverse, Transform
@@ -34,8 +35,8 @@ MIN_POINTS = 6
 """Surfels of fewer points of one scan are not matched."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Alignment:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Alignment(Record):
     """
     The result of an alignment of the window.
 

@@ -17,7 +17,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_real
+from surfel_mapper.arguments import as_real, Record
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.kernels.euclidean import FAR, MAX_REACH, spread
@@ -26,8 +26,8 @@ from surfel_mapper.tsdf.queries import checked_size, extent, in_voxels
 Flags = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True, kw_only=True)
-class KnownDistances:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class KnownDistances(Record):
     """
     Distances of the observed voxels about a place.
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import Record
 from surfel_mapper.config.layers import LEAST_WEIGHT
 from surfel_mapper.kernels.layout import KEY
 from surfel_mapper.tsdf.blocks import block_index, BlockMap, copied_rows, UPPER
@@ -40,8 +41,8 @@ PORTION = 512
 """Blocks copied at a time: with those above them some 4 MB, 3 ms between two scans."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Mesh:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Mesh(Record):
     """
     Triangles in the map frame.
 
@@ -75,7 +76,7 @@ EMPTY = Mesh(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class BlockMesh(Mesh):
     """
     The triangles of the cubes whose first corners lie in some blocks.

@@ -15,7 +15,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_numbers
+from surfel_mapper.arguments import as_numbers, Record
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.kernels import queries as kernels
@@ -28,8 +28,8 @@ MAX_VOXELS = 1 << 27
 """Limit of the voxels in a box: their distances take 0.5 GB, computing them four times that."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sampled:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Sampled(Record):
     """
     The field at points.
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import Record
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.tsdf.kernels import range_image as kernels
 from surfel_mapper.tsdf.measurements import checked_labels
@@ -29,8 +30,8 @@ NO_DEPTH_MM = 65535.0
 """Value of pixels without depth in images of mm of some cameras."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RangeImage:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class RangeImage(Record):
     """
     Ranges in the pixels of a sensor, with optional colours, labels and mask.
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import Record
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.mapping.ages import ages_s, last_seen_ns
 from surfel_mapper.mapping.surfels import QUALITY, Surfels
@@ -70,8 +71,8 @@ GREY = 0.6
 """Colour of a disc whose value is not known."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DrawnDiscs:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class DrawnDiscs(Record):
     """
     DrawnDiscs to be drawn.
 

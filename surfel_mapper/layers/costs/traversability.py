@@ -20,6 +20,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import Record
 from surfel_mapper.config import GridConfig
 from surfel_mapper.mapping.surfels import Surfels
 
@@ -30,8 +31,8 @@ OBSTACLE = 100
 """Cost of a cell that cannot be driven on."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CostGrid:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class CostGrid(Record):
     """
     Costs of the cells of an area.
 
