@@ -51,4 +51,4 @@ except ValueError as error:
 def test_a_map_is_the_same_to_the_bit_without_the_compiler():
     text = printed_alike(SHORT_MAPPING)
     assert 'does not hold' in text
-    assert len(text.splitlines()) == 21
+    assert len(text.splitlines()) == 20
