@@ -22,7 +22,13 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import Record
-from surfel_mapper.models.bspline_solvers import FieldSamples, is_direct, relax, solve_band
+from surfel_mapper.models.bspline_solvers import (
+    FieldSamples,
+    is_direct,
+    penalty_diagonals,
+    relax,
+    solve_band,
+)
 from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.kernels.splines import basis_functions, tensor_heights
 
@@ -35,7 +41,7 @@ NEAREST = 1e-9
 """The same for the change from the initial control points: the smallest of equally good ones."""
 
 CACHED_AXES = 4096
-"""Cached axes (knots, Greville abscissae): few different sizes occur."""
+"""Cached axes (knots, Greville abscissae, penalty): few different sizes occur."""
 
 
 @lru_cache(CACHED_AXES)
@@ -62,6 +68,12 @@ def greville_cells(num_cells: int, degree: int) -> Array:
     knot, number = knots(num_cells, degree), num_cells + 2
     means = sum(knot[k : k + number] for k in range(1, degree + 1)) / degree
     return np.asarray(means * (number - 1) - 0.5, np.float64)
+
+
+@lru_cache(CACHED_AXES)
+def penalty(num_cells: int, degree: int) -> Array:
+    """Return the diagonals of the penalty along an axis, see solve_band; cached, read-only."""
+    return penalty_diagonals(greville_cells(num_cells, degree))
 
 
 def axis_degree(num_cells: int, degree: int) -> int:
@@ -156,31 +168,10 @@ class HeightField(Record):
         return x, y
 
 
-def design(field: HeightField, xy: Array) -> tuple[npt.NDArray[np.int64], Array]:
-    """
-    Return the rows of the design matrix: control points and their weights for each location.
-
-    Parameters
-    ----------
-    field : HeightField
-        Grid and degrees; control points are not used.
-    xy : (M, 2) float64, m
-        Locations.
-
-    Returns
-    -------
-    (M, W) int64
-        Indices of the control points, y within x.
-    (M, W) float64
-        Their weights.
-
-    """
+def samples_of(field: HeightField, xy: Array, z: Array, share: Array) -> FieldSamples:
+    """Return (M,) heights at (M, 2) locations, m, and their weights as samples of a field."""
     (first_x, x, _), (first_y, y, _) = (field._basis(xy, axis) for axis in range(2))
-    along_x, along_y = (np.arange(degree + 1) for degree in field.degrees)
-    rows = (first_x[:, None] + along_x)[:, :, None] * field.control.shape[1]
-    rows = rows + (first_y[:, None] + along_y)[:, None]
-    weights = x[:, :, None] * y[:, None]
-    return rows.reshape(len(xy), -1), weights.reshape(len(xy), -1)
+    return FieldSamples((first_x, x, first_y, y), z, share)
 
 
 def initial_field(
@@ -242,13 +233,14 @@ def fit_pspline(
     if start.control.shape[1] > start.control.shape[0]:  # the bandwidth is the short side
         turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, rules)
         return transposed(turned)
-    rows, weights = design(start, xy)
-    samples = FieldSamples(rows, weights, z, weight / weight.mean())
+    samples = samples_of(start, xy, z, weight / weight.mean())
     if is_direct(start.control.shape, max(*start.degrees, 2)):
-        control = solve_band(samples, start.greville(), rules)
+        num_x, num_y = start.control.shape
+        penalties = penalty(num_x - 2, start.degrees[0]), penalty(num_y - 2, start.degrees[1])
+        control = solve_band(samples, penalties, rules)
         return HeightField(start.pitch_m, start.origin, start.degrees, control)
     active = np.zeros(start.control.shape, np.bool_)
-    active.ravel()[rows] = True
+    active.ravel()[samples.design(start.control.shape[1])[0]] = True
     initial = continued(start.control, start.control != 0.0)
     control = relax(samples, start.greville(), active, rules, initial)
     if rules[0] > 0.0:

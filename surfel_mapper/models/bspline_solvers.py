@@ -4,8 +4,7 @@
 Solvers of the normal equations of height fields: banded for small ones, iterative for large ones.
 
 The control points of a grid are counted y within x. A sample depends on W of them, at degree 3
-on 16; ``rows`` and ``weights`` (M, W) are those of ``design`` in models/bspline.py. The penalty is
-the squared second differences of the control points along both axes.
+on 16. The penalty is the squared second differences of the control points along both axes.
 
 The band has a column for each control point along three rows of the short side. LAPACK solves it
 in 4 ms for 50 x 50 cells and in 40 ms for 100 x 100, but needs 10 s and 2.1 GB for 450 x 450.
@@ -42,17 +41,30 @@ class FieldSamples:
 
     Attributes
     ----------
-    rows, weights : (M, W) int64, float64
-        Control points that each depends on, and their weights.
+    bases : tuple
+        Along x: first control point (M,) int64 that each depends on, and weights (M, degree + 1)
+        float64 of these; the same along y.
     z, share : (M,) float64
         Heights, m, and weights of the samples.
 
     """
 
-    rows: Indices
-    weights: Array
+    bases: tuple[Indices, Array, Indices, Array]
     z: Array
     share: Array
+
+    def design(self, num_y: int) -> tuple[Indices, Array]:
+        """
+        Return the rows of the design matrix, given the number of control points along y.
+
+        Indices (M, W) int64 of the control points, y within x, and their weights (M, W) float64.
+        """
+        first_x, x, first_y, y = self.bases
+        along_x, along_y = (np.arange(weights.shape[1]) for weights in (x, y))
+        rows = (first_x[:, None] + along_x)[:, :, None] * num_y
+        rows = rows + (first_y[:, None] + along_y)[:, None]
+        weights = x[:, :, None] * y[:, None]
+        return rows.reshape(len(x), -1), weights.reshape(len(x), -1)
 
 
 def is_direct(shape: tuple[int, ...], reach: int) -> bool:
@@ -72,8 +84,17 @@ def second_differences(positions: Array) -> Array:
     return matrix
 
 
+def penalty_diagonals(positions: Array) -> Array:
+    """Return three diagonals (3, N) of the squared second differences, 0 behind their ends."""
+    second, diagonals = second_differences(positions), np.zeros((3, len(positions)))
+    product = second.T @ second
+    for k in range(min(3, len(positions))):
+        diagonals[k, : len(positions) - k] = np.diagonal(product, -k)
+    return diagonals
+
+
 def solve_band(
-    samples: FieldSamples, positions: tuple[Array, Array], rules: tuple[float, float]
+    samples: FieldSamples, penalties: tuple[Array, Array], rules: tuple[float, float]
 ) -> Array:
     """
     Return the control points (Nx, Ny) that minimise squared residuals and the penalty, m.
@@ -82,38 +103,27 @@ def solve_band(
     ----------
     samples : FieldSamples
         Samples of the field.
-    positions : (Nx,), (Ny,) float64, m
-        Positions of the control points along x and y; Ny decides the width of the band.
+    penalties : (3, Nx), (3, Ny) float64
+        Diagonals of the penalty along x and y; Ny decides the width of the band.
     rules : (float, float)
         Weight of the penalty, and weight that pulls control points to 0.
 
     """
     from scipy.linalg.lapack import dpbsv  # seconds to import
 
-    (smoothing, ridge), shape = rules, (len(positions[0]), len(positions[1]))
-    reach = samples.rows[:, -1:] - samples.rows[:, :1] if len(samples.rows) else np.zeros((1, 1))
-    width = max(int(reach.max()), 2 * shape[1], 2) + 1
-    number = shape[0] * shape[1]
-    band, right = equations(samples, width, number)
-    grid = band.reshape(width, *shape)
-    for axis in range(2):
-        second = second_differences(positions[axis])
-        product, step = second.T @ second, shape[1] if axis == 0 else 1
-        for k in range(min(3, shape[axis])):
-            along = np.zeros(shape[axis])
-            along[: shape[axis] - k] = np.diagonal(product, -k)
-            grid[k * step] += smoothing * (along[:, None] if axis == 0 else along)
-    grid[0] += ridge
-    _, solution, info = dpbsv(band, right, lower=1, overwrite_ab=1)
+    (smoothing, ridge), (along_x, along_y) = rules, penalties
+    num_x, num_y, (_, x, _, y) = along_x.shape[1], along_y.shape[1], samples.bases
+    width = max((x.shape[1] - 1) * num_y + y.shape[1], 2 * num_y + 1, 3)
+    band, right = np.zeros((num_x * num_y, width)), np.zeros(num_x * num_y)
+    sum_equations(samples.bases, samples.share, samples.z, num_y, band, right)
+    grid = band.reshape(num_x, num_y, width)
+    for k in range(3):
+        grid[:, :, k * num_y] += smoothing * along_x[k][:, None]
+        grid[:, :, k] += smoothing * along_y[k]
+    grid[:, :, 0] += ridge
+    _, solution, info = dpbsv(band.T, right, lower=1, overwrite_ab=1)
     assert info == 0, 'the ridge makes the matrix positive'
-    return np.array(solution.reshape(shape), np.float64)  # a view would keep the band
-
-
-def equations(samples: FieldSamples, width: int, number: int) -> tuple[Array, Array]:
-    """Return the lower band (width, number) and right side (number,) of the normal equations."""
-    band, right = np.zeros((width, number)), np.zeros(number)
-    sum_equations(samples.rows, samples.weights, samples.share, samples.z, band, right)
-    return band, right
+    return np.array(solution.reshape(num_x, num_y), np.float64)  # a view would keep the band
 
 
 def relax(
@@ -144,7 +154,8 @@ def relax(
     from scipy.sparse.linalg import cg
 
     (smoothing, ridge), weight = rules, np.sqrt(samples.share)
-    data = sparse(samples.rows, samples.weights * weight[:, None], control.size)
+    rows, weights = samples.design(control.shape[1])
+    data = sparse(rows, weights * weight[:, None], control.size)
     matrices = [data, *differences(positions, active, np.sqrt(smoothing))]
     free = np.flatnonzero(active)
     design = vstack(matrices, format='csr')[:, free]

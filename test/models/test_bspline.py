@@ -10,14 +10,15 @@ import pytest
 from surfel_mapper.models.bspline import (
     axis_degree,
     basis,
-    design,
     fit_nearest,
     fit_pspline,
     initial_field,
     knots,
+    penalty,
     RIDGE,
+    samples_of,
 )
-from surfel_mapper.models.bspline_solvers import FieldSamples, second_differences, solve_band
+from surfel_mapper.models.bspline_solvers import second_differences, solve_band
 
 SIZES = [1, 2, 3, 4, 5, 30]
 PITCH, ORIGIN = 0.3, np.array([-1.2, 0.6])
@@ -69,7 +70,7 @@ def test_planes_are_reproduced(cells, solver):
 @pytest.mark.parametrize('cells', [(1, 1), (3, 4), (9, 6)])
 def test_nearest_field_is_the_least_change_of_the_least_squares(cells):
     start, xy, z = scene(lambda x, y: np.sin(3 * x) * y, cells, holes=cells == (9, 6))
-    rows, weights = design(start, xy)
+    rows, weights = samples_of(start, xy, z, z).design(start.control.shape[1])
     matrix = np.zeros((len(z), start.control.size))
     np.add.at(matrix, (np.arange(len(z))[:, None], rows), weights)
     change = np.linalg.pinv(matrix) @ (z - matrix @ start.control.ravel())
@@ -94,8 +95,8 @@ def test_quadrics_are_reproduced_and_holes_are_filled():
 def test_banded_fields_equal_the_dense_normal_equations(cells):
     rng = np.random.default_rng(4)
     start, xy, z = scene(lambda x, y: np.sin(2 * x) + y**2, cells, holes=cells == (9, 6))
-    rows, weights = design(start, xy)
     share = rng.uniform(0.5, 2.0, len(z))
+    rows, weights = samples_of(start, xy, z, share).design(start.control.shape[1])
     samples = np.zeros((len(z), start.control.size))
     np.add.at(samples, (np.arange(len(z))[:, None], rows), weights)
     expected = samples.T @ (share[:, None] * samples) + RIDGE * np.eye(start.control.size)
@@ -110,7 +111,8 @@ def test_banded_fields_equal_the_dense_normal_equations(cells):
         whole = np.kron(bend, np.eye(num_y)) if axis == 0 else np.kron(np.eye(num_x), bend)
         expected += 0.05 * whole
     control = np.linalg.solve(expected, samples.T @ (share * z))
-    found = solve_band(FieldSamples(rows, weights, z, share), start.greville(), (0.05, RIDGE))
+    penalties = [penalty(*axis) for axis in zip(cells, start.degrees, strict=True)]
+    found = solve_band(samples_of(start, xy, z, share), penalties, (0.05, RIDGE))
     np.testing.assert_allclose(found.ravel(), control, rtol=1e-6, atol=1e-8)
 
 

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel
+from surfel_mapper.kernels.compiling import kernel, U
 
 
 @kernel(error_model='numpy')
@@ -71,18 +71,23 @@ def tensor_heights(first_x, along_x, first_y, along_y, control, heights):
 
 
 @kernel(error_model='numpy')
-def sum_equations(rows, weights, share, z, band, right):
+def sum_equations(bases, share, z, columns, band, right):
     """
-    Sum the lower band (width, number) and right side (number,) of normal equations.
+    Sum the lower band (number, width) and right side (number,) of normal equations.
 
-    rows     (M, W) int64, unknowns of each sample, ascending
-    weights  (M, W) float64, of these
+    bases    of tensor_heights: first_x, along_x, first_y, along_y
     share, z (M,) float64, weights and values of the samples
-    band     element k, c is that of row c + k, column c; changed in place, as right is
+    columns  control points along y
+    band     element c, k is that of row c + k, column c; changed in place, as right is
     """
-    for m in range(len(rows)):
-        for i in range(rows.shape[1]):
-            row, weight = rows[m, i], share[m] * weights[m, i]
-            right[row] += weight * z[m]
-            for j in range(i + 1):
-                band[row - rows[m, j], rows[m, j]] += weight * weights[m, j]
+    first_x, x, first_y, y = bases
+    for m in range(len(z)):
+        corner = first_x[m] * columns + first_y[m]
+        for k in range(x.shape[1]):
+            for n in range(y.shape[1]):
+                row, weight = corner + k * columns + n, share[m] * x[m, k] * y[m, n]
+                right[row] += weight * z[m]
+                for i in range(k, x.shape[1]):
+                    product, shift = weight * x[m, i], (i - k) * columns - n
+                    for j in range(n if i == k else 0, y.shape[1]):
+                        band[U(row), U(shift + j)] += product * y[m, U(j)]
