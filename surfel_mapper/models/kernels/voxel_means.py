@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel
+from surfel_mapper.kernels.compiling import kernel, U
 
 
 @kernel()
@@ -77,22 +77,18 @@ def average_voxels(points, ordered, to_key, rows, starts, keys, means):
     keys     (V,) int64, out
     means    (V, 3) float64, out
     """
-    number = -1
-    for i in range(len(ordered)):
-        key, row = ordered[i] >> to_key, ordered[i] & ((1 << to_key) - 1)
-        if number < 0 or keys[number] != key:
-            number += 1
-            keys[number], starts[number] = key, i
-            means[number, 0] = means[number, 1] = means[number, 2] = 0.0
-        rows[i] = row
-        for axis in range(3):
-            means[number, axis] += np.float64(points[row, axis])
-    number += 1
+    number, i = 0, 0
+    while i < len(ordered):
+        begin, key, x, y, z = i, ordered[i] >> to_key, 0.0, 0.0, 0.0
+        while i < len(ordered) and ordered[i] >> to_key == key:
+            row = U(ordered[i] & ((1 << to_key) - 1))
+            x, y, z = x + points[row, 0], y + points[row, 1], z + points[row, 2]
+            rows[i] = row
+            i += 1
+        keys[number], starts[number], count = key, begin, i - begin
+        means[number, 0], means[number, 1], means[number, 2] = x / count, y / count, z / count
+        number += 1
     starts[number] = len(ordered)
-    for voxel in range(number):
-        count = starts[voxel + 1] - starts[voxel]
-        for axis in range(3):
-            means[voxel, axis] /= count
     return number
 
 
