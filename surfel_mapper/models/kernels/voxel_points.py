@@ -4,8 +4,8 @@
 The points of a cloud by voxel: neighbours, and means by voxel and owner.
 
 Voxels are sorted by key: x in the lowest bits, y from bit ``to_y``, z from bit ``to_z``. The
-neighbours of a voxel are in nine rows along x. One pass with a place in the sorted keys for each
-row finds all without a hash table, in 8 ns a voxel and row.
+neighbours of a voxel are in nine rows along x, the later ones in five. One pass with a place in
+the sorted keys for each of the five finds all without a hash table, in 80 ns a voxel.
 """
 
 import numpy as np
@@ -23,26 +23,36 @@ def neighbour_table(keys, to_y, to_z, starts, rows):
     starts  (V + 1,) int64, out: first neighbour of each voxel in rows
     rows    (26 V,) int32, out: the neighbours; see starts for how many there are
     """
-    mask_y, num = (np.int64(1) << (to_z - to_y)) - 1, 0
-    shifts, first = np.empty(9, np.int64), np.zeros(9, np.int64)
-    for row in range(9):
-        shifts[row] = ((row % 3 - 1) << to_y) + ((row // 3 - 1) << to_z)
-    for i in range(len(keys)):
-        starts[i] = num
-        key, y = keys[i], keys[i] >> to_y & mask_y
-        for row in range(9):
-            middle, j = key + shifts[row], first[row]
-            while j < len(keys) and keys[j] < middle - 1:
+    mask_y, number, num = (np.int64(1) << (to_z - to_y)) - 1, len(keys), 0
+    later, ends = np.empty(13 * number, np.int32), np.zeros(number + 1, np.int64)
+    first, starts[:] = np.zeros(5, np.int64), 0
+    for i in range(number):
+        y = keys[i] >> to_y & mask_y
+        for row in range(5):
+            step = (row + 1) % 3 - 1
+            middle = keys[i] + (step << to_y) + ((row + 1) // 3 << to_z)
+            j = max(first[row], i + 1)
+            while j < number and keys[j] < middle - 1:
                 j += 1
             first[row] = j
             # rows at the end of a grid continue in the next one, and its layers, too
-            inside = 0 <= y + row % 3 - 1 <= mask_y
-            while inside and j < len(keys) and keys[j] <= middle + 1:
-                if keys[j] >> to_y == middle >> to_y and j != i:
-                    rows[num] = j
+            inside = 0 <= y + step <= mask_y
+            while inside and j < number and keys[j] <= middle + 1:
+                if keys[j] >> to_y == middle >> to_y:
+                    later[num] = j
+                    starts[j] += 1
                     num += 1
                 j += 1
-    starts[len(keys)] = num
+        ends[i + 1] = num
+    num = 0
+    for i in range(number):
+        starts[i], num = num, num + starts[i] + ends[i + 1] - ends[i]
+    starts[number], free = num, starts.copy()
+    for i in range(number):
+        for j in later[ends[i] : ends[i + 1]]:
+            rows[free[i]], rows[free[j]] = j, i
+            free[i] += 1
+            free[j] += 1
 
 
 @kernel(error_model='numpy')
