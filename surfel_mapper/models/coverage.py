@@ -117,27 +117,12 @@ def trimmed(
     """Yield chosen patches and grids of their covered cells, without empty rows at the ends."""
     first, corners, sizes = grids
     cells, patch = np.flatnonzero(filled), np.repeat(np.arange(len(sizes)), sizes.prod(axis=1))
-    columns, low, high = sizes[patch[cells], 1], *np.empty((2, len(sizes), 2))
-    near = np.stack([cells - columns, cells + columns, cells - 1, cells + 1])
-    rim = np.zeros(len(filled), np.bool_)
-    rim[cells] = ~filled[near].all(axis=0)  # the first and last cell of a row are empty
-    xy = np.stack(np.divmod(cells - first[patch[cells]], columns), axis=1)
+    low, high = np.empty((2, len(sizes), 2))
+    xy = np.stack(np.divmod(cells - first[patch[cells]], sizes[patch[cells], 1]), axis=1)
     box_patches(xy.astype(np.float64), patch[cells], low, high)
     for k in chosen.tolist():
         (x, y), (end_x, end_y) = low[k].astype(np.int64), high[k].astype(np.int64) + 1
-        own = slice(first[k], first[k] + sizes[k, 0] * sizes[k, 1])
-        kept, boundary = (
-            flags[own].reshape(sizes[k])[x:end_x, y:end_y].astype(np.bool_)
-            for flags in (filled, rim)
-        )
-        yield (
-            k,
-            Grid(
-                pitch_m=pitch_m,
-                origin=corners[k] + pitch_m * low[k],
-                filled=kept,
-                rim=boundary,
-                corner=np.zeros(kept.shape, np.uint8),
-                cuts=np.zeros((*kept.shape, 3), np.uint8),
-            ),
-        )
+        own = filled[first[k] : first[k] + sizes[k].prod()].reshape(sizes[k])
+        kept = own[x:end_x, y:end_y].astype(np.bool_)
+        corner, cuts = np.zeros(kept.shape, np.uint8), np.zeros((*kept.shape, 3), np.uint8)
+        yield k, Grid(pitch_m, corners[k] + pitch_m * low[k], kept, corner, cuts)

@@ -37,8 +37,6 @@ class Grid(Record):
         Lowest corner of cell (0, 0).
     filled : (Nx, Ny) bool
         Cells that hold points.
-    rim : (Nx, Ny) bool
-        Boundary cells: filled, with an empty 4-neighbour; cells beyond the grid are empty.
     corner : (Nx, Ny) uint8
         The cut corner of a boundary cell: 1 for its high x, 2 for its high y.
     cuts : (Nx, Ny, 3) uint8
@@ -49,9 +47,17 @@ class Grid(Record):
     pitch_m: float
     origin: Array
     filled: npt.NDArray[np.bool_]
-    rim: npt.NDArray[np.bool_]
     corner: npt.NDArray[np.uint8]
     cuts: npt.NDArray[np.uint8]
+
+    @property
+    def rim(self) -> npt.NDArray[np.bool_]:
+        """Boundary cells (Nx, Ny): filled, with an empty 4-neighbour or none."""
+        wide = np.zeros(np.add(self.filled.shape, 2), np.bool_)
+        wide[1:-1, 1:-1] = self.filled
+        inner = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
+        rim: npt.NDArray[np.bool_] = self.filled & ~inner
+        return rim
 
     def contains(self, xy: Array) -> npt.NDArray[np.bool_]:
         """Return which (M, 2) locations in the frame of the patch are covered, (M,) bool."""
@@ -104,15 +110,6 @@ class Grid(Record):
         return float(len(self.samples(step_m)) * step_m**2)
 
 
-def rim_of(filled: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Return the filled cells (Nx, Ny) with an empty 4-neighbour."""
-    wide = np.zeros(np.add(filled.shape, 2), np.bool_)
-    wide[1:-1, 1:-1] = filled
-    inner = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
-    rim: npt.NDArray[np.bool_] = filled & ~inner
-    return rim
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
     """
@@ -132,7 +129,7 @@ class Cells:
         Sums of x, y and z of the points in each cell, and their number.
     points : tuple
         Points in the frames of their patches, (N, 3) float64, m, and the first of each, (K + 1,).
-    rim, corner, cuts : (C,) bool, (C,) uint8, (C, 3) uint8
+    corner, cuts : (C,) uint8, (C, 3) uint8
         See Grid.
 
     """
@@ -143,7 +140,6 @@ class Cells:
     first: Indices
     sums: Array
     points: tuple[Array, Indices]
-    rim: npt.NDArray[np.bool_]
     corner: npt.NDArray[np.uint8]
     cuts: npt.NDArray[np.uint8]
 
@@ -198,7 +194,7 @@ class Cells:
             number = np.floor(free_m / (steps * np.array([1.0, 1.0, 2.0])))
             cuts[cut] = np.clip(CUT_STEP * number, 0.0, 255.0).astype(np.uint8)
         points = local, np.searchsorted(patch, np.arange(len(pitches) + 1))
-        return cls(pitches, origins, sizes, first, sums, points, rim, corner, cuts)
+        return cls(pitches, origins, sizes, first, sums, points, corner, cuts)
 
     def of(self, patch: int) -> slice:
         """Return the rows of a patch."""
@@ -215,7 +211,6 @@ class Cells:
                 pitch_m=pitch_m,
                 origin=origin,
                 filled=filled[low:high].reshape(shape).copy(),
-                rim=self.rim[low:high].reshape(shape).copy(),
                 corner=self.corner[low:high].reshape(shape).copy(),
                 cuts=self.cuts[low:high].reshape(*shape, 3).copy(),
             )

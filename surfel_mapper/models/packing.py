@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 import math
 from pathlib import Path
 import struct
@@ -28,7 +29,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError, ModelError
 from surfel_mapper.models.bspline import HeightField
-from surfel_mapper.models.grid import Grid, rim_of
+from surfel_mapper.models.grid import Grid
 from surfel_mapper.models.primitives import Gaussians, Plane, Surface
 
 Array = npt.NDArray[np.float64]
@@ -256,8 +257,7 @@ def factors(covariances: Array, least_m: float) -> Array:
 def patch_columns(patches: Sequence[Plane], step_m: float) -> list[bytes]:
     """Return frames and outlines of planes and surfaces."""
     grids = [patch.grid for patch in patches]
-    rims = [rim_of(grid.filled) for grid in grids]
-    pairs = list(zip(grids, rims, strict=True))
+    pairs = [(grid, grid.rim) for grid in grids]
     none: npt.NDArray[Any] = np.empty((0, 3), np.uint8)
     corner = np.concatenate([none[:, 0], *(grid.corner[rim] for grid, rim in pairs)])
     cuts = needed_cuts(np.concatenate([none, *(grid.cuts[rim] for grid, rim in pairs)]))
@@ -497,22 +497,20 @@ class Columns:
         sizes = self._sizes(number, 1, CELL_MEMORY)
         total = sum(x * y for x, y in sizes)
         bits = np.frombuffer(self._bytes(-(-total // 8)), np.uint8)
-        filled, rims, start = np.unpackbits(bits, count=total).view(np.bool_), [], 0
-        cells = []
-        for x, y in sizes:
-            cells.append(filled[start : start + x * y].reshape(x, y).copy())
-            rims.append(rim_of(cells[-1]))
+        filled, start = np.unpackbits(bits, count=total).view(np.bool_), 0
+        grids = []
+        for pitch_m, origin, (x, y) in zip(pitches, origins, sizes, strict=True):
+            own = filled[start : start + x * y].reshape(x, y).copy()
+            uncut = np.zeros((x, y), np.uint8), np.zeros((x, y, 3), np.uint8)
+            grids.append(Grid(pitch_m, origin, own, *uncut))
             start += x * y
+        rims = [grid.rim for grid in grids]
         ends = np.cumsum([0, *(np.count_nonzero(rim) for rim in rims)]).tolist()
         corner = np.frombuffer(self._bytes(ends[-1]), np.uint8)
         self.check((corner < 4).all(), 'a corner beyond 3')
         cuts = np.frombuffer(self._bytes(3 * ends[-1]), np.uint8).reshape(3, -1).T
-        grids = []
-        for k, rim in enumerate(rims):
-            own = slice(ends[k], ends[k + 1])
-            corners, strips = np.zeros(rim.shape, np.uint8), np.zeros((*rim.shape, 3), np.uint8)
-            corners[rim], strips[rim] = corner[own], cuts[own]
-            grids.append(Grid(pitches[k], origins[k], cells[k], rim, corners, strips))
+        for grid, rim, (begin, end) in zip(grids, rims, pairwise(ends), strict=True):
+            grid.corner[rim], grid.cuts[rim] = corner[begin:end], cuts[begin:end]
         return grids
 
     def _splines(self, number: int) -> list[HeightField]:
