@@ -188,10 +188,9 @@ def fit_points(parts: Thinned, config: ModelsConfig, view: Array, laps: list[flo
         of_cluster[members] = k
     label = of_cluster[group]
     growth = grow(voxels, thinned.means, label, group, charts, config, view)
-    weights = np.diff(parts.starts) if is_parted else 1
-    is_sparse = np.sum(weights * (growth.owner < 0)) >= max(SPARSE_SHARE * len(parts.rows), 1.0)
-    is_sparse &= config.noise_per_range_sq < LEAST_DISPARITY_NOISE
-    joined = grow_sparse(thinned, voxels, growth, config, view) if is_sparse else growth
+    joined = growth
+    if config.noise_per_range_sq < LEAST_DISPARITY_NOISE:
+        joined = grow_sparse(thinned, voxels, growth, config, view)
     laps.append(clock())
     fitted = owner_patches(joined, config, view)
     lost = np.array([patch is None for patch in fitted], np.bool_)
