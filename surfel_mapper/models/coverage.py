@@ -31,9 +31,6 @@ Mask = npt.NDArray[np.bool_]
 LEAST_POINTS = 6
 """Points in the cells of a dense patch, at least; each cell counts by its points."""
 
-LEAST_MEAN = 1.0
-"""Patches with fewer points in the area of a cell have too many gaps, and are not looked at."""
-
 LEAST_SHARE = 0.25
 """A cell is covered if its points weigh this share of those in a usual cell of its patch."""
 
@@ -64,29 +61,22 @@ def covered(
         Number of points of the cloud that each stands for; 1 if omitted.
 
     """
-    finer, pitch_m = model.patches, model.voxel_size_m
-    number = np.bincount(model.labels + 1, numbers, len(finer) + 1)[1:]
-    cells = [np.count_nonzero(p.grid.filled) * (p.grid.pitch_m / pitch_m) ** 2 for p in finer]
-    chosen = np.flatnonzero(number[: len(finer)] >= LEAST_MEAN * np.array(cells))
-    if not len(chosen):
+    patches, pitch_m = model.patches, model.voxel_size_m
+    if not patches:
         return model
-    patches = [finer[k] for k in chosen]
-    index = np.full(len(number) + 1, -1, np.int32)
-    index[chosen] = np.arange(len(chosen))
-    labels = model.labels if len(chosen) == len(finer) else index[model.labels]
     frames = np.array([[*patch.R_patch_map, patch.mean] for patch in patches])
     grids = cells_over([patch.grid for patch in patches], pitch_m)
     total = grids[0][-1] + grids[2][-1].prod()
     counts, weights, filled = np.zeros(total, np.int64), np.zeros(total), np.zeros(total, np.uint8)
-    count_points(points, labels, frames, view, grids, pitch_m, counts, weights, numbers)
+    count_points(points, model.labels, frames, view, grids, pitch_m, counts, weights, numbers)
     gaps, coarse = np.empty(len(patches)), inner_cells([patch.grid for patch in patches])
     cover_cells(counts, weights, grids, pitch_m, coarse, RULES, filled, gaps)
     for k, grid in trimmed(filled, grids, np.flatnonzero(gaps <= MOST_GAPS), pitch_m):
-        finer[chosen[k]] = replace(patches[k], grid=grid)
+        patches[k] = replace(patches[k], grid=grid)
     return replace(
         model,
-        planes=finer[: len(model.planes)],
-        surfaces=[patch for patch in finer if isinstance(patch, Surface)],
+        planes=patches[: len(model.planes)],
+        surfaces=[patch for patch in patches if isinstance(patch, Surface)],
     )
 
 
