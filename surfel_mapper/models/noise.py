@@ -199,9 +199,9 @@ def step_noise(samples: NoiseSamples) -> float:
     """Return sigma / distance^2, 1/m, of the steps of disparity along an axis; 0 without steps."""
     if samples.view is None:
         return 0.0
-    rows = samples.rows[:: 1 + len(samples.rows) // STEP_SAMPLES]
+    points = samples.points[samples.rows[:: 1 + len(samples.rows) // STEP_SAMPLES]]
     for axis in (2, 1, 0):  # that of a camera is z
-        values = np.abs(samples.points[rows, axis] - samples.view[axis])
+        values = np.abs(points[:, axis] - samples.view[axis])
         levels = np.unique(values[values > 0.0])
         if 2 < len(levels) < len(values) / STEP_POINTS:
             low, step, high = np.quantile(np.diff(1.0 / levels[::-1]), [0.1, 0.5, 0.9])

@@ -69,7 +69,7 @@ class Thinned:
     def whole_voxels(self) -> Thinned:
         """Return the means of parts as a cloud by voxel."""
         keys = self.keys // self.parts**3
-        first = np.flatnonzero(np.diff(keys, prepend=-1))
+        first = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
         starts, counts = np.append(first, len(keys)), np.diff(self.starts).astype(np.float64)
         means = means_and_scatters(self.means, counts, starts)[1]
         rows = np.arange(len(keys), dtype=np.int32)
