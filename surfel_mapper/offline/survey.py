@@ -312,6 +312,8 @@ def tried(
                 missing = f'poses and clouds are in {fixed}; --poses-from identity maps them'
             frame = base
     covered = 0
+    if source.kind != 'tf' and fixed == base:
+        return Offer(clouds, source.topic, 0, len(stamps), settings, f'it is of {base} in itself')
     for stamp in stamps:
         try:
             buffer.lookup(fixed, frame, stamp)

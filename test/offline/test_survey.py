@@ -171,6 +171,16 @@ def test_refused_poses_and_clouds_in_the_fixed_frame_are_named(tmp_path):
     assert offer.missing == 'poses and clouds are in odom; --poses-from identity maps them'
 
 
+def test_odometry_of_a_frame_in_itself_has_no_poses(tmp_path):
+    entries = [row for row in drive() if row[0] in ('/points', '/odom', '/tf_static')]
+    for topic, _, _, message in entries:
+        if topic == '/odom':
+            message.header.frame_id = message.child_frame_id
+    _, made = surveyed(write_rosbag2(tmp_path / 'a', entries))
+    (offer,) = (offer for offer in made if offer.poses == '/odom')
+    assert (offer.covered, offer.missing) == (0, 'it is of base_link in itself')
+
+
 def test_damaged_messages_are_counted(tmp_path):
     entries = drive()
     entries[4][3].fields[0].name = 'x'
