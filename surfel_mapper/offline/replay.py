@@ -180,6 +180,7 @@ def replay(
         figures = {
             **recording.describe(),
             'clock_offsets': motion_clock.offsets(),
+            'pose_doubt': motion_clock.doubt,
             'recorded_s': recording.recorded_s,
             'replay_s': replay_s,
             'compile_s': PROGRESS.seconds,

@@ -110,9 +110,12 @@ def in_order(values: Mapping[str, Any], names: Sequence[str]) -> list[tuple[str,
 def uncertain_text(summary: Mapping[str, Any]) -> str:
     """Return why a map is in doubt, or lacks more scans than usual; empty if neither is so."""
     texts = [apart_text(summary), tracking_doubt(summary), missing_text(summary)]
-    texts.append(summary.get('mount_changes', ''))
+    texts += [summary.get(name, '') for name in ('mount_changes', 'pose_doubt')]
     if not summary['surfels']:
-        texts.append('the map has no surfels: no voxel has map.min_points points; larger voxels?')
+        texts.append(
+            'the map has no surfels: no voxel has map.min_points points. Are the points not in '
+            'metres, or the voxels too small?'
+        )
     clocks = [offset['text'] for offset in summary.get('clock_offsets', [])]
     return '\n'.join(filter(None, [*texts, *clocks]))
 

@@ -10,7 +10,7 @@ import pytest
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.files.trajectory import Trajectory
-from surfel_mapper.geometry import compose, inverse, pose_matrix, se3_exp
+from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw, se3_exp
 from surfel_mapper.offline.motion_clock import PosedMotions
 from surfel_mapper.simulation import Drive, Lidar, record, Simulation, World
 
@@ -91,6 +91,25 @@ def test_an_offset_is_named_and_the_option_that_corrects_it_gives_the_right_map(
 def test_equal_clocks_are_no_offset(weaving, tmp_path):
     code, summary = replayed(weaving, tmp_path / 'out', 0.0)
     assert (code, summary['clock_offsets']) == (0, [])
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        lambda pose: pose @ se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.25])),
+        lambda pose: pose_matrix(0.5 * pose[:3, 3], q_xyzw(pose)),
+    ],
+    ids=['turned mount', 'half the way'],
+)
+def test_poses_with_other_motions_than_the_scans_leave_the_map_in_doubt(
+    weaving, tmp_path, capsys, change
+):
+    poses = Trajectory.load(weaving / 'poses.tum')
+    wrong = tmp_path / 'wrong.tum'
+    Trajectory.from_matrices([*map(change, poses.matrices)], poses.stamp_ns).save(wrong)
+    command = ['replay', str(weaving / 'scans'), '-o', str(tmp_path / 'out'), '--poses']
+    assert main([*command, str(wrong)]) == 4
+    assert 'motions of the scans differ from those of their poses' in capsys.readouterr().err
 
 
 def test_a_straight_drive_at_constant_speed_determines_no_offset(tmp_path):
