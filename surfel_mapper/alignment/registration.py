@@ -310,7 +310,7 @@ class Registration:
         self,
         cells: npt.NDArray[np.float64],
         surfel_map: SurfelMap,
-        places: Sequence[Transform],
+        poses_tried: Sequence[Transform],
     ) -> RegistrationResult:
         """
         Return the pose of a scan that may be at any of some places, of PlaceSearch.
@@ -323,23 +323,23 @@ class Registration:
             Cells of the scan, from ``cells``.
         surfel_map : SurfelMap
             A map of the given voxel size.
-        places : sequence of (4, 4) float64
+        poses_tried : sequence of (4, 4) float64
             Possible poses, at least one.
 
         """
         level, some = self.config.coarse_levels, thinned(cells, ROUGH_CELLS)
         rough = []
-        for place in places:  # levels of its own: those of all would be the whole map
-            planes = PlaneLevels(self.config, surfel_map, some, [place]).planes(level)
+        for pose in poses_tried:  # levels of its own: those of all would be the whole map
+            planes = PlaneLevels(self.config, surfel_map, some, [pose]).planes(level)
             size_m = planes.voxel_size_m
             tolerance_m = COARSE_TOLERANCE * size_m
-            rough.append(self._converge(some, planes, place, size_m, tolerance_m, ROUGH_STEPS))
+            rough.append(self._converge(some, planes, pose, size_m, tolerance_m, ROUGH_STEPS))
         view, results = ScanView(cells), []
         for pose in self._distinct_poses(rough, RELOCATED):
             levels = PlaneLevels(self.config, surfel_map, cells, [pose])
             result = self._descend(cells, levels, pose, levels.voxel_size_m(level))
             results.append(self._viewed(result, view, levels))
-        return replace(self._chosen(results, places[:1], is_lost=True), is_found=True)
+        return replace(self._chosen(results, poses_tried[:1], is_lost=True), is_found=True)
 
     def seen_through(
         self, cells: npt.NDArray[np.float64], surfel_map: SurfelMap, T_map_sensor: Transform

@@ -127,9 +127,9 @@ def interrupted_by_sigterm(*, ends_process: bool = False) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    earlier = signal.signal(signal.SIGTERM, interrupt)
+    previous_handler = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
     finally:
         if not (ends_process and due_s):
-            signal.signal(signal.SIGTERM, earlier)
+            signal.signal(signal.SIGTERM, previous_handler)

@@ -123,16 +123,16 @@ def map_bags(
         ):
             total.add(results)
             del unfinished[bag]
-    again = [bag for bag, results in unfinished.items() if len(results) == len(bags[bag])]
-    for bag in again:
+    unordered_bags = [bag for bag, results in unfinished.items() if len(results) == len(bags[bag])]
+    for bag in unordered_bags:
         log.warning(
             '%s: its scans are out of order; it is mapped as one', bags[bag][0].request.path
         )
-    wholes = [replace(bags[bag][0], span=None) for bag in again]
+    wholes = [replace(bags[bag][0], span=None) for bag in unordered_bags]
     for number, result in workers.run(map_shard, wholes, stopped):
         total.add([result])
         total.repeated += 1
-        del unfinished[again[number]]
+        del unfinished[unordered_bags[number]]
     for partial in unfinished.values():
         results = leading(partial)
         total.add(results if continues(results) else results[:1])

@@ -242,9 +242,9 @@ def known_starts(map_path: Path, truth_path: Path) -> dict[str, Transform]:
     rows, other_rows = common_stamps(stamps_ns, other_ns, SAME_NS)
     if not len(rows):
         return {}
-    middle = len(rows) // 2
-    T_sensor_map = inverse(poses[rows[middle]])
-    return {'trajectories': compose(truth_poses[other_rows[middle]], T_sensor_map)}
+    centre = len(rows) // 2
+    T_sensor_map = inverse(poses[rows[centre]])
+    return {'trajectories': compose(truth_poses[other_rows[centre]], T_sensor_map)}
 
 
 def refined(
@@ -278,13 +278,13 @@ def gauss_newton_step(position: Floats, truth: Truth, width_m: float) -> Floats:
         axes = nearest.normal[valid][:, None]
     off = np.einsum('kai,ki->ka', axes, gap)
     weight = (width_m**2 / ((off**2).sum(axis=1) + width_m**2)) ** 2
-    middle = xyz.mean(axis=0)  # lever arms about the middle keep the system well conditioned
-    turns = np.cross((xyz - middle)[:, None], axes)
+    centre = xyz.mean(axis=0)  # lever arms about the middle keep the system well conditioned
+    turns = np.cross((xyz - centre)[:, None], axes)
     jacobian = np.concatenate([axes, turns], axis=2)
     hessian = np.einsum('kai,k,kaj->ij', jacobian, weight, jacobian)
     gradient = np.einsum('kai,k,ka->i', jacobian, weight, off)
     step = -np.linalg.lstsq(hessian, gradient, rcond=1e-9)[0]
-    about_origin: Floats = np.concatenate([step[:3] - np.cross(step[3:], middle), step[3:]])
+    about_origin: Floats = np.concatenate([step[:3] - np.cross(step[3:], centre), step[3:]])
     return about_origin
 
 

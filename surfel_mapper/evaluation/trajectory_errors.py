@@ -172,13 +172,13 @@ def best_motion(estimated: Floats, true: Floats) -> Transform:
 
     For positions on a line or in a point it is one of several.
     """
-    middle, target = estimated.mean(axis=0), true.mean(axis=0)
-    u, _, vt = np.linalg.svd((true - target).T @ (estimated - middle))
+    centre, target = estimated.mean(axis=0), true.mean(axis=0)
+    u, _, vt = np.linalg.svd((true - target).T @ (estimated - centre))
     mirrored = np.linalg.det(u) * np.linalg.det(vt) < 0.0
     rotation = u @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0]) @ vt
     T_true_estimated = np.eye(4)
     T_true_estimated[:3, :3] = rotation
-    T_true_estimated[:3, 3] = target - rotation @ middle
+    T_true_estimated[:3, 3] = target - rotation @ centre
     return T_true_estimated
 
 

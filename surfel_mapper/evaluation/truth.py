@@ -61,11 +61,11 @@ class WorldTruth:
         if self._simulation is None:
             return None
         lidar = replace(self._simulation.lidar, range_noise_m=0.0)
-        again = replace(self._simulation, lidar=lidar)
+        noise_free = replace(self._simulation, lidar=lidar)
         sampled = []
-        for number in range(0, again.num_scans, -(-again.num_scans // SCANS)):
-            scan = again.scan(number)
-            pose = again.drive.T_odom_sensor(scan.stamp_ns)
+        for number in range(0, noise_free.num_scans, -(-noise_free.num_scans // SCANS)):
+            scan = noise_free.scan(number)
+            pose = noise_free.drive.T_odom_sensor(scan.stamp_ns)
             points = scan.points[scan.columns['surface'] >= 0].astype(np.float64)
             sampled.append(points @ pose[:3, :3].T + pose[:3, 3])
         return np.concatenate(sampled)

@@ -76,10 +76,10 @@ def read_cloud_map(path: Path, voxel_size_m: float) -> SurfelMap:
 
 def origin_of(points: Floats) -> Floats:
     """Return the origin of a map of points (N, 3), which is not 0 if they are far from it."""
-    middle = np.median(points, axis=0)
-    if not np.abs(middle).max() > FAR_M:
+    centre = np.median(points, axis=0)
+    if not np.abs(centre).max() > FAR_M:
         return np.zeros(3)
-    return np.asarray(np.rint(middle / ORIGIN_STEP_M) * ORIGIN_STEP_M + 0.0)
+    return np.asarray(np.rint(centre / ORIGIN_STEP_M) * ORIGIN_STEP_M + 0.0)
 
 
 def usable_share(moments: ScanMoments) -> float:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from decimal import Context, Decimal, InvalidOperation
 from pathlib import Path
+import re
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,9 @@ EXACT = Context(prec=100)
 """Significant digits of a stamp that count in its rounding."""
 
 MOST_NS = 2**63 - 1
+
+DATE = re.compile(r'((?:19|2[01])\d\d-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?)Z?')
+"""Date and time, in UTC."""
 
 
 def nanoseconds(text: str, where: str, unit: str = '') -> int:
@@ -76,8 +80,9 @@ def read_dates(path: str | Path) -> npt.NDArray[np.int64]:
     rows = table_rows(read_lines(path), 2, meaning=': a date and a time')
     stamps = np.empty(len(rows), np.int64)
     for row, words in enumerate(rows.words):
+        date = DATE.fullmatch('T'.join(words))  # numpy warns of zones, and wraps late years
         try:
-            stamps[row] = np.datetime64('T'.join(words), 'ns').astype(np.int64)
+            stamps[row] = np.datetime64(date[1], 'ns').astype(np.int64) if date else -1
         except ValueError:
             stamps[row] = -1
         if stamps[row] < 0:

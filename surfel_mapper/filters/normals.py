@@ -74,8 +74,8 @@ def estimate_normals(
     if not finite.any():
         return result
     valid_points = all_points[finite].astype(np.float64)
-    middle = valid_points[0]
-    normals = np.asarray(chosen.apply(valid_points - middle).columns[NORMALS], np.float64)
+    origin = valid_points[0]
+    normals = np.asarray(chosen.apply(valid_points - origin).columns[NORMALS], np.float64)
     if viewpoint is not None:
         sensor = as_numbers('viewpoint', viewpoint)
         if sensor.shape != (3,) or not np.isfinite(sensor).all():

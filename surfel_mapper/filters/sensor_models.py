@@ -131,9 +131,9 @@ class RemoveSensorBias(Filter):
         self.column(scan, OBSERVATION_DIRECTIONS)
         scan = select(scan, (angles >= 0.0) & (angles < math.radians(self.max_angle_deg)))
         angles = scan.columns[INCIDENCE_ANGLES].astype(np.float64)
-        towards = scan.columns[OBSERVATION_DIRECTIONS].astype(np.float64)
-        shift_m = bias_m(np.sqrt(dot(towards, towards)), angles, *BIASED[self.sensor_type])
-        points = scan.points + shift_m[:, None] * unit(towards)
+        directions = scan.columns[OBSERVATION_DIRECTIONS].astype(np.float64)
+        shift_m = bias_m(np.sqrt(dot(directions, directions)), angles, *BIASED[self.sensor_type])
+        points = scan.points + shift_m[:, None] * unit(directions)
         return with_points(scan, points, scan.columns)
 
 

@@ -80,8 +80,8 @@ class Votes:
     @property
     def saliencies(self) -> Points:
         """Saliencies of junction, curve and surface, (N, 3)."""
-        low, middle, high = self.values.T
-        return np.stack([low, middle - low, high - middle], axis=1) / max(self.num_neighbours, 1)
+        low, medium, high = self.values.T
+        return np.stack([low, medium - low, high - medium], axis=1) / max(self.num_neighbours, 1)
 
     @property
     def tensors(self) -> Points:
@@ -106,9 +106,9 @@ class Votes:
         if labels:
             columns['labels'] = 1.0 + saliencies.argmax(axis=1)
         if tensors:
-            low, middle, high = self.values.T
-            columns['sticks'] = np.column_stack([high - middle, normal])
-            columns['plates'] = np.column_stack([middle - low, normal, second])
+            low, medium, high = self.values.T
+            columns['sticks'] = np.column_stack([high - medium, normal])
+            columns['plates'] = np.column_stack([medium - low, normal, second])
             columns['balls'] = low
         return columns
 
@@ -139,9 +139,9 @@ class Voting:
     def balls(self) -> Votes:
         """Return the votes of voters without tensors, in closed form."""
         ball = np.array([float(i == j) for i, j in PAIRS])
-        return self.again(np.tile(ball, (len(self.points), 1)))
+        return self.next_round(np.tile(ball, (len(self.points), 1)))
 
-    def again(self, tensors: Points) -> Votes:
+    def next_round(self, tensors: Points) -> Votes:
         """Return the votes of voters with tensors (N, 6)."""
         votes = np.empty((6, len(self.points)))
         closed_form_votes(self.points, self.ids, tensors, self.sigma, self.is_symmetric, votes)
@@ -200,7 +200,7 @@ class Saliency(VotingFilter):
     def apply_finite(self, scan: Scan) -> Scan:
         """Return the scan with the columns added."""
         voting = Voting.among(coordinates(scan), self)
-        return self.with_votes(scan, voting.again(voting.first().tensors))
+        return self.with_votes(scan, voting.next_round(voting.first().tensors))
 
 
 EVEN = 5
@@ -268,7 +268,7 @@ class SpectralDecomposition(VotingFilter):
                 voting, votes = self.vote(points[rows])
             if np.count_nonzero(~stays) < EVEN:
                 break
-        votes = voting.again(votes.tensors)
+        votes = voting.next_round(votes.tensors)
         salient = self.salient(votes)
         votes = Votes(votes.values[salient], votes.vectors[salient], votes.num_neighbours)
         names = ('lambda3', 'lambda2', 'lambda1') if self.keep_lambdas else ()
@@ -295,9 +295,9 @@ class SpectralDecomposition(VotingFilter):
         """Return which points stay for the next round."""
         if self.thinning == 'each':
             return self.stays_in_each_class(votes, random)
-        lowest, middle, highest = votes.values.T / votes.num_neighbours
+        lowest, medium, highest = votes.values.T / votes.num_neighbours
         with np.errstate(invalid='ignore'):  # nan without votes, then not dense
-            ratios = np.stack([lowest, middle], axis=1) / highest[:, None]
+            ratios = np.stack([lowest, medium], axis=1) / highest[:, None]
         nearest = ((ratios[:, None] - RATIOS) ** 2).sum(axis=2).argmin(axis=1)
         expected = np.array(
             [

@@ -272,8 +272,8 @@ def shifted_moments(moments: ScanMoments, voxels: npt.NDArray[np.int64]) -> Scan
 def check_arrays(moments: ScanMoments) -> None:
     """Raise MapError unless the arrays have the shapes and types that the kernels read."""
     channels = len(moments.channel_names)
-    others = ('channels', (channels,), (np.int64,)), ('scans', (), (np.int64,))
-    for name, width, types in (*ARRAYS, *others):
+    optional_arrays = ('channels', (channels,), (np.int64,)), ('scans', (), (np.int64,))
+    for name, width, types in (*ARRAYS, *optional_arrays):
         array = getattr(moments, name)
         shape = (len(moments), *width)
         if not (isinstance(array, np.ndarray) and array.shape == shape and array.dtype in types):

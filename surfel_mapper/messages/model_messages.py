@@ -120,7 +120,7 @@ def patch_markers(
     """Return the markers of one patch: filled, its outline, its id."""
     number = shape.patch.id
     (color,) = primitive_colors([number]).tolist()
-    above = shape.middle + voxel_size_m * shape.patch.normal
+    above = shape.centre + voxel_size_m * shape.patch.normal
     filled: dict[str, Any] = {'color': (*color, OPACITY)}
     if shape.is_curved:  # viewers do not light markers; unshaded it would look flat
         filled = {'colors': shaded(shape.corners, color, OPACITY)}
@@ -223,7 +223,7 @@ def patch_rows(shapes: Sequence[PatchShape]) -> npt.NDArray[np.float64]:
     rows[:, 7:11] = quaternions(R_map_patch)
     for row, shape in zip(rows, shapes, strict=True):
         patch = shape.patch
-        row[:7] = (*shape.middle, *patch.normal, patch.offset_m)
+        row[:7] = (*shape.centre, *patch.normal, patch.offset_m)
         row[11:] = (*(shape.high - shape.low), shape.area_m2, patch.rms_m)
     return rows
 

@@ -248,5 +248,5 @@ def shade(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
     """Return the brightness of triangles (F, 3, 3), (F,) from 0.3 to 1."""
     normals = face_normals(corners)
     lengths = np.linalg.norm(normals, axis=1)
-    towards = normals @ LIGHT / np.where(lengths > 0.0, lengths, 1.0)
-    return np.asarray(0.65 + 0.35 * towards / np.linalg.norm(LIGHT), np.float32)
+    lightness = normals @ LIGHT / np.where(lengths > 0.0, lengths, 1.0)
+    return np.asarray(0.65 + 0.35 * lightness / np.linalg.norm(LIGHT), np.float32)

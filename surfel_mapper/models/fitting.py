@@ -130,8 +130,8 @@ def fit(
         raise ModelError(f'viewpoint: {viewpoint!r}, expected three finite numbers')
     laps = [clock()]
     grows = not is_paper(config) and config.kinds == 'all'
-    parts = PARTS if grows and config.voxel_size_m <= MOST_PARTED_M else 1
-    thinned = thin(points.reshape(-1, 3), config.voxel_size_m, parts)
+    divisions = PARTS if grows and config.voxel_size_m <= MOST_PARTED_M else 1
+    thinned = thin(points.reshape(-1, 3), config.voxel_size_m, divisions)
     if are_far_apart(thinned.means, len(thinned.rows)):
         _log.warning(OTHER_UNIT)
     laps.append(clock())
@@ -158,14 +158,14 @@ def fit_means(
     return replace(model, labels=thinned.point_labels(labels))
 
 
-def fit_points(parts: Thinned, config: ModelsConfig, view: Array, laps: list[float]) -> MultiModel:
+def fit_points(fine: Thinned, config: ModelsConfig, view: Array, laps: list[float]) -> MultiModel:
     """Fit models to one point a voxel, and grow them over those of the parts of voxels."""
-    is_parted = parts.parts > 1
-    thinned = parts.whole_voxels() if is_parted else parts
+    is_parted = fine.divisions > 1
+    thinned = fine.whole_voxels() if is_parted else fine
     voxels = thinned.by_voxel()
     if config.noise_m == config.noise_per_range_sq == 0.0:
-        starts = parts.starts[thinned.starts] if is_parted else parts.starts
-        samples = NoiseSamples(parts.points, parts.rows, starts, thinned.means, view=view)
+        starts = fine.starts[thinned.starts] if is_parted else fine.starts
+        samples = NoiseSamples(fine.points, fine.rows, starts, thinned.means, view=view)
         noise = estimate_noise(samples, config.voxel_size_m)
         config = replace(config, noise_m=min(noise[0], 1.0), noise_per_range_sq=min(noise[1], 1.0))
     laps.append(clock())
@@ -199,9 +199,9 @@ def fit_points(parts: Thinned, config: ModelsConfig, view: Array, laps: list[flo
         fitted = owner_patches(joined, config, view)
     model = owner_models(thinned, voxels, joined, fitted, config)
     if not is_parted:
-        return covered(model, parts.points, view)
-    model = covered(model, parts.means, view, np.diff(parts.starts))
-    return replace(model, labels=parts.point_labels(model.labels))
+        return covered(model, fine.points, view)
+    model = covered(model, fine.means, view, np.diff(fine.starts))
+    return replace(model, labels=fine.point_labels(model.labels))
 
 
 def grow_sparse(
@@ -227,9 +227,9 @@ def separated(
 ) -> Grown:
     """Return joined patches, the lost ones (K,) as the previous ones; these are multi-valued."""
     number = len(joined.normals)
-    again = np.append(lost, np.False_)[np.maximum(joined.owner, -1)]
-    earlier = np.where(previous.owner >= 0, previous.owner + number, previous.owner)
-    owner = np.where(again, earlier, joined.owner)
+    is_unjoined = np.append(lost, np.False_)[np.maximum(joined.owner, -1)]
+    previous_owner = np.where(previous.owner >= 0, previous.owner + number, previous.owner)
+    owner = np.where(is_unjoined, previous_owner, joined.owner)
     used, index = np.unique(np.maximum(owner, -1), return_inverse=True)
     shift = int(used[0] < 0)
     owner = np.where(owner < 0, owner, index - shift).astype(np.int32)
@@ -245,13 +245,13 @@ def owner_patches(growth: Grown, config: ModelsConfig, view: Array) -> list[Plan
     first = int(starts[0])
     if not number:
         return []
-    middle = np.add.reduceat(growth.means, starts[:-1]) / np.diff(starts)[:, None]
-    towards = np.einsum('ij,ij->i', growth.normals, view - middle)
+    centre = np.add.reduceat(growth.means, starts[:-1]) / np.diff(starts)[:, None]
+    facing = np.einsum('ij,ij->i', growth.normals, view - centre)
     points = PatchPoints(
         points=np.ascontiguousarray(growth.means[first:]),
         starts=starts - first,
-        normals=growth.normals * np.where(towards < 0.0, -1.0, 1.0)[:, None],
-        thickness=thickness(middle, config, view),
+        normals=growth.normals * np.where(facing < 0.0, -1.0, 1.0)[:, None],
+        thickness=thickness(centre, config, view),
         curved=growth.curved,
     )
     return fit_patches(points, config, view)
@@ -470,6 +470,6 @@ def above(surfels: Surfels) -> Array:
     if not len(surfels):
         return np.zeros(3)
     low, high = surfels.position.min(axis=0), surfels.position.max(axis=0)
-    middle: Array = 0.5 * (low + high)
-    middle[2] = high[2] + ABOVE_EXTENTS * float(np.linalg.norm(high - low))
-    return middle
+    centre: Array = 0.5 * (low + high)
+    centre[2] = high[2] + ABOVE_EXTENTS * float(np.linalg.norm(high - low))
+    return centre

@@ -94,13 +94,13 @@ def mean_normals(normals: Array, starts: Indices) -> Array:
     return totals
 
 
-def oriented(axes: Array, towards: Array) -> Array:
+def oriented(axes: Array, directions: Array) -> Array:
     """
     Return frames (K, 3, 3) of eigenvectors, rows ascending by eigenvalue.
 
     The normal is on the side of a direction (K, 3), and the largest component of x is positive.
     """
-    side = np.where(np.einsum('ij,ij->i', axes[:, 0], towards) < 0.0, -1.0, 1.0)
+    side = np.where(np.einsum('ij,ij->i', axes[:, 0], directions) < 0.0, -1.0, 1.0)
     z, x = axes[:, 0] * side[:, None], axes[:, 2]  # its largest component is positive
     frames: Array = np.stack([x, np.cross(z, x), z], axis=1)
     return frames

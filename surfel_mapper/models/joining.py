@@ -185,8 +185,8 @@ def join_patches(
         normals = np.where(undone[:, None], single.normals, layered.normals)
         sigma = np.where(undone, single.sigma, layered.sigma)
         separated = replace(layered, normals=normals, sigma=sigma)
-        again = touching[undone[touching[:, :2]].all(axis=1)]
-        root = separated.joined(root, again, UNRESOLVED_VOXELS * size_m)
+        open_pairs = touching[undone[touching[:, :2]].all(axis=1)]
+        root = separated.joined(root, open_pairs, UNRESOLVED_VOXELS * size_m)
         index, normals, curved, _ = separated.described(root, size_m)
     return index, normals, curved
 
@@ -234,10 +234,10 @@ class Comparison:
         number, means, scatters = means_and_scatters(pieces.means, pieces.weights, pieces.starts)
         covariances = scatters / np.maximum(number, 1.0)[:, None, None]
         values, axes = eigen(covariances)
-        towards, normals = view - means, axes[:, 0].copy()
-        normals[np.einsum('ij,ij->i', towards, normals) < 0.0] *= -1.0
-        range_sq = np.maximum(np.einsum('ij,ij->i', towards, towards), 1e-24)
-        cosine = np.abs(np.einsum('ij,ij->i', towards, normals)) / np.sqrt(range_sq)
+        view_rays, normals = view - means, axes[:, 0].copy()
+        normals[np.einsum('ij,ij->i', view_rays, normals) < 0.0] *= -1.0
+        range_sq = np.maximum(np.einsum('ij,ij->i', view_rays, view_rays), 1e-24)
+        cosine = np.abs(np.einsum('ij,ij->i', view_rays, normals)) / np.sqrt(range_sq)
         cosine = np.maximum(cosine, LEAST_COSINE)
         across = (noise[0] + noise[1] * range_sq) * cosine
         limits = LEAST_FLOOR_VOXELS * size_m, MOST_FLOOR_VOXELS * size_m
@@ -289,8 +289,8 @@ class Comparison:
         pairs = touching_pairs(root[touching[:, :2]], touching[:, 2], number)
         gains, is_stale = np.zeros(len(pairs)), np.full(number, True)
         while len(pairs):
-            again = is_stale[pairs].any(axis=1)
-            gains[again] = self.compared(pairs[again], root, regions)[:, 0]
+            open_pairs = is_stale[pairs].any(axis=1)
+            gains[open_pairs] = self.compared(pairs[open_pairs], root, regions)[:, 0]
             if plane_m is not None:
                 gains[self.worse_planes(pairs, root, plane_m)] = 0.0
             small, large = chosen_joins(pairs, gains, regions.rows)

@@ -283,10 +283,10 @@ class LiveModels:
         existed = [number for number in chosen if number in self._patches]
         groups = self._fitter.describe(list(chosen.values()))
         beyond = rows_beyond(self._graph, self._patches, [*chosen, *matched.removed], groups)
-        again = [n for n in beyond if n not in chosen and self._continues_otherwise(n, beyond[n])]
+        refit = [n for n in beyond if n not in chosen and self._continues_otherwise(n, beyond[n])]
         self._fit(list(chosen), groups, beyond)
-        self._fit(again, self._fitter.describe([self._patches[n].rows for n in again]), beyond)
-        return existed + again
+        self._fit(refit, self._fitter.describe([self._patches[n].rows for n in refit]), beyond)
+        return existed + refit
 
     def _continues_otherwise(self, number: int, beyond: Rows) -> bool:
         """Return whether the voxels beyond the seams of a surface changed."""

@@ -99,10 +99,10 @@ class PatchShape:
         return isinstance(self.patch, Surface)
 
     @property
-    def middle(self) -> Array:
+    def centre(self) -> Array:
         """Middle of the box, (3,) m."""
-        middle: Array = 0.5 * (self.low + self.high) @ self.patch.R_patch_map + self.patch.mean
-        return middle
+        centre: Array = 0.5 * (self.low + self.high) @ self.patch.R_patch_map + self.patch.mean
+        return centre
 
 
 def shape_of(patch: Plane) -> PatchShape:

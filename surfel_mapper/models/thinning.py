@@ -48,7 +48,7 @@ class Thinned:
         models/kernels/voxel_means.py.
     bits : (3,) int64
         Bits of x, y and z in the keys.
-    parts : int
+    divisions : int
         Parts of a voxel along each axis; if not 1, all of the above are those of the parts.
 
     """
@@ -59,7 +59,7 @@ class Thinned:
     starts: Indices
     keys: Indices
     bits: Indices
-    parts: int = 1
+    divisions: int = 1
 
     def by_voxel(self) -> VoxelPoints:
         """Return the finite points by voxel, with the neighbours of voxels."""
@@ -68,7 +68,7 @@ class Thinned:
 
     def whole_voxels(self) -> Thinned:
         """Return the means of parts as a cloud by voxel."""
-        keys = self.keys // self.parts**3
+        keys = self.keys // self.divisions**3
         first = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
         starts, counts = np.append(first, len(keys)), np.diff(self.starts).astype(np.float64)
         means = means_and_scatters(self.means, counts, starts)[1]
@@ -82,8 +82,8 @@ class Thinned:
         return of_points
 
 
-def thin(points: npt.NDArray[Any], voxel_size_m: float, parts: int = 1) -> Thinned:
-    """Return the means of the points (N, 3) in each voxel, or in the parts^3 parts of each."""
+def thin(points: npt.NDArray[Any], voxel_size_m: float, divisions: int = 1) -> Thinned:
+    """Return the means of the points (N, 3) in each voxel, or in the divisions^3 parts of each."""
     points, ends = np.require(points, None, ['C', 'W']), np.empty((2, 3))
     number = finite_ends(points, ends)
     if not number:
@@ -91,15 +91,15 @@ def thin(points: npt.NDArray[Any], voxel_size_m: float, parts: int = 1) -> Thinn
         rows, bits = none.astype(np.int32), np.zeros(3, np.int64)
         return Thinned(np.empty((0, 3)), points, rows, np.zeros(1, np.int64), none, bits)
     grid = ScanVoxels.between(ends[0], ends[1], np.full(3, voxel_size_m), 'origin')
-    if int(grid.bits.sum()) + (parts**3 - 1).bit_length() > KEY_BITS:
-        parts = 1
-    ordered, to_key, long_keys = sorted_keys(points, (grid, parts), number)
+    if int(grid.bits.sum()) + (divisions**3 - 1).bit_length() > KEY_BITS:
+        divisions = 1
+    ordered, to_key, long_keys = sorted_keys(points, (grid, divisions), number)
     rows, starts = np.empty(number, np.int32), np.empty(number + 1, np.int64)
     keys, means = np.empty(number, np.int64), np.empty((number, 3))
     num = average_voxels(points, ordered, to_key, rows, starts, keys, means)
     keys = keys[:num].copy() if long_keys is None else long_keys[keys[:num]]
     starts = starts[: num + 1].copy()
-    return Thinned(means[:num].copy(), points, rows, starts, keys, grid.bits, parts)
+    return Thinned(means[:num].copy(), points, rows, starts, keys, grid.bits, divisions)
 
 
 def sorted_keys(
@@ -110,11 +110,11 @@ def sorted_keys(
 
     Keys that leave no room for rows are replaced by their ranks; they are returned too, ascending.
     """
-    (grid, parts), to_key = voxels, len(points).bit_length()
+    (grid, divisions), to_key = voxels, len(points).bit_length()
     keys: Indices = np.empty(number, np.int64)
-    is_long = int(grid.bits.sum()) + (parts**3 - 1).bit_length() + to_key > 63
+    is_long = int(grid.bits.sum()) + (divisions**3 - 1).bit_length() + to_key > 63
     axes = grid.size, grid.shift, grid.base
-    voxel_keys(points, (axes, grid.bits), parts, 0 if is_long else to_key, keys)
+    voxel_keys(points, (axes, grid.bits), divisions, 0 if is_long else to_key, keys)
     long_keys: Indices | None = None
     if is_long:
         rows = np.flatnonzero(np.isfinite(points).all(axis=1))

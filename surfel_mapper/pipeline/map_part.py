@@ -235,7 +235,7 @@ class MapPart:
         cells: npt.NDArray[np.float64],
         surfel_map: SurfelMap,
         T_part_middle: Transform,
-        places: Sequence[Transform] = (),
+        candidates: Sequence[Transform] = (),
     ) -> tuple[Transform, RegistrationResult] | None:
         """
         Compare the newest scan with the map; return T_map_part once enough scans agree.
@@ -248,7 +248,7 @@ class MapPart:
             The map.
         T_part_middle : (4, 4) float64
             Pose of the scan on the part.
-        places : sequence of (4, 4) float64
+        candidates : sequence of (4, 4) float64
             Poses of the scan on the map that a search found; by default the guess.
 
         """
@@ -256,8 +256,8 @@ class MapPart:
         start = compose(
             self.guess if self._T_map_part is None else self._T_map_part, T_part_middle
         )
-        if places:
-            result = self._registration.relocate(cells, surfel_map, [start, *places])
+        if candidates:
+            result = self._registration.relocate(cells, surfel_map, [start, *candidates])
         else:
             is_lost, most_m = self._T_map_part is None, settings.max_deviation_m
             result = self._registration.align(cells, surfel_map, [start], most_m, is_lost=is_lost)
@@ -289,12 +289,14 @@ class MapPart:
             return None
         T_part_body, registration = self.scans[0].T_part_body, self._registration
         search = PlaceSearch(means(surfel_map.moments()), surfel_map.voxel_size_m)
-        places = turned([T_map_body], 24) + search.poses(cells_around(self._map, T_part_body))
+        candidates = turned([T_map_body], 24) + search.poses(cells_around(self._map, T_part_body))
         small, large, T_small_body = self._map, surfel_map, T_part_body
         if is_larger := self._map.num_voxels > surfel_map.num_voxels:
             small, large, T_small_body = surfel_map, self._map, T_map_body
-            places = [compose(T_part_body, compose(inverse(T), T_map_body)) for T in places]
-        result = registration.relocate(cells_around(small, T_small_body), large, places)
+            candidates = [
+                compose(T_part_body, compose(inverse(T), T_map_body)) for T in candidates
+            ]
+        result = registration.relocate(cells_around(small, T_small_body), large, candidates)
         cells = cells_around(large, result.T_map_sensor)
         back = registration.align(
             cells, small, [T_small_body], registration.config.max_deviation_m

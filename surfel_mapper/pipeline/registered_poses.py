@@ -379,10 +379,10 @@ class RegisteredPoses:
             T_part_middle = map_part.add(sighting)
         except AlignmentError:
             return self._leave(sighting, map_part, twist, surfel_map, T_map_fixed)
-        places = self._places(map_part, surfel_map, T_part_middle)
+        candidates = self._candidates(map_part, surfel_map, T_part_middle)
         confirmed = None
-        if self._knows_start or places or map_part.has_place:
-            confirmed = map_part.confirmed(sighting.cells, surfel_map, T_part_middle, places)
+        if self._knows_start or candidates or map_part.has_place:
+            confirmed = map_part.confirmed(sighting.cells, surfel_map, T_part_middle, candidates)
         if confirmed is None:
             if len(map_part.scans) >= MOST_SCANS:
                 self._end_part(waits=True)
@@ -409,7 +409,7 @@ class RegisteredPoses:
             for waiting in map_part.scans
         ]
 
-    def _places(
+    def _candidates(
         self, map_part: MapPart, surfel_map: SurfelMap, T_part_middle: Transform
     ) -> list[Transform]:
         """

@@ -540,8 +540,8 @@ def _chained(edges: list[PoseTrack], stamp_ns: int) -> Transform | None:
 
 def seconds(stamp_ns: int) -> str:
     """Return a stamp in seconds with all its digits."""
-    whole, rest = divmod(abs(stamp_ns), NS_PER_S)
-    return f'{"-" if stamp_ns < 0 else ""}{whole}.{rest:09d}'
+    whole, remainder_ns = divmod(abs(stamp_ns), NS_PER_S)
+    return f'{"-" if stamp_ns < 0 else ""}{whole}.{remainder_ns:09d}'
 
 
 def check_held(edges: list[PoseTrack], stamp_ns: int, max_gap_s: float) -> None:

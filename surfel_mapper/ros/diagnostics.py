@@ -189,8 +189,8 @@ class Totals:
         """Return the rates since an earlier count, received and published, in Hz."""
         seconds = self.time_s - last.time_s
 
-        def rate_hz(number: int, earlier: int) -> float:
-            return round(max(number - earlier, 0) / seconds, 2)
+        def rate_hz(number: int, previous: int) -> float:
+            return round(max(number - previous, 0) / seconds, 2)
 
         return {
             'received_hz': rate_hz(self.received, last.received),

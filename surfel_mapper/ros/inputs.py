@@ -316,9 +316,9 @@ class Inputs:
             with suppress(CloudFormatError):  # counted when it is decoded
                 self.poses.note_cloud(frame_name(msg.header.frame_id))
 
-    def _on_lost(self, topic: str, earlier: int, number: int) -> None:
+    def _on_lost(self, topic: str, previous: int, number: int) -> None:
         """Take the number that a subscription has lost, after the losses of earlier ones."""
-        self.lost[topic] = earlier + number
+        self.lost[topic] = previous + number
         self._node.get_logger().warning(self.loss(), throttle_duration_sec=10.0)
 
 

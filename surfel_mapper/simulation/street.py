@@ -79,8 +79,8 @@ class Street:
     def ends(self) -> Iterator[Primitive]:
         """Yield the ground and a house across each end."""
         size = (self._length_m + 2.0 * BEYOND_M + 40.0, GROUND_WIDTH_M)
-        middle = (self._length_m / 2.0, 0.0, 0.0)
-        yield self._primitive('rectangle', size, middle, label='ground', reflectivity=0.25)
+        midpoint = (self._length_m / 2.0, 0.0, 0.0)
+        yield self._primitive('rectangle', size, midpoint, label='ground', reflectivity=0.25)
         for x in (-BEYOND_M - 4.0, self._length_m + BEYOND_M + 4.0):
             turn = (self._about(0.0, 1.0), self._about(0.0, 1.0), self._about(0.0, 8.0))
             yield self._primitive('box', (8.0, 40.0, 24.0), (x, 0.0, 2.0), turn, label='building')

@@ -92,8 +92,8 @@ def _fill(
     centres = inside[:, :3] + inside[:, 3:]
     axis = int(np.argmax(np.ptp(centres, axis=0)))
     order = members[np.argsort(centres[:, axis], kind='stable')]
-    middle = _fill(tree, boxes, order[: len(order) // 2], node + 1)
-    return _fill(tree, boxes, order[len(order) // 2 :], middle)
+    sibling = _fill(tree, boxes, order[: len(order) // 2], node + 1)
+    return _fill(tree, boxes, order[len(order) // 2 :], sibling)
 
 
 FloatArray = npt.NDArray[np.float64]

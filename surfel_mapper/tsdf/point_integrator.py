@@ -206,11 +206,11 @@ class PointIntegrator:
             NO_COLORS if colors is None else np.ascontiguousarray(colors[solid]),
             NO_LABELS if labels is None else labels[solid],
         )
-        places: Float64 = np.empty((0, 3))
+        positions: Float64 = np.empty((0, 3))
         if len(images[0]) + len(images[1]):
             with np.errstate(invalid='ignore'):  # points may be infinite
-                places = points[solid] @ pose[:, :3].T + (origin + corner * side)
-        return self._fuse(scan, cells, (origin, corner), stamp_ns, (places, *images))
+                positions = points[solid] @ pose[:, :3].T + (origin + corner * side)
+        return self._fuse(scan, cells, (origin, corner), stamp_ns, (positions, *images))
 
     @property
     def _plane_voxels(self) -> int:

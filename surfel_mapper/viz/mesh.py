@@ -95,14 +95,14 @@ def mesh_data(
 
     Vertices farther from that box than half of its longest side are left out.
     """
-    middle, reach = low + 0.5 * size, 0.5 * size + 0.5 * size.max()
-    near = np.less_equal(np.abs(mesh.vertices - middle), reach).min(axis=1)
+    centre, reach = low + 0.5 * size, 0.5 * size + 0.5 * size.max()
+    near = np.less_equal(np.abs(mesh.vertices - centre), reach).min(axis=1)
     triangles = mesh.triangles[near[mesh.triangles].min(axis=1)]
     near_mesh = Mesh(vertices=mesh.vertices, triangles=triangles, colors=mesh.colors)
     mesh = reduced(near_mesh, max_triangles)
     used, indices = np.unique(mesh.triangles, return_inverse=True)
     packed = np.zeros(len(used), VERTEX)
-    within = (mesh.vertices[used] - middle + reach) / (2.0 * reach)
+    within = (mesh.vertices[used] - centre + reach) / (2.0 * reach)
     packed['place'] = np.rint(np.clip(within, 0.0, 1.0) * 65535.0)
     packed['normal'][:, :3] = np.rint(vertex_normals(mesh)[used] * 127.0)
     packed['color'][:, :3] = mesh.colors[used] if len(mesh.colors) else GREY

@@ -170,15 +170,15 @@ def draw_map(
     scene = MapScene.of(DrawnDiscs.of(surfels), trajectory)
     oblique = scene.oblique()
     plan = scene.plan(oblique.height)
-    left = BORDER + oblique.width + BETWEEN + DIGIT_PX * digits_of(plan, origin)
-    width, height = left + plan.width + BORDER, ABOVE + oblique.height + BELOW
+    left_px = BORDER + oblique.width + BETWEEN + DIGIT_PX * digits_of(plan, origin)
+    width, height = left_px + plan.width + BORDER, ABOVE + oblique.height + BELOW
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     FigureCanvasAgg(figure)
     page = figure.add_axes((0.0, 0.0, 1.0, 1.0), zorder=2)
     page.set(xlim=(0, width), ylim=(0, height))
     page.axis('off')
     draw_oblique(page, scene, oblique)
-    draw_plan(page, scene, plan, origin, left)
+    draw_plan(page, scene, plan, origin, left_px)
     draw_key(page, scene, oblique)
     # a name of a file may be no text, or hold dollar signs
     write: dict[str, Any] = {'parse_math': False, 'color': INK}
@@ -216,10 +216,10 @@ def draw_oblique(page: Axes, scene: MapScene, camera: Camera) -> None:
     draw_way(page, scene.trajectory, camera, BORDER)
 
 
-def place_image(page: Axes, image: npt.NDArray[Any], left: int, bottom: int) -> None:
+def place_image(page: Axes, image: npt.NDArray[Any], left_px: int, bottom: int) -> None:
     """Place an image with its lower left corner at a pixel of the page, without resampling."""
     figure: Any = page.figure
-    figure.figimage(as_bytes(image), left, bottom, origin='upper', zorder=1)
+    figure.figimage(as_bytes(image), left_px, bottom, origin='upper', zorder=1)
 
 
 def square_m(camera: Camera) -> float:
@@ -251,9 +251,11 @@ def ground_lines(scene: MapScene, camera: Camera, depth: Image) -> Image:
 def draw_key(page: Axes, scene: MapScene, camera: Camera) -> None:
     """Draw scale bar, axes and the meaning of the colours below the oblique view."""
     text: dict[str, Any] = {'fontsize': TEXT_PT, 'color': INK, 'va': 'center'}
-    side, left, low = square_m(camera), BORDER + 4, NOTE_PX
-    page.plot([left, left + side * camera.px_per_m], [low + 66] * 2, color=INK, linewidth=2.5)
-    page.text(left, low + 36, f'{side:g} m, one square of the grid', **text)
+    side, left_px, low = square_m(camera), BORDER + 4, NOTE_PX
+    page.plot(
+        [left_px, left_px + side * camera.px_per_m], [low + 66] * 2, color=INK, linewidth=2.5
+    )
+    page.text(left_px, low + 36, f'{side:g} m, one square of the grid', **text)
     arrow = {'arrowstyle': '->', 'color': INK, 'shrinkA': 0.0, 'shrinkB': 0.0}
     x, y = BORDER + 450, low + 46
     for name, (right, up) in zip('xyz', camera.R_view_map[:2].T.tolist(), strict=True):
@@ -272,15 +274,15 @@ def draw_key(page: Axes, scene: MapScene, camera: Camera) -> None:
         page.legend(fontsize=TEXT_PT, loc='center left', bbox_to_anchor=at, ncols=3, frameon=False)
 
 
-def draw_plan(page: Axes, scene: MapScene, camera: Camera, origin_m: Array, left: int) -> None:
+def draw_plan(page: Axes, scene: MapScene, camera: Camera, origin_m: Array, left_px: int) -> None:
     """Draw the discs from above, with the coordinates of the fixed frame and equal ticks."""
     from matplotlib.ticker import MultipleLocator
 
     figure: Any = page.figure
     page_px = 2 * tuple(figure.get_size_inches() * DPI)
-    ax = figure.add_axes(np.divide((left, BELOW, camera.width, camera.height), page_px))
-    place_image(page, scene.rendered(camera)[0], left, BELOW)
-    draw_way(page, scene.trajectory, camera, left)
+    ax = figure.add_axes(np.divide((left_px, BELOW, camera.width, camera.height), page_px))
+    place_image(page, scene.rendered(camera)[0], left_px, BELOW)
+    draw_way(page, scene.trajectory, camera, left_px)
     corners, names = np.stack(camera.limits), []
     for column, axis in enumerate((ax.xaxis, ax.yaxis)):
         row = camera.R_view_map[column]
@@ -297,13 +299,13 @@ def draw_plan(page: Axes, scene: MapScene, camera: Camera, origin_m: Array, left
     ax.ticklabel_format(useOffset=False, style='plain')
 
 
-def draw_way(page: Axes, trajectory: Array, camera: Camera, left: int) -> None:
+def draw_way(page: Axes, trajectory: Array, camera: Camera, left_px: int) -> None:
     """Draw a trajectory, (S, 3) m, with its start and its end, on the view at a column."""
     from matplotlib.transforms import Bbox
 
     if not len(trajectory):
         return
-    corner = np.array([left, BELOW])
+    corner = np.array([left_px, BELOW])
     way = (camera.projected(trajectory) - camera.limits[0]) * camera.px_per_m + corner
     dots: dict[str, Any] = {'zorder': 4, 'linestyle': '', 'markeredgecolor': 'white'}
     name, drawn = 'sensor', []
@@ -314,8 +316,8 @@ def draw_way(page: Axes, trajectory: Array, camera: Camera, left: int) -> None:
         drawn += page.plot(*way[:1].T, 'o', color=GREEN, markersize=7.0, label='start', **dots)
     drawn += page.plot(*way[-1:].T, 's', color=RED, markersize=6.0, label=name, **dots)
     for line in drawn:
-        line.set_clip_box(Bbox.from_bounds(left, BELOW, camera.width, camera.height))
-        if left != BORDER:
+        line.set_clip_box(Bbox.from_bounds(left_px, BELOW, camera.width, camera.height))
+        if left_px != BORDER:
             line.set_label('_')  # the key has each name once
 
 

@@ -178,8 +178,8 @@ def hollow_shade(depth: Image, unit_m: Any) -> Image:
         for down, right in step * np.array([(0, 1), (1, 0), (1, 1), (1, -1)]):
             total = np.zeros_like(finite_depth)
             for sign in (-1, 1):
-                top, left = most + sign * down, most + sign * right
-                rise = finite_depth - wide[top : top + height, left : left + width]
+                top, column = most + sign * down, most + sign * right
+                rise = finite_depth - wide[top : top + height, column : column + width]
                 total += np.maximum(rise / steps_m, -4.0)
             hollow += np.fmin(np.fmax(total - 0.25, 0.0), 2.0)  # 0 for nan
     shade: Image = np.maximum(np.exp(hollow * np.float32(-STRENGTH / 12.0)), np.float32(0.4))
@@ -207,8 +207,8 @@ def facing_discs(camera: Camera, discs: DrawnDiscs) -> tuple[npt.NDArray[np.int6
     radius_m = discs.radius_m[rows, None]
     larger = radius_m + CLOSING * np.minimum(radius_m, np.median(radius_m) if len(rows) else 0.0)
     radius_m = np.maximum(larger, FINER * THINNEST_PX / scale)
-    middle = 0.5 * FINER * np.array([camera.width, camera.height]) - 0.5
-    centre = middle + (in_camera[:, :2] - camera.centre_m) * scale * [1.0, -1.0]
+    image_centre = 0.5 * FINER * np.array([camera.width, camera.height]) - 0.5
+    centre = image_centre + (in_camera[:, :2] - camera.centre_m) * scale * [1.0, -1.0]
     steps_m = normal[:, :2] / normal[:, 2:] * [1.0, -1.0] / scale  # of depth, right and down
     across = [sign * R[k] / scale + steps_m[:, k, None] * ray for k, sign in ((0, 1), (1, -1))]
     columns = [

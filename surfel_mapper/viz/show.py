@@ -202,10 +202,10 @@ def shared_origin(contents: Sequence[Content]) -> Array:
     for content in contents:
         if isinstance(content.shape, ScanMoments):
             return content.origin_m
-    middle = place_of(contents)
-    if np.abs(middle).max() < FAR_M:
+    centre = place_of(contents)
+    if np.abs(centre).max() < FAR_M:
         return np.zeros(3)
-    return np.asarray(ROUND_M * np.round(middle / ROUND_M), np.float64)
+    return np.asarray(ROUND_M * np.round(centre / ROUND_M), np.float64)
 
 
 def place_of(contents: Sequence[Content]) -> Array:

@@ -98,11 +98,18 @@ def test_times_of_a_table_are_exact_to_the_last_nanosecond(tmp_path):
 
 @pytest.mark.parametrize(
     'line',
-    ['2011-13-26 13:02:25', '2011-09-26 13:02:25.x', '11-09-26 13:02:25', '1969-12-31 0:0:0'],
+    [
+        '2011-13-26 13:02:25',
+        '2011-09-26 13:02:25.x',
+        '2011-09-26 13:02:25-02:00',
+        '11-09-26 13:02:25',
+        '1969-12-31 0:0:0',
+        '9999-09-26 13:02:25',
+    ],
 )
 def test_dates_of_another_form_are_refused_with_their_line(tmp_path, line):
     path = tmp_path / 'timestamps.txt'
-    path.write_text(f'2011-09-26 13:02:25.5\n\n{line}\n')
+    path.write_text(f'2011-09-26 13:02:25.5Z\n\n{line}\n')
     with pytest.raises(FileFormatError, match=rf"timestamps\.txt:3: '{line}' is no time"):
         read_dates(path)
 

@@ -61,7 +61,7 @@ def test_no_triangle_of_a_plane_is_in_its_hole_or_beyond_its_rim(frame):
 
 def test_box_of_a_plane_encloses_it(frame):
     shape = shape_of(frame[0])
-    assert shape.middle == pytest.approx([5.0, 1.0, 2.0], abs=A)
+    assert shape.centre == pytest.approx([5.0, 1.0, 2.0], abs=A)
     length_x, length_y, thickness = shape.high - shape.low
     assert thickness == 0.0
     # the frame of a square may be turned within its plane: its box is no larger than its diagonal
@@ -76,7 +76,7 @@ def test_small_board_on_the_edges_of_large_voxels_has_a_shape():
     shape = shape_of(plane)
     reach = 0.02 + 0.25 * 1.0 + 2.0 / 255
     assert 0.04**2 < shape.area_m2 < (2.0 * reach) ** 2
-    assert np.abs(shape.middle - [0.0, 0.0, 0.5]).max() < reach
+    assert np.abs(shape.centre - [0.0, 0.0, 0.5]).max() < reach
 
 
 def test_shapes_of_surfaces_are_curved():

@@ -74,4 +74,4 @@ def test_parts_divide_voxels_and_make_up_their_means():
 
 def test_voxels_that_leave_no_numbers_for_parts_are_not_divided():
     corners = np.array([[0.25] * 3, [2.0**19 - 0.75] * 3])
-    assert (thin(corners, 0.5, 3).parts, thin(corners, 1.0, 3).parts) == (1, 3)
+    assert (thin(corners, 0.5, 3).divisions, thin(corners, 1.0, 3).divisions) == (1, 3)

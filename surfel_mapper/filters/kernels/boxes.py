@@ -43,21 +43,21 @@ def cut(points, max_points, order, rows):
             waiting -= 1
             continue
         axis = (highs[box] - lows[box]).argmax()
-        middle = last - (last - first) // 2
-        split(points, axis, order, first, last, middle)
+        rank = last - (last - first) // 2
+        split(points, axis, order, first, last, rank)
         # the upper part replaces the box on the stack, the lower one is cut next
         lower = waiting
         lows[lower], highs[lower] = lows[box], highs[box]
-        spans[lower, 0], spans[lower, 1] = first, middle
-        spans[box, 0] = middle
-        highs[lower, axis] = lows[box, axis] = points[order[middle], axis]
+        spans[lower, 0], spans[lower, 1] = first, rank
+        spans[box, 0] = rank
+        highs[lower, axis] = lows[box, axis] = points[order[rank], axis]
         waiting += 1
     return number
 
 
 @njit(cache=True, nogil=True)
-def split(points, axis, order, first, last, middle):
-    """Partition order[first:last] at middle."""
+def split(points, axis, order, first, last, rank):
+    """Partition order[first:last] at rank."""
     low, high = first, last - 1
     chance = np.uint32(last - first)  # pseudo-random pivots: no input order is slow
     while low < high:
@@ -74,9 +74,9 @@ def split(points, axis, order, first, last, middle):
                 order[i], order[j] = order[j], order[i]
                 i += 1
                 j -= 1
-        if middle <= j:
+        if rank <= j:
             high = j
-        elif middle >= i:
+        elif rank >= i:
             low = i
         else:
             return

@@ -53,15 +53,15 @@ def build_nodes(points, order, links, boxes, xyz, num_leaves):
                 row = U(order[i])
                 xyz[0, i], xyz[1, i], xyz[2, i] = points[row, 0], points[row, 1], points[row, 2]
             continue
-        middle = (begin + end) >> 1
+        rank = (begin + end) >> 1
         for i in range(first, last):
             values[U(i)] = points[U(order[U(i)]), axis]
-        split_at(values, order, first, last, middle * LEAF)
-        lower, upper = node + 1, node + 2 * (middle - begin)
+        split_at(values, order, first, last, rank * LEAF)
+        lower, upper = node + 1, node + 2 * (rank - begin)
         links[RIGHT, node] = upper
         links[PARENT, lower] = links[PARENT, upper] = node
-        stack[top, 0], stack[top, 1], stack[top, 2] = upper, middle, end
-        stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = lower, begin, middle
+        stack[top, 0], stack[top, 1], stack[top, 2] = upper, rank, end
+        stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = lower, begin, rank
         top += 2
 
 
@@ -112,9 +112,9 @@ def move_up_to(values, rows, low, high, pivot):
 
 
 @kernel(fastmath={'nnan'})
-def split_at(values, order, low, high, middle):
-    """Permute values and order from low to high - 1 so that no value before middle is larger."""
-    low, high, middle = U(low), U(high), U(middle)
+def split_at(values, order, low, high, rank):
+    """Permute values and order from low to high - 1 so that no value before rank is larger."""
+    low, high, rank = U(low), U(high), U(rank)
     while high - low > U(1):
         half, last = (low + high) >> U(1), high - U(1)
         a, b, c = values[low], values[half], values[last]
@@ -125,13 +125,13 @@ def split_at(values, order, low, high, middle):
         less = move_below(values, order, low, last, pivot)
         values[last], order[last] = values[less], order[less]
         values[less], order[less] = pivot, pivot_row
-        if less == middle or less + U(1) == middle:
+        if less == rank or less + U(1) == rank:
             return
-        if less > middle:
+        if less > rank:
             high = less
         elif less > low:
             low = less + U(1)
         else:  # the pivot is the smallest, maybe one of many
             low = move_up_to(values, order, less, high, pivot)
-            if low >= middle:
+            if low >= rank:
                 return

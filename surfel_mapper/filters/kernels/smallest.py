@@ -56,14 +56,14 @@ def largest(squares, count):
 def sort(squares, indices, order, count):
     """Sort the neighbours by distance, equally near ones by row."""
     for i in range(U(1), count):
-        value, index, later = squares[i], indices[i], i
-        while later > U(0):
-            earlier = later - U(1)
-            farther = squares[earlier] > value
-            if squares[earlier] == value:
-                farther = order[U(indices[earlier])] > order[U(index)]
+        value, index, slot = squares[i], indices[i], i
+        while slot > U(0):
+            lower_slot = slot - U(1)
+            farther = squares[lower_slot] > value
+            if squares[lower_slot] == value:
+                farther = order[U(indices[lower_slot])] > order[U(index)]
             if not farther:
                 break
-            squares[later], indices[later] = squares[earlier], indices[earlier]
-            later = earlier
-        squares[later], indices[later] = value, index
+            squares[slot], indices[slot] = squares[lower_slot], indices[lower_slot]
+            slot = lower_slot
+        squares[slot], indices[slot] = value, index

@@ -27,7 +27,7 @@ LEAST_CELLS = 5
 
 
 def look_through(
-    points: npt.NDArray[np.floating], places: npt.NDArray[np.floating], margin_m: float
+    points: npt.NDArray[np.floating], centers: npt.NDArray[np.floating], margin_m: float
 ) -> npt.NDArray[np.int8]:
     """
     Return the verdict of points on places, (K,).
@@ -36,7 +36,7 @@ def look_through(
     ----------
     points : (N, 3) float, m
         About the sensor, z up, finite.
-    places : (K, 3) float, m
+    centers : (K, 3) float, m
         In the same frame.
     margin_m : float
         Half of the depth of a place.
@@ -50,10 +50,11 @@ def look_through(
         within the margin. Else UNKNOWN.
 
     """
-    (range_m, *cells), (distance_m, row, column) = direction_cells(points), direction_cells(places)
+    range_m, *cells = direction_cells(points)
+    distance_m, row, column = direction_cells(centers)
     nearest: Float32 = np.full((round(180 / FINEST_DEG), round(360 / FINEST_DEG)), np.inf)
     np.minimum.at(nearest, tuple(cells), range_m)
-    through, is_hit = np.zeros((2, len(places)), bool)
+    through, is_hit = np.zeros((2, len(centers)), bool)
     for _ in range(NUM_GRIDS):
         modes = ('constant', 'wrap')
         lowest = minimum_filter(nearest, (5, 3), mode=modes, cval=np.inf)

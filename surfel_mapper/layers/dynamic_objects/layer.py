@@ -102,9 +102,9 @@ class DynamicObjectsLayer(Layer):
         scales = np.minimum(tsdf.max_range_m / ranges[kept], 1.0)  # unknown beyond
         T = inverse(T_map_sensor)
         centers = (unpack_keys(keys).astype(np.float64) + 0.5) * voxel_size_m
-        places = (centers @ T[:3, :3].T + T[:3, 3])[:, axes].astype(np.float32)
-        near = np.linalg.norm(places, axis=1) <= tsdf.max_range_m
+        voxels_m = (centers @ T[:3, :3].T + T[:3, 3])[:, axes].astype(np.float32)
+        near = np.linalg.norm(voxels_m, axis=1) <= tsdf.max_range_m
         margin_m = self.config.dynamic.margin_m or math.sqrt(3.0) * voxel_size_m
         verdict = np.zeros(len(keys), np.int8)
-        verdict[near] = look_through(points[kept] * scales[:, None], places[near], margin_m)
+        verdict[near] = look_through(points[kept] * scales[:, None], voxels_m[near], margin_m)
         return verdict

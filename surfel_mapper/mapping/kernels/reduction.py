@@ -216,7 +216,7 @@ def look_back(keys, origin, voxel_size, view):
     Chunks without branches, so that the compiler vectorises the loop.
     """
     ox, oy, oz = origin[0], origin[1], origin[2]
-    towards = np.empty((3, CHUNK))
+    directions = np.empty((3, CHUNK))
     for start in range(0, len(keys), CHUNK):
         num = min(CHUNK, len(keys) - start)
         for i in range(num):
@@ -227,12 +227,12 @@ def look_back(keys, origin, voxel_size, view):
             dz = oz - (np.int32(kz) + 0.5) * voxel_size
             length = math.sqrt((dx * dx + dy * dy) + dz * dz)
             defined = length > 0.0  # false for nan
-            towards[0, i] = np.rint(VIEW_SCALE * (dx / length)) if defined else 0.0
-            towards[1, i] = np.rint(VIEW_SCALE * (dy / length)) if defined else 0.0
-            towards[2, i] = np.rint(VIEW_SCALE * (dz / length)) if defined else 0.0
+            directions[0, i] = np.rint(VIEW_SCALE * (dx / length)) if defined else 0.0
+            directions[1, i] = np.rint(VIEW_SCALE * (dy / length)) if defined else 0.0
+            directions[2, i] = np.rint(VIEW_SCALE * (dz / length)) if defined else 0.0
         for i in range(num):
             for axis in range(3):
-                view[start + i, axis] = np.int16(towards[axis, i])
+                view[start + i, axis] = np.int16(directions[axis, i])
 
 
 @kernel(error_model='numpy')

@@ -59,8 +59,8 @@ def sum_of(flat, at, axis):
 def view_of(flat, at):
     """Return the sum of the views of a voxel, x y z."""
     highest = (flat[at + U(SUM + 2)] << (64 - PIECE)) >> (64 - 3 * PIECE)
-    middle = (flat[at + U(SUM + 1)] & LOW) << PIECE
-    z = highest | middle | (flat[at + U(SUM)] & LOW)
+    medium = (flat[at + U(SUM + 1)] & LOW) << PIECE
+    z = highest | medium | (flat[at + U(SUM)] & LOW)
     return flat[at + U(VIEW)] >> PIECE, flat[at + U(VIEW + 1)] >> PIECE, z
 
 

@@ -136,10 +136,10 @@ def side_of(nx, ny, nz, vx, vy, vz):
     If the direction v of the sensor is unknown or orthogonal to the normal, its component of
     largest magnitude decides, the first of equal ones.
     """
-    towards = (nx * vx + ny * vy) + nz * vz
+    facing = (nx * vx + ny * vy) + nz * vz
     y_or_z = ny if abs(ny) >= abs(nz) else nz
     largest = nx if (abs(nx) >= abs(ny)) & (abs(nx) >= abs(nz)) else y_or_z
-    return -1.0 if (largest if towards == 0.0 else towards) < 0.0 else 1.0
+    return -1.0 if (largest if facing == 0.0 else facing) < 0.0 else 1.0
 
 
 @inlined(error_model='numpy')

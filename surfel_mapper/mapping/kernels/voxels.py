@@ -486,7 +486,7 @@ def sum_coarse(moments, chosen, rows, fine_level, level, coarse):
     fine_keys, count, total, product, view, num_scans = moments
     counts, sums, products, views, most_scans = coarse
     fine = np.int64(1) << (BITS + fine_level)
-    middle = fine // 2 - (fine << level) // 2
+    half_gap = fine // 2 - (fine << level) // 2
     below = (np.int64(1) << level) - 1
     for k in range(len(chosen)):
         i, row = chosen[k], np.int64(rows[k])
@@ -494,9 +494,9 @@ def sum_coarse(moments, chosen, rows, fine_level, level, coarse):
         x, y, z = unpack(key)
         # d: from the coarse centre to the fine centre
         n = np.int64(count[i])
-        dx = (x & below) * fine + middle
-        dy = (y & below) * fine + middle
-        dz = (z & below) * fine + middle
+        dx = (x & below) * fine + half_gap
+        dy = (y & below) * fine + half_gap
+        dz = (z & below) * fine + half_gap
         sx, sy, sz = np.int64(total[i, 0]), np.int64(total[i, 1]), np.int64(total[i, 2])
         counts[row] += n
         most_scans[row] = max(most_scans[row], np.int64(num_scans[i]))

@@ -155,19 +155,19 @@ def partition(points, order, low, high, share, spare, spare_order):
     share               (n,) float64, above a half for points of the second child
     spare, spare_order  (3, N) float64, (N,) int32, scratch
     """
-    middle, num = low, 0
+    border, num = low, 0
     for i in range(low, high):  # without branches
         beyond = share[i - low] > 0.5
         for j in range(3):
-            points[j, middle] = spare[j, num] = points[j, i]
-        order[middle] = spare_order[num] = order[i]
+            points[j, border] = spare[j, num] = points[j, i]
+        order[border] = spare_order[num] = order[i]
         num += beyond
-        middle += not beyond
+        border += not beyond
     for i in range(num):
         for j in range(3):
-            points[j, middle + i] = spare[j, i]
-        order[middle + i] = spare_order[i]
-    return middle
+            points[j, border + i] = spare[j, i]
+        order[border + i] = spare_order[i]
+    return border
 
 
 MAX_DEPTH = 66
@@ -210,21 +210,21 @@ def bisect_cloud(points, order, viewpoint, rules, spare, spare_order, rows, flat
         cluster_moments(x, y, z, mean, sums[2])
         covariance_of(sums[2], scatter)
         eigen_frame(scatter, value, frame)
-        is_flat, middle = is_flat_cluster(x, y, z, mean, value, frame, viewpoint, rules), high
+        is_flat, border = is_flat_cluster(x, y, z, mean, value, frame, viewpoint, rules), high
         if not is_flat and high - low >= max(rules[3], 4.0):
             share = spare[3, : high - low]
             plane[0], plane[1], plane[2], plane[3] = frame[2, 0], frame[2, 1], frame[2, 2], 0.0
             split_two_means(x, y, z, mean, plane, share, sums[3])
             if high - low <= rules[2]:
                 split_mixture(x, y, z, mean, plane, sums[2], sums[3], sums[4], share)
-            middle = partition(points, order, low, high, share, spare, spare_order)
-        if middle - low < 2 or high - middle < 2:
+            border = partition(points, order, low, high, share, spare, spare_order)
+        if border - low < 2 or high - border < 2:
             rows[num, 0], rows[num, 1], flat[num] = low, high, is_flat
             num += 1
             continue
-        is_low = 2 * middle > low + high  # the larger child waits
-        stack[depth, 0], stack[depth, 1] = (low, middle) if is_low else (middle, high)
-        stack[depth + 1, 0], stack[depth + 1, 1] = (middle, high) if is_low else (low, middle)
+        is_low = 2 * border > low + high  # the larger child waits
+        stack[depth, 0], stack[depth, 1] = (low, border) if is_low else (border, high)
+        stack[depth + 1, 0], stack[depth + 1, 1] = (border, high) if is_low else (low, border)
         depth += 2
     return num
 

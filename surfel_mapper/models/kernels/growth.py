@@ -90,7 +90,7 @@ def fit_layers(points, starts, widths, rounds, planes):
     widths          (2, K) float64, m: distance of near points in the first round, and at least
     planes          (K, 4) float64, in place
     """
-    sums, value, axes, middle = np.empty(10), np.empty(3), np.empty((3, 3)), np.empty(3)
+    sums, value, axes, centre_of_voxel = np.empty(10), np.empty(3), np.empty((3, 3)), np.empty(3)
     for k in range(len(planes)):
         width, start = widths[0, k], starts[k]
         for _ in range(rounds):
@@ -102,8 +102,8 @@ def fit_layers(points, starts, widths, rounds, planes):
                 break
             plane_of(sums, sums[0], value, axes)
             for j in range(3):
-                middle[j] = points[start, j] + sums[1 + j] / sums[0]
-            set_plane(axes[0], middle, planes[k])
+                centre_of_voxel[j] = points[start, j] + sums[1 + j] / sums[0]
+            set_plane(axes[0], centre_of_voxel, planes[k])
             width = max(0.7 * width, widths[1, k])
 
 

@@ -274,14 +274,14 @@ def compare_regions(pairs, groups, pieces, regions, rules, columns, out):
             ends[side + 1] = num
         if not is_chart:
             continue
-        stride, end, middle = 1 + num // MOST_ROWS, zero, zero
+        stride, end, border = 1 + num // MOST_ROWS, zero, zero
         for side in range(1 if is_single else 2):
-            middle = end
+            border = end
             for i in range(ends[side], ends[side + 1], stride):
                 for j in range(4):
                     columns[j, end] = columns[j, i]
                 end += 1
-        if min(middle, end - middle) < 3 and not is_single:
+        if min(border, end - border) < 3 and not is_single:
             continue
         least = max(floor[a], floor[b])
         both = heights(columns, zero, end, normals[2], (least, steepest, end))
@@ -289,11 +289,11 @@ def compare_regions(pairs, groups, pieces, regions, rules, columns, out):
         if not is_single:
             gain, rms_m = -both[0], max(noise[a], noise[b])
             for side in range(2):
-                low, high = (middle, end) if side else (zero, middle)
+                low, high = (border, end) if side else (zero, border)
                 own = heights(columns, low, high, normals[side], (least, steepest, end))
                 gain, rms_m = gain + own[0], max(rms_m, own[2])
             if cosine > COPLANAR_COSINE and both[2] < COPLANAR_GROWTH * rms_m:
-                gain = max(gain, float(min(middle, end - middle)))
+                gain = max(gain, float(min(border, end - border)))
             elif both[5] > MOST_STEEP and both[0] < both[1]:
                 gain = 0.0
         out[r, 0] = max(gain, 0.0)
@@ -320,10 +320,10 @@ def heights(points, low, high, normal, rules):
     scale = local_points(points, low, normal, local)
     raw = local[2:].copy()
     plane_sq = quadric_sq = turn = steep = 0.0
-    for again in range(ROUNDS):
+    for round_number in range(ROUNDS):
         quadric_sq = height_sums(local, powers, sums, right)
         solve_heights(sums, right, terms, matrix)
-        if not again:
+        if not round_number:
             plane_sq = quadric_sq
             for p in range(PLANE):
                 plane[p] = terms[p]
@@ -332,7 +332,7 @@ def heights(points, low, high, normal, rules):
             plane_sq /= 1.0 + plane[1] * plane[1] + plane[2] * plane[2]
         for p in range(QUADRIC):
             quadric_sq -= terms[p] * terms[p]
-        if again < ROUNDS - 1:
+        if round_number < ROUNDS - 1:
             solve_transposed(matrix, terms, QUADRIC)
             turn, steep = round_heights(local, raw, terms, steepest)
     plane_sq = max(plane_sq, 0.0) * scale * scale

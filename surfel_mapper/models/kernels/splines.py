@@ -42,12 +42,12 @@ def basis_functions(u, knot, degree, first, values, slopes):
             carried = slope = 0.0
             for k in range(order):
                 low, high = knot[span + 1 - order + k], knot[span + 1 + k]
-                part = values[m, k] / (high - low)
+                quotient = values[m, k] / (high - low)
                 if order == degree:
-                    slopes[m, k] = slope - degree * part
-                    slope = degree * part
-                values[m, k] = carried + (high - x) * part
-                carried = (x - low) * part
+                    slopes[m, k] = slope - degree * quotient
+                    slope = degree * quotient
+                values[m, k] = carried + (high - x) * quotient
+                carried = (x - low) * quotient
             values[m, order] = carried
             if order == degree:
                 slopes[m, order] = slope

@@ -37,19 +37,19 @@ def finite_ends(points, ends):
 
 
 @kernel(error_model='numpy')
-def voxel_keys(points, grid, parts, to_key, keys):
+def voxel_keys(points, grid, divisions, to_key, keys):
     """
-    Compute the keys of the finite points: of their voxels, times parts^3, plus the part of these.
+    Compute keys of finite points: the key of the voxel times divisions^3, plus its part's number.
 
-    points  (N, 3) float32 or float64, m
-    grid    size, shift and base of each axis (3, 3) float64, and its bits in a key (3,) int64
-    parts   into which a voxel is divided along each axis
-    to_key  bits of a row; 0 for keys alone
-    keys    (P,) int64, out: key << to_key | row; x of the voxel in the lowest bits, then y and z;
-            of parts alike
+    points     (N, 3) float32 or float64, m
+    grid       size, shift and base of each axis (3, 3) float64, and its bits in a key (3,) int64
+    divisions  number of parts of a voxel along each axis
+    to_key     bits of a row; 0 for keys alone
+    keys       (P,) int64, out: key << to_key | row; x of the voxel in the lowest bits, then y and
+               z; the same order for parts
     """
     (size, shift, base), (bits_x, bits_y, _) = grid
-    number, last = 0, parts - 1
+    number, last = 0, divisions - 1
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         if (x - x) + (y - y) + (z - z) == 0.0:  # else one is not finite
@@ -57,9 +57,9 @@ def voxel_keys(points, grid, parts, to_key, keys):
             i_x, i_y, i_z = np.floor(x), np.floor(y), np.floor(z)
             key = np.int64(i_y - base[1]) | np.int64(i_z - base[2]) << bits_y
             key = np.int64(i_x - base[0]) | key << bits_x
-            key = key * parts + min(np.int64((z - i_z) * parts), last)
-            key = key * parts + min(np.int64((y - i_y) * parts), last)
-            key = key * parts + min(np.int64((x - i_x) * parts), last)
+            key = key * divisions + min(np.int64((z - i_z) * divisions), last)
+            key = key * divisions + min(np.int64((y - i_y) * divisions), last)
+            key = key * divisions + min(np.int64((x - i_x) * divisions), last)
             keys[number] = key << to_key | i if to_key else key
             number += 1
 

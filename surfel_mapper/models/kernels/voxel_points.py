@@ -30,15 +30,15 @@ def neighbour_table(keys, to_y, to_z, starts, rows):
         y = keys[i] >> to_y & mask_y
         for row in range(5):
             step = (row + 1) % 3 - 1
-            middle = keys[i] + (step << to_y) + ((row + 1) // 3 << to_z)
+            centre = keys[i] + (step << to_y) + ((row + 1) // 3 << to_z)
             j = max(first[row], i + 1)
-            while j < number and keys[j] < middle - 1:
+            while j < number and keys[j] < centre - 1:
                 j += 1
             first[row] = j
             # rows at the end of a grid continue in the next one, and its layers, too
             inside = 0 <= y + step <= mask_y
-            while inside and j < number and keys[j] <= middle + 1:
-                if keys[j] >> to_y == middle >> to_y:
+            while inside and j < number and keys[j] <= centre + 1:
+                if keys[j] >> to_y == centre >> to_y:
                     later[num] = j
                     starts[j] += 1
                     num += 1
@@ -128,12 +128,12 @@ def sample_cubes(means, starts, cubes, voxels, rows):
     """
     seeds, halves, first, last = cubes
     for b in range(len(seeds)):
-        middle, half = means[seeds[b]], halves[b]
+        centre, half = means[seeds[b]], halves[b]
         number, total = 0, 0
         for v in range(first[b], last[b]):
             inside = True
             for j in range(3):
-                inside &= abs(means[v, j] - middle[j]) <= half
+                inside &= abs(means[v, j] - centre[j]) <= half
             if inside:
                 voxels[number] = v
                 number += 1

@@ -141,9 +141,9 @@ def hit_cylinder(ray, half, capped):
     offset = ray[0] * ray[4] - ray[1] * ray[3]
     discriminant = across * radius_sq - offset * offset
     if across > 0.0 and discriminant >= 0.0:
-        middle, spread = -(ray[0] * ray[3] + ray[1] * ray[4]), math.sqrt(discriminant)
+        half_sum, spread = -(ray[0] * ray[3] + ray[1] * ray[4]), math.sqrt(discriminant)
         for sign in (-1.0, 1.0):
-            distance = (middle + sign * spread) / across
+            distance = (half_sum + sign * spread) / across
             if 0.0 < distance < nearest and abs(ray[2] + distance * ray[5]) <= half[2]:
                 nearest = distance
     if capped and ray[5] != 0.0:

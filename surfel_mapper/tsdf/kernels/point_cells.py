@@ -152,8 +152,8 @@ def merge_cells(keys, sums, edge, table, planes, plane_keys, plane_sums):
         planes[cell] = into
         if number > last:
             plane_sums[into] = 0.0
-        middle = 0.5 * (edge - 1)
-        x, y, z = i - a * edge - middle, j - b * edge - middle, k - c * edge - middle
+        centre = 0.5 * (edge - 1)
+        x, y, z = i - a * edge - centre, j - b * edge - centre, k - c * edge - centre
         add_moments(sums[cell], x, y, z, plane_sums[into])
     return number
 
@@ -172,12 +172,12 @@ def fit_planes(keys, sums, edge, normals):
         near[:] = 0.0
         for column in range(9):
             a, b = column % 3 - 1, column // 3 - 1
-            middle = keys[cell] + (a << 2 * INDEX_BITS) + (b << INDEX_BITS)
-            while first[column] < len(keys) and keys[first[column]] < middle - 1:
+            centre = keys[cell] + (a << 2 * INDEX_BITS) + (b << INDEX_BITS)
+            while first[column] < len(keys) and keys[first[column]] < centre - 1:
                 first[column] += 1
             n = first[column]
-            while n < len(keys) and keys[n] <= middle + 1:
-                add_moments(sums[n], a * edge, b * edge, (keys[n] - middle) * edge, near)
+            while n < len(keys) and keys[n] <= centre + 1:
+                add_moments(sums[n], a * edge, b * edge, (keys[n] - centre) * edge, near)
                 n += 1
         normals[cell] = 0.0
         count = near[0]

@@ -217,14 +217,14 @@ def free_rays(cells, start, origin, limits, bits, table, keys, number, freed):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def sum_cells(grouped, cells, corner, tau, places, sums, row):
+def sum_cells(grouped, cells, corner, tau, layer_xy, sums, row):
     """
     Sum the distances that cells give to the voxels of a block, and prefetch those voxels.
 
     grouped  (P,) int32, the cells that observe the block
     cells    (K, CELL) float64
     corner   (3,) int64, index of the block's first voxel
-    places   (2, M^2) float32, index along x and y of the voxels of a layer
+    layer_xy   (2, M^2) float32, index along x and y of the voxels of a layer
     sums     (2, M, M^2) float32, in: 0; out: weighted distances, voxels, and weights, by layer
     row      (2 N,) float32, the field of the block
 
@@ -246,7 +246,7 @@ def sum_cells(grouped, cells, corner, tau, places, sums, row):
         full, per_behind = np.float32(cell[WEIGHT]), _ONE / behind
         first = max(low[1] - corner[1], 0) * side
         last = (min(high[1] - corner[1], side - 1) + 1) * side
-        across, along = places[0, first:last], places[1, first:last]
+        across, along = layer_xy[0, first:last], layer_xy[1, first:last]
         for k in range(max(low[2] - corner[2], 0), min(high[2] - corner[2], side - 1) + 1):
             distances, weights = sums[0, k, first:last], sums[1, k, first:last]
             z = first_z + np.float32(k)
@@ -285,7 +285,7 @@ def fuse_blocks(blocks, cells, origin, settings, voxel_m, bits, field, figures):
     num_voxels, tau = field.shape[2], settings[TAU] / voxel_m
     side = 1 << bits
     layer = np.arange(side * side)
-    places = np.stack((layer & (side - 1), layer >> bits)).astype(np.float32)
+    layer_xy = np.stack((layer & (side - 1), layer >> bits)).astype(np.float32)
     by_layer = np.zeros((2, side, side * side), np.float32)
     sums = by_layer.reshape(2, num_voxels)
     observed = np.empty(num_voxels + 1, np.int64)
@@ -299,7 +299,7 @@ def fuse_blocks(blocks, cells, origin, settings, voxel_m, bits, field, figures):
         if len(near):
             sums[:] = 0.0
             row = flat[block_size * rows[b] : block_size * (rows[b] + 1)]
-            sum_cells(near, cells, corners[b], tau, places, by_layer, row)
+            sum_cells(near, cells, corners[b], tau, layer_xy, by_layer, row)
             fuse_sums(sums, observed, settings, voxel_m, rates[b], freed[b], content)
         free_voxels(freed[b], corners[b], origin, settings, voxel_m, bits, rates[b], content)
 
