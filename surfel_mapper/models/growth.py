@@ -289,11 +289,10 @@ def extend_patches(
 ) -> None:
     """Grow patches, given as tangents and tolerances, over touching voxels; write the owners."""
     candidate = np.full((len(label), SLOTS), -1, np.int32)
-    planes = np.empty((len(label), SLOTS, 4))
     state = voxels.points, voxels.starts
     flat = free[1], free[3], math.cos(math.radians(GROWTH_ANGLE_DEG))
-    grow_patches(*state, voxels.adjacent, label, *shape, flat, candidate, planes)
-    assign_points(*state, label, *shape, candidate, planes, owner)
+    grow_patches(*state, voxels.adjacent, label, *shape, flat, candidate)
+    assign_points(*state, label, *shape, candidate, owner)
 
 
 def extend_planes(

@@ -108,39 +108,34 @@ def fit_layers(points, starts, widths, rounds, planes):
 
 
 @kernel(error_model='numpy')
-def grow_patches(
-    points, starts, adjacent, label, tangent, tolerance, free, candidate, candidate_plane
-):
+def grow_patches(points, starts, adjacent, label, tangent, tolerance, free, candidate):
     """
     Find the candidates of voxels by growing all patches together, breadth first.
 
-    adjacent         starts and rows of neighbour_table
-    label            (V,) int32, patch of each voxel, -1 for none
-    tangent          (V, 4) float64, plane of the patch there
-    tolerance        (K,) float64, m, of each patch
-    free             flat (V,), normal (V, 3) of voxels without a patch; least cosine of the
-                     normals of a flat voxel and a patch
-    candidate        (V, SLOTS) int32, all -1; out
-    candidate_plane  (V, SLOTS, 4) float64, out
+    adjacent   starts and rows of neighbour_table
+    label      (V,) int32, patch of each voxel, -1 for none
+    tangent    (V, 4) float64, plane of the patch there
+    tolerance  (K,) float64, m, of each patch
+    free       flat (V,), normal (V, 3) of voxels without a patch; least cosine of the normals of a
+               flat voxel and a patch
+    candidate  (V, SLOTS) int32, all -1; out: voxels from which patches were grown
     """
     first, rows = adjacent
     flat, normal, least_cosine = free
     queue = np.empty((len(label) * (SLOTS + 1), 2), np.int32)
-    plane, head, tail = np.empty(4), 0, 0
+    head, tail = 0, 0
     for v in range(len(label)):
         if label[v] >= 0:
-            queue[tail, 0], queue[tail, 1] = v, -1
+            queue[tail, 0] = queue[tail, 1] = v
             tail += 1
     while head < tail:
-        u, slot = queue[head, 0], queue[head, 1]
+        u, source = queue[head, 0], queue[head, 1]
         head += 1
-        patch = label[u] if slot < 0 else candidate[u, slot]
-        for j in range(4):
-            plane[j] = tangent[u, j] if slot < 0 else candidate_plane[u, slot, j]
+        patch, plane = label[source], tangent[source]
         for k in range(first[u], first[u + 1]):
             v = rows[k]
-            free_slot = -1 if label[v] == patch else slot_of(candidate[v], patch)
-            if free_slot < 0:
+            slot = -1 if label[v] == patch else slot_of(candidate[v], label, patch)
+            if slot < 0:
                 continue
             num = 0
             for i in range(starts[v], starts[v + 1]):
@@ -149,22 +144,20 @@ def grow_patches(
                 continue
             if label[v] < 0 and flat[v] and abs_cosine(normal[v], plane) < least_cosine:
                 continue
-            candidate[v, free_slot] = patch
-            for j in range(4):
-                candidate_plane[v, free_slot, j] = plane[j]
+            candidate[v, slot] = source
             if label[v] < 0 and num >= LEAST_SHARE * (starts[v + 1] - starts[v]):
-                queue[tail, 0], queue[tail, 1] = v, free_slot
+                queue[tail, 0], queue[tail, 1] = v, source
                 tail += 1
 
 
 @inlined(error_model='numpy')
-def slot_of(candidates, patch):
+def slot_of(candidates, label, patch):
     """Return the free slot for a patch; -1 if it is a candidate already or all are taken."""
     for slot in range(SLOTS):
-        if candidates[slot] == patch:
-            return -1
         if candidates[slot] < 0:
             return slot
+        if label[candidates[slot]] == patch:
+            return -1
     return -1
 
 
@@ -175,12 +168,12 @@ def abs_cosine(normal, plane):
 
 
 @kernel(error_model='numpy')
-def assign_points(points, starts, label, tangent, tolerance, candidate, candidate_plane, owner):
+def assign_points(points, starts, label, tangent, tolerance, candidate, owner):
     """
     Assign each point to the patch of its voxel, or to the nearest candidate if that fits better.
 
-    label ... candidate_plane  of grow_patches
-    owner                      (P,) int32, out: patch, FREE for none
+    label ... candidate  of grow_patches
+    owner                (P,) int32, out: patch, FREE for none
     """
     for v in range(len(label)):
         for i in range(starts[v], starts[v + 1]):
@@ -190,12 +183,12 @@ def assign_points(points, starts, label, tangent, tolerance, candidate, candidat
                 if best <= tolerance[own]:
                     best = -1.0
             for slot in range(SLOTS):
-                patch = candidate[v, slot]
-                if patch < 0:
+                source = candidate[v, slot]
+                if source < 0:
                     break
-                away = plane_distance(points, i, candidate_plane[v, slot])
-                if away < tolerance[patch] and away < best:
-                    own, best = patch, away
+                away = plane_distance(points, i, tangent[source])
+                if away < tolerance[label[source]] and away < best:
+                    own, best = label[source], away
             owner[i] = own
 
 
