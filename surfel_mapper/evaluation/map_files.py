@@ -85,9 +85,9 @@ def load_discs(path: str | Path, min_points: int, bin_columns: int | None = None
     if file.is_dir() or suffix == '.parquet' or (suffix == '.npz' and not is_cloud(file)):
         return of_map(load_surfel_map(file), min_points)
     if suffix not in SUFFIXES:
-        raise FileFormatError(
-            f'{path}: expected a directory, .parquet, .npz, or points: {", ".join(SUFFIXES)}'
-        )
+        missing = '' if file.exists() else 'no such file or directory; '
+        forms = f'a directory, .parquet, .npz, or points: {", ".join(SUFFIXES)}'
+        raise FileFormatError(f'{path}: {missing}expected {forms}')
     return of_columns(*scan_reader([file], bin_columns)(file))
 
 

@@ -127,16 +127,14 @@ def check_free(path: Path, overwrite: bool) -> None:
 
 def use_of(path: Path) -> str:
     """Return how a path is in use, and the ways out; empty for a new path or empty directory."""
-    if not os.path.lexists(path):
+    if not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir())):
         return ''
-    if not path.is_dir():
-        return 'exists; expected a new name, or --overwrite (in Python: overwrite=True)'
-    if not any(path.iterdir()):
-        return ''
-    return (
-        'has files in it; expected a new or empty directory, or --overwrite (in Python: '
-        'overwrite=True)'
+    use = (
+        'has files in it; expected a new or empty directory'
+        if path.is_dir()
+        else ('exists; expected a new name')
     )
+    return f'{use}, or --overwrite (in Python: overwrite=True, for replay in its ReplayOptions)'
 
 
 def make_directory(directory: Path) -> None:

@@ -119,7 +119,7 @@ def test_the_report_says_it_in_a_few_lines(street, capsys):
 @pytest.mark.parametrize(
     ('name', 'text'),
     [
-        ('nothing', 'expected a directory'),
+        ('nothing', 'no such file or directory; expected a directory'),
         ('empty', 'no map in this directory'),
         ('a.json', 'No such file'),
         ('other.ply', 'No such file'),
