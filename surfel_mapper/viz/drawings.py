@@ -30,6 +30,7 @@ from surfel_mapper.layers.drawings import (
 from surfel_mapper.models.shapes import CORNERS, FACES
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 from surfel_mapper.viz.discs import as_bytes, DrawnDiscs
+from surfel_mapper.viz.framing import mass_box
 from surfel_mapper.viz.markup import as_html, html_figures, html_table
 from surfel_mapper.viz.mesh import MAX_TRIANGLES
 from surfel_mapper.viz.rendering import Camera, rendered, round_length
@@ -42,8 +43,8 @@ Array = npt.NDArray[np.float64]
 PANEL_INCH, TEXT_INCH, LEAST_INCH, MOST_INCH, DPI = 6.0, 0.6, 3.0, 9.0, 120
 """Width of a panel, height of its texts, least and greatest height of both, pixels of an inch."""
 
-BEYOND, MARGIN = 0.5, 0.03
-"""Points left out of the frame at either end of an axis, per cent, and its margin."""
+MARGIN = 0.03
+"""Margin of the frame, as a share of its longer side."""
 
 MOST_RADIUS_PX = 4.0
 """Largest radius of a point: points fill the frame if they are evenly spread."""
@@ -86,8 +87,10 @@ def draw_points(path: str | Path, picture: PointsPicture) -> None:
 
     R = view_axes(picture.points, picture.viewpoint)
     mesh = page_mesh(picture.drawings, MOST_TRIANGLES)
-    corners = mesh.vertices[mesh.triangles.ravel()]
-    low, high = frame_of(np.concatenate([picture.points, corners]) @ R[:2].T)
+    projected = picture.points @ R[:2].T
+    low, high = frame_of(projected)
+    outside = int(((projected < low) | (projected > high)).any(axis=1).sum())
+    note = f', {outside:,} of them outside' if outside else ''
     aspect = (high[1] - low[1]) / (high[0] - low[0])
     height = min(max(PANEL_INCH * aspect + TEXT_INCH, LEAST_INCH), MOST_INCH)
     size = 2.0 * PANEL_INCH + TEXT_INCH, height
@@ -96,7 +99,8 @@ def draw_points(path: str | Path, picture: PointsPicture) -> None:
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     fill_points(left, picture.points, R, (low, high))
     fill_shapes(right, mesh, picture.drawings, R)
-    for ax, title in zip((left, right), picture.titles, strict=True):
+    titles = picture.titles[0] + note, picture.titles[1]
+    for ax, title in zip((left, right), titles, strict=True):
         ax.set(aspect='equal', xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         ax.set(xticks=[], yticks=[], facecolor=GROUND)
         ax.set_title(title, fontsize='medium')
@@ -106,10 +110,8 @@ def draw_points(path: str | Path, picture: PointsPicture) -> None:
 
 
 def frame_of(projected: Array) -> tuple[Array, Array]:
-    """Return the lowest and highest corner (2,) of a picture of points (N, 2), m."""
-    if not len(projected):
-        return np.full(2, -1.0), np.full(2, 1.0)
-    low, high = np.percentile(projected, [BEYOND, 100.0 - BEYOND], axis=0)
+    """Return the corners (2,) of the rectangle of most points (N, 2), m, with a margin."""
+    low, high = mass_box(projected, np.ones(len(projected)))
     margin = MARGIN * max(float((high - low).max()), 1e-3)
     return low - margin, high + margin
 
@@ -177,7 +179,7 @@ def draw_scale(ax: Axes, low: Array, high: Array) -> None:
     x, y = low[0] + 0.03 * width, low[1] + 0.04 * height
     ax.plot([x, x + length_m], [y, y], color='black', linewidth=3.0, solid_capstyle='butt')
     text = f'{length_m:g} m' if length_m >= 1.0 else f'{100.0 * length_m:g} cm'
-    ax.text(x, y + 0.015 * height, text, fontsize='small')
+    ax.text(x, y + 0.02 * height, text, fontsize='small', bbox={'facecolor': GROUND, 'pad': 2.0})
 
 
 def page_meshes(drawings: Iterable[Drawing]) -> dict[str, Mesh]:

@@ -120,6 +120,14 @@ def test_pictures_of_rooms_are_mostly_filled(seen, tmp_path):
     assert empty.mean() < 0.35
 
 
+def test_far_points_are_left_out_of_the_frame():
+    near = np.stack(np.meshgrid(*[np.linspace(0.0, 2.0, 100)] * 2), axis=-1).reshape(-1, 2)
+    far = np.random.default_rng(0).uniform(0.0, 50.0, (300, 2))
+    low, high = viz_drawings.frame_of(np.concatenate([near, far]))
+    np.testing.assert_allclose(low, [0.0, 0.0], atol=0.6)
+    np.testing.assert_allclose(high, [2.0, 2.0], atol=0.6)
+
+
 def test_a_picture_of_nothing_has_two_empty_frames(tmp_path):
     image = painted(tmp_path, np.empty((0, 3)), fit(np.empty((0, 3))), np.zeros(3))
     assert (np.abs(image - viz_drawings.GROUND).max(axis=2) < 0.01).mean() > 0.5
