@@ -5,13 +5,14 @@ Patches in voxels of other sizes: growth over points that are left, and joins ac
 
 In finer voxels faces are flat that share a voxel with others. Rings of a lidar and objects in its
 way leave gaps in the ground that are wider than a voxel; in voxels of two and more times the size
-both sides touch, so planes grow and patches are joined by the rules of fine voxels. Clouds and
-surfels of a map use it alike: a surfel is one point.
+both sides touch. Planes grow there by the rules of fine voxels. Patches of a map are joined by the
+same rules, those of a scan to planes only. Clouds and surfels of a map use growth alike: a surfel
+is one point.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import Any
 
@@ -82,12 +83,10 @@ def grow_coarse(
     shape: Shape,
     size_m: float,
     rules: CoarseRules,
-    *,
     facets: ModelsConfig | None = None,
-    joins: bool = True,
 ) -> Shape:
     """
-    Grow planes over free points, join patches, and return the normals and curvature of these.
+    Grow planes over free points, and return the normals and curvature of all patches.
 
     Parameters
     ----------
@@ -103,9 +102,6 @@ def grow_coarse(
         The other rules.
     facets : ModelsConfig, optional
         Settings of facets, which are grown from free points if given.
-    joins : bool
-        Whether patches are joined. Single points far from a sensor are tens of metres apart, and
-        in voxels as large patches of all kinds touch, so that joins are wrong as often as not.
 
     """
     coarse = thin(points, size_m).by_voxel()
@@ -118,19 +114,52 @@ def grow_coarse(
         facet_normals = add_facets(coarse, new_owner, len(normals), sizes, facets)
         normals = np.concatenate([normals, facet_normals])
         curved = np.append(curved, np.zeros(len(facet_normals), np.bool_))
-    index: Owners = np.arange(len(normals), dtype=np.int32)
-    if joins:
-        pieces = pieces_of(coarse, owner_table(coarse, new_owner), len(normals))
-        view = beyond(pieces, normals) if rules.view is None else rules.view
-        index, normals, bent = join_patches(
-            pieces, view, rules.noise, rules.finest_m, COARSE_STEEPEST_DEG
-        )
-        # coarse voxels resolve less: a curved patch stays so, unless a larger plane takes it
-        counts = np.bincount(new_owner[new_owner >= 0], minlength=len(curved))
-        total = np.bincount(index, counts, len(normals))
-        curved = bent | (2.0 * np.bincount(index, counts * curved, len(normals)) > total)
-    owner[coarse.rows] = np.where(new_owner < 0, old_owner, np.append(index, 0)[new_owner])
+    owner[coarse.rows] = np.where(new_owner < 0, old_owner, new_owner)
     return normals, curved
+
+
+def gap_pieces(finest: VoxelPoints, owner: Owners, number: int, size_m: float) -> Pieces:
+    """
+    Return patches that touch in coarse voxels, with the means of their points in finest voxels.
+
+    Means in coarse voxels determine neither the normal nor the thickness of a small patch.
+    """
+    owners, means, counts, _ = owner_table(finest, np.maximum(owner, -1))
+    coarse = thin(means, size_m).by_voxel()
+    table = owners[coarse.rows], coarse.points, counts[coarse.rows], coarse.starts
+    touching, _, _, first = owner_table(coarse, table[0])
+    pieces = pieces_of(coarse, table, number)
+    return replace(pieces, first=first, owners=touching, edge_m=size_m)
+
+
+def join_coarse(pieces: Pieces, owner: Owners, shape: Shape, rules: CoarseRules) -> Shape:
+    """
+    Join patches, and return the normals and curvature of the regions.
+
+    Parameters
+    ----------
+    pieces : Pieces
+        The patches.
+    owner, shape, rules
+        Those of grow_coarse; owner is changed in place.
+
+    """
+    (normals, curved), patch = shape, np.maximum(owner, -1)
+    view = beyond(pieces, normals) if rules.view is None else rules.view
+    index, joined, bent = join_patches(
+        pieces, view, rules.noise, rules.finest_m, COARSE_STEEPEST_DEG
+    )
+    number = np.bincount(patch[patch >= 0], minlength=len(curved))
+    if pieces.edge_m > rules.finest_m:
+        bent[:] = False
+        used = np.flatnonzero(number)
+        alone = used[np.bincount(index[used])[index[used]] == 1]
+        joined[index[alone]] = normals[alone]  # of a curved patch the mean of its strips
+    # a curved patch stays so, unless a larger plane takes it
+    total = np.bincount(index, number, len(joined))
+    curved = bent | (2.0 * np.bincount(index, number * curved, len(joined)) > total)
+    owner[:] = np.where(patch < 0, owner, np.append(index, 0)[patch])
+    return joined, curved
 
 
 def facet_tolerance(

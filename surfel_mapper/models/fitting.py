@@ -28,7 +28,13 @@ from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import AXIS_BITS, KEY_BITS
 from surfel_mapper.mapping.moments import are_far_apart, OTHER_UNIT
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse, SPARSE_SHARE
+from surfel_mapper.models.coarse_growth import (
+    CoarseRules,
+    gap_pieces,
+    grow_coarse,
+    join_coarse,
+    SPARSE_SHARE,
+)
 from surfel_mapper.models.coverage import covered
 from surfel_mapper.models.frames import eigen
 from surfel_mapper.models.growth import (
@@ -67,8 +73,10 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 SIZES = (0.5, 2.0, 4.0, 8.0, 16.0, 64.0, 128.0)
-"""Edges of the voxels in which points that are left are grown, in those of the cloud; the finer
-ones only if these can be numbered."""
+"""
+Edges of the voxels in which points that are left are grown and patches are joined, in those of the
+cloud; the finer ones only if these can be numbered.
+"""
 
 PARTS, MOST_PARTED_M = 3, 0.1
 """
@@ -82,9 +90,6 @@ MERGED_VOXELS = 0.3
 Largest offset of merged clusters before growth, in voxels. Merged clusters are never divided
 again, as a book and its table would have to be. Separate ones may be joined after growth.
 """
-
-MOST_JOINED = 16.0
-"""Largest of these in which patches are joined, too."""
 
 STAGES = ('thin', 'neighbours', 'cluster', 'merge', 'fit', 'grow', 'refit')
 """Names of the stages of a fit with growth."""
@@ -207,16 +212,20 @@ def fit_points(fine: Thinned, config: ModelsConfig, view: Array, laps: list[floa
 def grow_sparse(
     thinned: Thinned, voxels: VoxelPoints, growth: Grown, config: ModelsConfig, view: Array
 ) -> Grown:
-    """Find facets in finer, then in coarser voxels while many points are on no patch, and join."""
+    """Find facets in finer, then in coarser voxels while many points are on no patch; join all."""
     noise = config.noise_m, config.noise_per_range_sq
     rules = CoarseRules(config.voxel_size_m, growth.tolerance_m, noise, view)
     shape, owner = (growth.normals, growth.curved), growth.owner.copy()
     halves = thinned.bits.max() < AXIS_BITS and thinned.bits.sum() + 3 <= KEY_BITS
     for factor in SIZES if halves else SIZES[1:]:
-        if (owner < 0).sum() < max(SPARSE_SHARE * len(owner), 1.0):
-            break
-        size_m, joins = factor * config.voxel_size_m, factor <= MOST_JOINED
-        shape = grow_coarse(voxels.points, owner, shape, size_m, rules, facets=config, joins=joins)
+        size_m = factor * config.voxel_size_m
+        grows = (owner < 0).sum() >= max(SPARSE_SHARE * len(owner), 1.0)
+        if grows:
+            shape = grow_coarse(voxels.points, owner, shape, size_m, rules, config)
+        if len(shape[0]) > 1 and (grows or factor > 1.0):
+            size_m = max(size_m, config.voxel_size_m)
+            pieces = gap_pieces(voxels, owner, len(shape[0]), size_m)
+            shape = join_coarse(pieces, owner, shape, rules)
     if shape[0] is growth.normals:
         return growth
     return grown(owner, owner_table(voxels, owner), *shape, growth.tolerance_m)

@@ -42,11 +42,19 @@ LARGER = 8.0
 LEAST_COSINE = 0.5
 """Noise is along the ray; at grazing incidence other errors dominate."""
 
-LEAST_FLOOR_VOXELS, MOST_FLOOR_VOXELS = 0.02, 0.1
+LEAST_FLOOR_VOXELS, MOST_FLOOR_VOXELS, FLOOR_RANGE = 0.02, 0.1, 3e-3
 """
 Residuals are not resolved below the first: exact surfaces would otherwise never join. Nor are they
 below noise that grows with range^2, up to the second. It is that of depth cameras, correlated over
-tens of centimetres: halves of a table seem to differ by less.
+tens of centimetres: halves of a table seem to differ by less. The first grows with the voxels in
+which patches touch, up to the second and the third, a share of the range: roads are less flat over
+metres than walls of rooms.
+"""
+
+GAP_WIDTHS = 0.2, 0.5
+"""
+Half the widths of two patches that are joined across a gap, in voxels, at least. Small patches far
+from each other lie on one plane by chance.
 """
 
 LEAST_TURN_DEG, LEAST_BEND_VOXELS, LEAST_BEND_SIGMAS = 15.0, 0.25, 1.5
@@ -89,6 +97,9 @@ class Pieces:
     first : (V + 1,) int64
     owners : (M,) int32
         Owners of the points of each voxel, negative for free ones.
+    edge_m : float
+        Edge of these voxels, if there are several means of a patch in one: patches touch across
+        gaps. 0 otherwise.
 
     """
 
@@ -99,6 +110,7 @@ class Pieces:
     adjacent: tuple[Indices, npt.NDArray[np.int32]]
     first: Indices
     owners: npt.NDArray[np.int32]
+    edge_m: float = 0.0
 
     def touching(self) -> Indices:
         """Return pairs of touching patches (R, 3): patch, other, voxels of the patch that do."""
@@ -176,6 +188,11 @@ def join_patches(
     """
     single, touching = Comparison.of(pieces, view, noise, size_m), pieces.touching()
     single = replace(single, steepest=math.cos(math.radians(steepest_deg)))
+    if pieces.edge_m > size_m:
+        widths = np.sort(single.extents[touching[:, :2]] / pieces.edge_m - 1.0, axis=1)
+        wide = touching[(widths > GAP_WIDTHS).all(axis=1)]
+        root = single.joined(np.arange(len(single.means)), wide, UNRESOLVED_VOXELS * size_m)
+        return single.described(root, size_m)[:3]
     root, layered = single.with_layers(touching)
     root = layered.joined(root, touching)
     index, normals, curved, is_worse = layered.described(root, size_m)
@@ -240,9 +257,11 @@ class Comparison:
         cosine = np.abs(np.einsum('ij,ij->i', view_rays, normals)) / np.sqrt(range_sq)
         cosine = np.maximum(cosine, LEAST_COSINE)
         across = (noise[0] + noise[1] * range_sq) * cosine
-        limits = LEAST_FLOOR_VOXELS * size_m, MOST_FLOOR_VOXELS * size_m
-        floor = np.clip(noise[1] * range_sq * cosine, *limits) ** 2
-        extents = np.sqrt(3.0 * values[:, 2]) + size_m
+        edge_m, most_m = max(pieces.edge_m, size_m), MOST_FLOOR_VOXELS * size_m
+        least_m = np.minimum(LEAST_FLOOR_VOXELS * edge_m, FLOOR_RANGE * np.sqrt(range_sq))
+        least_m = np.clip(least_m, LEAST_FLOOR_VOXELS * size_m, most_m)
+        floor = np.clip(noise[1] * range_sq * cosine, least_m, most_m) ** 2
+        extents = np.sqrt(3.0 * values[:, 2]) + edge_m
         sigma = np.maximum(across, np.sqrt(np.maximum(values[:, 0], floor)))
         moments = number, means, covariances, extents
         return cls(pieces, *moments, normals, across, sigma, floor)
@@ -289,10 +308,11 @@ class Comparison:
         pairs = touching_pairs(root[touching[:, :2]], touching[:, 2], number)
         gains, is_stale = np.zeros(len(pairs)), np.full(number, True)
         while len(pairs):
-            open_pairs = is_stale[pairs].any(axis=1)
-            gains[open_pairs] = self.compared(pairs[open_pairs], root, regions)[:, 0]
+            open_pairs = np.flatnonzero(is_stale[pairs].any(axis=1))
+            gains[open_pairs] = 0.0
             if plane_m is not None:
-                gains[self.worse_planes(pairs, root, plane_m)] = 0.0
+                open_pairs = open_pairs[~self.worse_planes(pairs[open_pairs], root, plane_m)]
+            gains[open_pairs] = self.compared(pairs[open_pairs], root, regions)[:, 0]
             small, large = chosen_joins(pairs, gains, regions.rows)
             if not len(small):
                 break

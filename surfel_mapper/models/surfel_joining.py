@@ -17,10 +17,14 @@ import numpy.typing as npt
 from surfel_mapper.models.coarse_growth import (
     CoarseRules,
     grow_coarse,
+    join_coarse,
+    Shape,
     SPARSE_SHARE,
 )
 from surfel_mapper.models.frames import mean_normals
+from surfel_mapper.models.growth import owner_table, pieces_of
 from surfel_mapper.models.surfel_graph import SurfelGraph
+from surfel_mapper.models.thinning import thin
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int32]
@@ -55,17 +59,20 @@ def join_charts(graph: SurfelGraph, owner: Rows) -> Rows:
     order = np.argsort(patch, kind='stable')[was_free.sum() :]
     starts = np.searchsorted(patch[order], np.arange(number + 1))
     normals = mean_normals(graph.flat_normals(rows[order]), starts)
-    curved: npt.NDArray[np.bool_] = np.zeros(number, np.bool_)
+    shape: Shape = normals, np.zeros(number, np.bool_)
     points = graph.position[rows]
     rules = CoarseRules(size_m, graph.thickness_m, (graph.noise_m, 0.0))
     for factor in FACTORS:
         if factor > 1.0 and np.count_nonzero(patch < 0) < SPARSE_SHARE * len(patch):
             break
-        normals, curved = grow_coarse(points, patch, (normals, curved), factor * size_m, rules)
+        shape = grow_coarse(points, patch, shape, factor * size_m, rules)
+        coarse = thin(points, factor * size_m).by_voxel()
+        pieces = pieces_of(coarse, owner_table(coarse, patch[coarse.rows]), len(shape[0]))
+        shape = join_coarse(pieces, patch, shape, rules)
     else:
-        grow_coarse(points, patch, (normals, curved), FARTHEST * size_m, rules, joins=False)
+        shape = grow_coarse(points, patch, shape, FARTHEST * size_m, rules)
     came = np.flatnonzero(was_free & (patch >= 0))
-    patch[came[~graph.is_thin(rows[came], normals[patch[came]])]] = -1
+    patch[came[~graph.is_thin(rows[came], shape[0][patch[came]])]] = -1
     patches[rows] = patch
     return patches
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse
+from surfel_mapper.models.coarse_growth import CoarseRules, gap_pieces, grow_coarse, join_coarse
 from surfel_mapper.models.growth import extend_planes
 from surfel_mapper.models.thinning import thin
 
@@ -37,7 +37,7 @@ def test_planes_take_the_sparse_points_on_them_and_no_others():
     assert (owner[kind > 0] == -1).all()
 
 
-def test_planes_grow_over_single_points_far_apart_and_are_not_joined():
+def test_planes_grow_over_single_points_far_apart():
     rng = np.random.default_rng(3)
     near = rng.uniform([0.0, 0.0, 0.0], [32.0, 12.0, 0.0], (20_000, 3))
     x, y = np.meshgrid(np.arange(33.0, 60.0, 3.0), [1.0, 5.0, 9.0])
@@ -49,8 +49,34 @@ def test_planes_grow_over_single_points_far_apart_and_are_not_joined():
     owner[: len(near)] = near[:, 0] > 16.0  # two pieces of one plane
     shape = np.tile([0.0, 0.0, 1.0], (2, 1)), np.zeros(2, np.bool_)
     rules = CoarseRules(COARSE_M, TOLERANCE_M, (NOISE_M, 0.0))
-    normals, curved = grow_coarse(points, owner, shape, 4.0 * COARSE_M, rules, joins=False)
+    normals, curved = grow_coarse(points, owner, shape, 4.0 * COARSE_M, rules)
     assert len(normals) == len(curved) == 2
     np.testing.assert_array_equal(owner[: len(near)], near[:, 0] > 16.0)
     assert (owner[len(near) : -len(above)] >= 0).mean() > 0.9
     assert (owner[-len(above) :] == -1).all()
+
+
+def test_wide_patches_of_one_plane_are_joined_across_a_gap():
+    rng = np.random.default_rng(4)
+    wide = [(0.0, 6.0, 0.0), (8.0, 14.0, 0.0), (8.0, 14.0, 0.5)]  # first and last x, height
+    small = [(30.0, 30.4, 0.0), (32.0, 32.4, 0.0)]
+    parts = []
+    for low, high, height in wide + small:
+        number = 400 * int(np.ceil(high - low))
+        x, y = rng.uniform(low, high, number), rng.uniform(0.0, min(high - low, 4.0), number)
+        parts.append(np.column_stack([x, y, height + NOISE_M * rng.standard_normal(number)]))
+    patch = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
+    voxels = thin(np.concatenate(parts), COARSE_M).by_voxel()
+    patch = patch[voxels.rows]
+    owner = np.where(np.arange(len(patch)) % 50, patch, -7).astype(np.int32)
+    free = owner < 0
+    shape = np.tile([0.0, 0.0, 1.0], (5, 1)), np.zeros(5, np.bool_)
+    rules = CoarseRules(COARSE_M, TOLERANCE_M, (NOISE_M, 0.0), np.array([7.0, 2.0, 9.0]))
+    pieces = gap_pieces(voxels, owner, 5, 4.0 * COARSE_M)
+    normals, curved = join_coarse(pieces, owner, shape, rules)
+    assert (owner[free] == -7).all()
+    regions = [np.unique(owner[~free & (patch == k)]).tolist() for k in range(5)]
+    assert regions[0] == regions[1]
+    assert sorted(np.concatenate(regions[1:]).tolist()) == [0, 1, 2, 3]
+    assert curved.tolist() == [False] * 4
+    np.testing.assert_allclose(normals, np.tile([0.0, 0.0, 1.0], (4, 1)), atol=0.01)

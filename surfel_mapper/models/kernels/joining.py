@@ -46,7 +46,7 @@ def touching_patches(starts, voxel, adjacent, first, owners, pairs):
     """
     Count the voxels of each patch that touch another one; return how many pairs there are.
 
-    starts    (K + 1,) int64, voxel (P,) int32: voxels of each patch
+    starts    (K + 1,) int64, voxel (P,) int32: voxels of each patch, equal ones in a row
     adjacent  starts and rows of neighbour_table
     first     (V + 1,) int64, owners (M,) int32: owners of the points of each voxel
     pairs     (R, 3) int64, out: patch, other patch, voxels of the patch that contain points of the
@@ -62,6 +62,8 @@ def touching_patches(starts, voxel, adjacent, first, owners, pairs):
         num_touched = 0
         for i in range(starts[k], starts[k + 1]):
             own = voxel[i]
+            if i > starts[k] and voxel[i - 1] == own:
+                continue
             for n in range(low[own] - 1, low[own + 1]):
                 v = rows[n] if n >= low[own] else own
                 for m in range(first[v], first[v + 1]):
