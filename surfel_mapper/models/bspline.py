@@ -25,8 +25,8 @@ from surfel_mapper.arguments import Record
 from surfel_mapper.models.bspline_solvers import (
     FieldSamples,
     is_direct,
-    penalty_diagonals,
     relax,
+    second_differences,
     solve_band,
 )
 from surfel_mapper.models.grid import Cells
@@ -72,8 +72,10 @@ def greville_cells(num_cells: int, degree: int) -> Array:
 
 @lru_cache(CACHED_AXES)
 def penalty(num_cells: int, degree: int) -> Array:
-    """Return the diagonals of the penalty along an axis, see solve_band; cached, read-only."""
-    return penalty_diagonals(greville_cells(num_cells, degree))
+    """Return three diagonals (3, N) of the squared second differences along an axis; cached."""
+    second = second_differences(greville_cells(num_cells, degree))
+    product = np.pad(second.T @ second, ((0, 3), (0, 0)))
+    return np.stack([np.diagonal(product, -k) for k in range(3)])
 
 
 def axis_degree(num_cells: int, degree: int) -> int:

@@ -84,15 +84,6 @@ def second_differences(positions: Array) -> Array:
     return matrix
 
 
-def penalty_diagonals(positions: Array) -> Array:
-    """Return three diagonals (3, N) of the squared second differences, 0 behind their ends."""
-    second, diagonals = second_differences(positions), np.zeros((3, len(positions)))
-    product = second.T @ second
-    for k in range(min(3, len(positions))):
-        diagonals[k, : len(positions) - k] = np.diagonal(product, -k)
-    return diagonals
-
-
 def solve_band(
     samples: FieldSamples, penalties: tuple[Array, Array], rules: tuple[float, float]
 ) -> Array:
