@@ -37,18 +37,10 @@ from surfel_mapper.models.coarse_growth import (
 )
 from surfel_mapper.models.coverage import covered
 from surfel_mapper.models.frames import eigen
-from surfel_mapper.models.growth import (
-    Charts,
-    grow,
-    Grown,
-    grown,
-    LEAST_DISPARITY_NOISE,
-    owner_table,
-    VoxelPoints,
-)
+from surfel_mapper.models.growth import Charts, grow, Grown, grown, owner_table, VoxelPoints
 from surfel_mapper.models.kernels.frames import LEAST_WIDTH, member_moments, split_members
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
-from surfel_mapper.models.noise import estimate_noise, NoiseSamples
+from surfel_mapper.models.noise import estimate_noise, LEAST_DISPARITY_NOISE, NoiseSamples
 from surfel_mapper.models.patches import (
     described,
     fit_patches,

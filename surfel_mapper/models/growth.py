@@ -35,7 +35,8 @@ from surfel_mapper.models.kernels.growth import (
     grow_patches,
     SLOTS,
 )
-from surfel_mapper.models.kernels.voxel_points import neighbour_table, owner_means, sort_owners
+from surfel_mapper.models.kernels.voxel_points import owner_means, sort_owners
+from surfel_mapper.models.noise import LEAST_DISPARITY_NOISE
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -57,13 +58,6 @@ SEPARATE_SIGMAS, SEPARATE_VOXELS, SEPARATE_ROUNDS, LEAST_LAYER = 3.0, 0.1, 6, 50
 """
 Half the thickness of the largest layer of a plane, in sigmas of the sensor, and at least, in
 voxels. Its plane is refitted in this number of rounds. It has this number of voxels, at least.
-"""
-
-LEAST_DISPARITY_NOISE = 3e-4
-"""
-Sigma by range^2, 1/m, from which on a cloud is of a depth camera: theirs is 1e-3 1/m, of lidars
-less than 1e-4 1/m. Layers are separated there, as roads that a lidar sees are cambered. Patches in
-voxels of other sizes are not grown: pixels leave no gaps.
 """
 
 FAR_SIGMAS = 2.0
@@ -111,21 +105,6 @@ class VoxelPoints:
     rows: npt.NDArray[np.int32]
     starts: Indices
     adjacent: tuple[Indices, npt.NDArray[np.int32]]
-
-    @classmethod
-    def of(
-        cls,
-        points: Array,
-        rows: npt.NDArray[np.int32],
-        starts: Indices,
-        keys: Indices,
-        bits: Indices,
-    ) -> VoxelPoints:
-        """Find the neighbours; bits (3,) of x, y and z in the keys."""
-        to_y, to_z = int(bits[0]), int(bits[:2].sum())
-        ends, near = np.empty(len(keys) + 1, np.int64), np.empty(26 * len(keys), np.int32)
-        neighbour_table(keys, to_y, to_z, ends, near)
-        return cls(points, rows, starts, (ends, near))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -63,6 +63,13 @@ A smooth surface with noise keeps this share of its points, and the residual of 
 least this share of that of a quadric.
 """
 
+LEAST_DISPARITY_NOISE = 3e-4
+"""
+Sigma by range^2, 1/m, from which on a cloud is of a depth camera: theirs is 1e-3 1/m, of lidars
+less than 1e-4 1/m. Layers are separated there, as roads that a lidar sees are cambered. Patches in
+voxels of other sizes are not grown: pixels leave no gaps.
+"""
+
 STEP_SAMPLES, STEP_POINTS, STEP_SPREAD = 20_000, 8, 2.5
 """
 Points for the steps of disparity; each step holds STEP_POINTS on average, and 80 % of the steps

@@ -23,6 +23,7 @@ from surfel_mapper.models.kernels.voxel_means import (
     spread_labels,
     voxel_keys,
 )
+from surfel_mapper.models.kernels.voxel_points import neighbour_table
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -64,7 +65,10 @@ class Thinned:
     def by_voxel(self) -> VoxelPoints:
         """Return the finite points by voxel, with the neighbours of voxels."""
         points = np.take(self.points, self.rows, axis=0).astype(np.float64, copy=False)
-        return VoxelPoints.of(points, self.rows, self.starts, self.keys, self.bits)
+        number, to_y, to_z = len(self.keys), int(self.bits[0]), int(self.bits[:2].sum())
+        ends, near = np.empty(number + 1, np.int64), np.empty(26 * number, np.int32)
+        neighbour_table(self.keys, to_y, to_z, ends, near)
+        return VoxelPoints(points, self.rows, self.starts, (ends, near))
 
     def whole_voxels(self) -> Thinned:
         """Return the means of parts as a cloud by voxel."""
