@@ -23,7 +23,6 @@ from surfel_mapper.alignment.kernels.edges import (
     pair_moments,
     weighted_moments,
 )
-from surfel_mapper.arguments import Record
 from surfel_mapper.errors import AlignmentError
 
 Floats = npt.NDArray[np.float64]
@@ -34,8 +33,8 @@ ROUNDING = 1e-9
 """Rounding of a weight matrix as a share of the largest weight of its edge."""
 
 
-@dataclass(slots=True, repr=False)
-class Edge(Record):
+@dataclass(slots=True)
+class Edge:
     """Pairs of points of two vertices, optional weights, and the cached sums over them."""
 
     pairs: Pairs

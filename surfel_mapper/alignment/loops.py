@@ -25,7 +25,6 @@ from surfel_mapper.alignment.angles import poses_of, transforms
 from surfel_mapper.alignment.correspondences import moved
 from surfel_mapper.alignment.lum import LUM
 from surfel_mapper.alignment.window import ANCHORS
-from surfel_mapper.arguments import Record
 from surfel_mapper.errors import AlignmentError, counted
 from surfel_mapper.geometry import compose, inverse, Transform
 
@@ -76,8 +75,8 @@ class Loop:
     votes: int = 0
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class LoopSolution(Record):
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopSolution:
     """
     Poses that agree with the loops.
 

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import Record
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -77,8 +76,8 @@ class Shard:
     span: Span | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class ShardResult(Record):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShardResult:
     """
     Result of a shard.
 

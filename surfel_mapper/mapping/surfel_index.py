@@ -109,40 +109,6 @@ class SurfelIndex:
         rows[is_finite] = np.where(number < len(self.surfels), number, -1)
         return rows, distance
 
-    def plane_distance(
-        self, points: npt.ArrayLike, max_distance_m: float = 0.0
-    ) -> npt.NDArray[np.float64]:
-        """
-        Return the distance of each point from the plane of its surfel.
-
-        Parameters
-        ----------
-        points : (N, 3) float, m
-            In the frame of the map.
-        max_distance_m : float
-            0: use the surfel of the voxel that the point lies in; else the nearest surfel
-            within this distance.
-
-        Returns
-        -------
-        (N,) float64, m
-            normal . (point - position), positive on the side of the sensor; nan if there is no
-            surfel, or it has no normal.
-
-        """
-        xyz = _as_xyz(points)
-        rows = self.nearest(xyz, max_distance_m)[0] if max_distance_m > 0 else self.at(xyz)
-        step = xyz - self._of(self.surfels.position, rows)
-        return np.asarray((step * self._of(self.surfels.normal, rows)).sum(axis=1))
-
-    def _of(
-        self, values: npt.NDArray[np.float64], rows: npt.NDArray[np.int64]
-    ) -> npt.NDArray[np.float64]:
-        """Return values (M, 3) by row, nan for -1."""
-        if not len(values):
-            return np.full((len(rows), 3), math.nan)
-        return np.where((rows >= 0)[:, None], values[rows], math.nan)
-
 
 def _as_xyz(points: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return points as (N, 3) float64 in C order."""

@@ -289,14 +289,12 @@ class MapPart:
             return None
         T_part_body, registration = self.scans[0].T_part_body, self._registration
         search = PlaceSearch(means(surfel_map.moments()), surfel_map.voxel_size_m)
-        candidates = turned([T_map_body], 24) + search.poses(cells_around(self._map, T_part_body))
+        starts = turned([T_map_body], 24) + search.poses(cells_around(self._map, T_part_body))
         small, large, T_small_body = self._map, surfel_map, T_part_body
         if is_larger := self._map.num_voxels > surfel_map.num_voxels:
             small, large, T_small_body = surfel_map, self._map, T_map_body
-            candidates = [
-                compose(T_part_body, compose(inverse(T), T_map_body)) for T in candidates
-            ]
-        result = registration.relocate(cells_around(small, T_small_body), large, candidates)
+            starts = [compose(T_part_body, compose(inverse(T), T_map_body)) for T in starts]
+        result = registration.relocate(cells_around(small, T_small_body), large, starts)
         cells = cells_around(large, result.T_map_sensor)
         back = registration.align(
             cells, small, [T_small_body], registration.config.max_deviation_m

@@ -86,11 +86,9 @@ class ClockWatch:
         references = self._poses or dict([*self._clouds.items()][:1])
         texts = []
         for topic, leads in self._clouds.items():
-            for reference, reference_leads in references.items():
-                enough = min(len(leads), len(reference_leads)) >= LEAST
-                seconds = (
-                    offset_s(leads, reference_leads) if enough and topic != reference else None
-                )
+            for reference, pose_leads in references.items():
+                enough = min(len(leads), len(pose_leads)) >= LEAST
+                seconds = offset_s(leads, pose_leads) if enough and topic != reference else None
                 if seconds is not None:
                     offset = ClockOffset(topic, reference, seconds, 'arrival times')
                     texts.append(self._text(offset))

@@ -57,8 +57,6 @@ class Integrated:
         Blocks selected.
     num_updated : int
         Blocks in which at least one voxel was observed.
-    num_skipped : int
-        Blocks that were free for long and are free in the image, so nothing would have changed.
     num_added : int
         Updated blocks that are new in the map.
     num_voxels : int
@@ -68,7 +66,6 @@ class Integrated:
 
     num_blocks: int
     num_updated: int
-    num_skipped: int
     num_added: int
     num_voxels: int
 
@@ -114,7 +111,6 @@ def fuse_into(
     return Integrated(
         num_blocks=len(rows),
         num_updated=len(updated),
-        num_skipped=int(skipped.sum()),
         num_added=blocks.num_blocks - num_before,
         num_voxels=int(observed.sum()),
     )

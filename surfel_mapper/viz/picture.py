@@ -251,11 +251,9 @@ def ground_lines(scene: MapScene, camera: Camera, depth: Image) -> Image:
 def draw_key(page: Axes, scene: MapScene, camera: Camera) -> None:
     """Draw scale bar, axes and the meaning of the colours below the oblique view."""
     text: dict[str, Any] = {'fontsize': TEXT_PT, 'color': INK, 'va': 'center'}
-    side, left_px, low = square_m(camera), BORDER + 4, NOTE_PX
-    page.plot(
-        [left_px, left_px + side * camera.px_per_m], [low + 66] * 2, color=INK, linewidth=2.5
-    )
-    page.text(left_px, low + 36, f'{side:g} m, one square of the grid', **text)
+    side, x_px, low = square_m(camera), BORDER + 4, NOTE_PX
+    page.plot([x_px, x_px + side * camera.px_per_m], [low + 66] * 2, color=INK, linewidth=2.5)
+    page.text(x_px, low + 36, f'{side:g} m, one square of the grid', **text)
     arrow = {'arrowstyle': '->', 'color': INK, 'shrinkA': 0.0, 'shrinkB': 0.0}
     x, y = BORDER + 450, low + 46
     for name, (right, up) in zip('xyz', camera.R_view_map[:2].T.tolist(), strict=True):

@@ -241,8 +241,7 @@ def fates(summary: Mapping[str, Any]) -> dict[str, int]:
     """Return the number of scans that were not mapped, by cause."""
     scans = summary['scans']
     gated = {'scans left out, too near to the last': scans['gated']} if scans['gated'] else {}
-    dropped = {f'scans dropped: {cause}': n for cause, n in named(scans['dropped']).items()}
-    return {**gated, **dropped}
+    return gated | {f'scans dropped: {cause}': n for cause, n in named(scans['dropped']).items()}
 
 
 def named(counts: Mapping[str, int]) -> dict[str, int]:

@@ -50,22 +50,6 @@ def test_nearest_is_nearest_of_all(index, points, radius_m):
             assert distance_m == pytest.approx(every.min(), abs=1e-12)
 
 
-def test_plane_distance_is_positive_on_the_side_of_the_sensor():
-    rng = np.random.default_rng(6)
-    floor = np.c_[rng.uniform(0.0, 2.0, (500, 2)), np.full(500, 0.2)]
-    surfel_map = SurfelMap(VOXEL_M)
-    surfel_map.add(floor, origin=(1.0, 1.0, 2.0))
-    index = surfel_map.index()
-    asked = [[1.1, 0.8, 0.3], [0.2, 0.9, 0.1], [1.1, 0.8, 0.9]]
-    lattice_m = VOXEL_M / 65536  # the floor is quantised
-
-    in_voxel = index.plane_distance(asked)
-    nearest = index.plane_distance(asked, max_distance_m=2.0)
-
-    np.testing.assert_allclose(in_voxel, [0.1, -0.1, np.nan], atol=lattice_m)
-    np.testing.assert_allclose(nearest, [0.1, -0.1, 0.7], atol=lattice_m)
-
-
 def test_a_coarser_level_uses_its_own_voxels(points):
     rng = np.random.default_rng(7)
     fine = SurfelMap(VOXEL_M)
@@ -81,7 +65,6 @@ def test_an_empty_map_finds_nothing():
     index = SurfelMap(VOXEL_M).index()
     assert index.at([[0.0, 0.0, 0.0]]).tolist() == [-1]
     assert index.nearest([[0.0, 0.0, 0.0]], 1.0)[0].tolist() == [-1]
-    assert np.isnan(index.plane_distance([[0.0, 0.0, 0.0]])).all()
 
 
 def test_invalid_points_have_no_surfel(index):

@@ -100,10 +100,8 @@ def traversability(
         step_m = steps(chosen, ground, voxel_size_m, number, limits.max_slope_deg)
         step = step_m / limits.max_step_m
         share = np.maximum(slope_deg / limits.max_slope_deg, step)
-        is_known = ground.has_slope | (step >= 1.0)
-        cost[ground.cell[is_known]] = np.minimum(share[is_known] * OBSTACLE, OBSTACLE).astype(
-            np.int8
-        )
+        valid = ground.has_slope | (step >= 1.0)
+        cost[ground.cell[valid]] = np.minimum(share[valid] * OBSTACLE, OBSTACLE).astype(np.int8)
     origin = first.astype(np.float64) * voxel_size_m
     return CostGrid(voxel_size_m, origin, cost.reshape(number, number))
 
