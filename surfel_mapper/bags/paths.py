@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from itertools import pairwise
 import logging
 from pathlib import Path
 import re
@@ -187,20 +186,15 @@ def loose_files(directory: Path) -> list[Path]:
             listed += f'; its folders: {shorten(", ".join(folders), 80)}'
         raise BagError(f'{directory}: {listed}; expected {readable()}')
     files = sorted(files, key=by_number)
-    for older, newer in pairwise(files):
-        (stem, number), (name, following) = (split_number(f) for f in (older, newer))
-        if stem == name and following > number + 1:
-            _log.warning(
-                '%s: no file between %s and %s: is a part of the bag missing?',
-                *(directory, older.name, newer.name),
-            )
+    matches = [re.fullmatch(r'(.*_)(\d+)\.\w+', unpacked_name(file)) for file in files]
+    stems = {match and match[1] for match in matches}
+    numbers = [int(match[2]) for match in matches if match and len(stems) == 1]
+    if len(numbers) == len(files) <= numbers[-1] - numbers[0]:
+        _log.warning(
+            '%s: %d files from %s to %s: is a part of the bag missing?',
+            *(directory, len(files), files[0].name, files[-1].name),
+        )
     return files
-
-
-def split_number(file: Path) -> tuple[str, int]:
-    """Return the name of a file of a split bag without its number, and the number; -1 without."""
-    match = re.fullmatch(r'(.*_)(\d+)\.\w+', unpacked_name(file))
-    return (match[1], int(match[2])) if match else (file.name, -1)
 
 
 def damaged_metadata(path: Path, error: Exception) -> BagError:
