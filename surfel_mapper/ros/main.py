@@ -22,6 +22,7 @@ from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.ros.context import context, explain, logging_to
 from surfel_mapper.ros.main_thread import Signals
 from surfel_mapper.ros.node import MapperNode
+from surfel_mapper.ros.parameters import unread_files
 from surfel_mapper.ros.turns import take_turns
 from surfel_mapper.threads import real_time_threads
 
@@ -47,6 +48,8 @@ def run_node(ros_args: Sequence[str], signals: Signals) -> None:
     with context(ros_args):
         node = create_node(ros_args)
         try:
+            for text in unread_files(ros_args, node.get_name()):
+                node.get_logger().warning(text)
             with logging_to(node.get_logger()), executing(node):
                 run_tasks(node, signals)
         finally:

@@ -10,7 +10,8 @@ nearest one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 import math
 import sys
 from typing import Any
@@ -19,8 +20,10 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from surfel_mapper.config import checked, Config, Declaration, declarations, near
+from surfel_mapper.config import checked, Config, Declaration, declarations, near, read_yaml
+from surfel_mapper.config.parameters_file import parts_of
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.ros.filter_files import PARAMS_FILE
 
 QOS_OVERRIDES = 'qos_overrides.'
 """rclpy declares parameters of this prefix when it subscribes to their topics."""
@@ -160,3 +163,16 @@ def float_settings() -> set[str]:
         for declared in declarations()
         if (declared.items if declared.is_list else type(declared.default)) is float
     }
+
+
+def unread_files(ros_args: Sequence[str], node: str) -> Iterator[str]:
+    """Yield a text for each parameter file of a command line that has none of a node."""
+    for option, path in pairwise(ros_args):
+        if option == PARAMS_FILE:
+            try:
+                names = [name for name, _ in parts_of(read_yaml(path, as_text=True)) if name]
+            except (OSError, ValueError) as error:
+                yield f'{path}: whether it has parameters of {node} is not known: {error}'
+                continue
+            if not any(name.endswith('*') or name.split('/')[-1] == node for name in names):
+                yield f'{path}: parameters of {", ".join(names)}, none of {node}: none is used'

@@ -13,7 +13,11 @@ rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from rclpy.parameter import Parameter  # noqa: E402
 
-from surfel_mapper.ros.parameters import declare_settings, settings_among  # noqa: E402
+from surfel_mapper.ros.parameters import (  # noqa: E402
+    declare_settings,
+    settings_among,
+    unread_files,
+)
 
 TYPES = {
     bool: 'BOOL',
@@ -133,3 +137,20 @@ def test_a_wrong_name_or_value_is_refused_before_anything_is_declared(make, over
 def test_parameters_of_rclpy_are_no_settings():
     found = [Parameter('window.max_scans', value=7), Parameter('use_sim_time', value=True)]
     assert settings_among(found) == {'window.max_scans': 7}
+
+
+@pytest.mark.parametrize(
+    ('sections', 'is_named'),
+    [
+        ('/**: &node\n  ros__parameters: {map: {voxel_size_m: 0.2}}', False),
+        ('robot:\n  surfel_mapper:\n    ros__parameters: {map: {voxel_size_m: 0.2}}', False),
+        ('mapper:\n  ros__parameters: {map: {voxel_size_m: 0.2}}', True),
+    ],
+)
+def test_a_file_with_parameters_of_other_nodes_alone_is_named(tmp_path, sections, is_named):
+    file = tmp_path / 'params.yaml'
+    file.write_text(sections)
+    arguments = ['--ros-args', '-r', 'points:=/a', '--params-file', str(file)]
+    assert [*unread_files(arguments, 'surfel_mapper')] == (
+        [f'{file}: parameters of mapper, none of surfel_mapper: none is used'] if is_named else []
+    )
