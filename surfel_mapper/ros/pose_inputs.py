@@ -252,11 +252,16 @@ class PoseInputs:
         else:
             log.info(str(choice))
         poses = self._waiting.get(choice.topic, deque())
-        if poses and (missing := self._missing_chain(poses)):
-            log.warning(
-                f'{missing}: set frames.base_to_sensor, the pose of the sensor in '
-                f'{poses[-1].child}'
-            )
+        if choice.topic and not poses:
+            log.warning(f'{choice.topic}: no message yet, scans wait for its poses')
+        elif poses and (missing := self._missing_chain(poses)):
+            parent, child, fixed = poses[-1].parent, poses[-1].child, self._config.frames.fixed
+            remedy = f'set frames.base_to_sensor, the pose of the sensor in {child}'
+            if parent == child:
+                remedy = f'the poses are of {child} in itself'
+            elif parent != fixed:
+                remedy = f'the poses are in {parent}: set frames.fixed: {parent}'
+            log.warning(f'{missing}: {remedy}')
         for topic in (*self._waiting, STATIC_TOPIC):
             if not self._reads(topic, choice):
                 self._subscriptions.unsubscribe(topic)

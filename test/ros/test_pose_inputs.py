@@ -6,9 +6,11 @@ from __future__ import annotations
 
 import time
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import pytest
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from surfel_mapper import Config
@@ -20,7 +22,7 @@ from surfel_mapper.ros.pose_inputs import PoseInputs
 from surfel_mapper.ros.topic_search import TopicSearch
 from test.bags import recorded
 from test.ros.driving import drive
-from test.ros.live import Peer
+from test.ros.live import Peer, START_NS
 
 DEFAULTS = ['--ros-args', '-p', 'publish.diagnostics_rate_hz:=20.0']
 PATIENT = [*DEFAULTS, '-p', 'pose.registration_after_s:=3600.0']  # on a loaded machine too
@@ -80,6 +82,50 @@ def test_scans_of_a_sensor_without_a_mount_are_dropped_with_the_remedy(start, pe
     assert (values['pose_source'], values['scans.mapped']) == ('odometry', '0')
     assert 'no transforms lead from odom to lidar: set frames.base_to_sensor' in node.output
     assert 'a sensor without a transform needs frames.base_to_sensor' in node.output
+
+
+@pytest.mark.parametrize(
+    ('parent', 'says'),
+    [
+        ('odom', 'from map to lidar: the poses are in odom: set frames.fixed: odom'),
+        ('base_link', 'from map to lidar: the poses are of base_link in itself'),
+    ],
+)
+def test_poses_in_another_frame_are_named_with_the_setting(start, peer, parent, says):
+    node = start('node', *PATIENT, *MOUNT, '-p', 'frames.fixed:=map')
+    peer.advertise('/odom', '/points')
+    messages = drive(2)
+    for _, pose in messages:
+        pose.header.frame_id = parent
+    send(peer, messages)
+    node.wait_for_output(says)
+
+
+def test_a_publisher_without_messages_is_named(start, peer):
+    node = start('node', *PATIENT, *MOUNT)
+    peer.advertise('/odom', '/points')
+    for cloud, _ in drive(1):
+        peer.publish('/points', cloud)
+    node.wait_for_output('/odom: no message yet, scans wait for its poses')
+
+
+def test_the_wait_for_the_choice_is_no_latency(start, peer):
+    start('node', *PATIENT, *MOUNT, '-p', 'use_sim_time:=true')
+    clock = peer.node.create_publisher(Clock, '/clock', 10)
+    peer.spin_until(clock.get_subscription_count)
+    peer.advertise('/odom', '/points')
+    reports = peer.collect(DiagnosticArray, '/diagnostics')
+    now = Clock()
+    now.clock.sec = START_NS // 10**9 + 3
+
+    def is_heard():
+        clock.publish(now)
+        return reports and reports[-1].header.stamp == now.clock
+
+    peer.spin_until(is_heard)
+    send(peer, drive(1))
+    _, values = peer.diagnosis({'scans.mapped': 1})
+    assert values['latency_ms.p99'] == '0.0'
 
 
 def test_pose_messages_are_taken_without_odometry(start, peer):
