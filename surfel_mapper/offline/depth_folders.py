@@ -295,10 +295,9 @@ def camera_of(
     """Return intrinsics and units of depth, of a file in the folder or above it, else as known."""
     candidates = [folder / name for folder in (path, path.parent) for name in INTRINSICS]
     file = next(filter(Path.is_file, candidates), None)
-    if file is None and nominal is None:
-        raise FileFormatError(f'{path}: no intrinsics of its camera, expected {INTRINSICS[0]}')
     if file is None:
-        assert nominal is not None
+        if nominal is None:
+            raise FileFormatError(f'{path}: no intrinsics of its camera, expected {INTRINSICS[1]}')
         logger.warning(
             '%s: no file of intrinsics, uses those of the data set: fx, fy, cx, cy %s',
             *(path, nominal),

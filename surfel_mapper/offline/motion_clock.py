@@ -276,8 +276,6 @@ class PosedMotions:
         rivals_s = shifts_s[np.nanmean(worse, axis=1) <= SIGMAS * errors + LEAST_WORSE]
         most_s = min(0.5 * abs(shift_s), SAME_S)
         is_unique = np.abs(rivals_s - shift_s).max(initial=0.0) <= most_s
-        unshifted = self.misfits(np.zeros(1))[0]
-        is_better = not np.isfinite(unshifted).any() or np.nanmean(unshifted - best) >= (
-            BETTER - 1.0
-        ) * np.nanmean(best)
+        unshifted = np.nan_to_num(self.misfits(np.zeros(1))[0], nan=MOST_MISFIT)
+        is_better = np.nanmean(unshifted - best) >= (BETTER - 1.0) * np.nanmean(best)
         return shift_s if abs(shift_s) >= LEAST_OFFSET_S and is_unique and is_better else None

@@ -334,7 +334,7 @@ def first_scans(reader: BagReader, topics: Sequence[str]) -> list[Scan]:
 def with_registration(config: Config, scans: Sequence[Scan]) -> Config:
     """Return a configuration with registration, and deskewing if all scans carry times."""
     settings: dict[str, object] = {'pose.source': 'registration'}
-    if config.deskew == DEFAULT.deskew and scans and all(map(has_times, scans)):
+    if config.deskew == DEFAULT.deskew and scans and not any(map(times_error, scans)):
         settings['deskew.enabled'] = True
     return config.replace(settings)
 
@@ -342,11 +342,6 @@ def with_registration(config: Config, scans: Sequence[Scan]) -> Config:
 def is_default(config: Config) -> bool:
     """Return whether a configuration leaves source and frames of the poses open."""
     return config.pose.source == AUTO and config.frames == DEFAULT.frames
-
-
-def has_times(scan: Scan) -> bool:
-    """Return whether the points of a scan carry times that differ."""
-    return not times_error(scan)
 
 
 def times_error(scan: Scan) -> str:
