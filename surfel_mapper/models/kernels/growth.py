@@ -37,6 +37,12 @@ FREE = -1
 ROUNDS = 3
 """A facet is grown this many times, each time from the plane of the previous result."""
 
+BESIDE, MOST_BESIDE = 3.0, 0.5
+"""
+Free points of its voxels up to BESIDE tolerances beside a facet, by those on it, at most. In
+scatter they are twice as many.
+"""
+
 LARGE_REGION = 100
 """
 Voxels of a region that is no facet, from which on none of them is a seed again: otherwise a rail
@@ -211,7 +217,7 @@ def find_facets(points, starts, adjacent, free, order, rules, owner, planes, num
     tolerance, least_voxels, least_points, _, least_width = rules
     marks = np.zeros((3, len(count)), np.int64)
     visited, region, rejected = marks[0], marks[1], marks[2]
-    plane, start, sums = np.empty(4), np.empty(3), np.empty(10)
+    plane, start, sums = np.empty(4), np.empty(3), np.empty(11)
     value, axes, mark = np.empty(3), np.empty((3, 3)), 0
     for seed in order:
         if num_planes == len(planes):
@@ -241,6 +247,7 @@ def find_facets(points, starts, adjacent, free, order, rules, owner, planes, num
                 mark,
             )
             is_small = sums[0] < least_points or size < least_voxels
+            is_small |= sums[10] > MOST_BESIDE * sums[0]
             if not is_small:
                 plane_of(sums, sums[0], value, axes)
                 is_small = math.sqrt(12.0 * max(value[1], 0.0)) < least_width
@@ -288,7 +295,8 @@ def grow_facet(
     adjacent ... owner  of find_facets
     adapts            whether the plane is refitted whenever the points have doubled
     plane             (4,) float64, in place
-    sums              (10,) float64, out: moments of the points, about the mean of the seed
+    sums              (11,) float64, out: moments of the points, about the mean of the seed; number
+                      of those beside
     visited           (V,) int64: mark for voxels that were tested
     region            (V,) int64, out
     """
@@ -303,8 +311,12 @@ def grow_facet(
         u = region[head]
         head += 1
         for i in range(starts[u], starts[u + 1]):
-            if owner[i] == FREE and plane_distance(points, i, plane) < tolerance:
+            if owner[i] != FREE:
+                continue
+            away = plane_distance(points, i, plane)
+            if away < tolerance:
                 add_point(points, i, mean[seed], 1.0, sums)
+            sums[10] += tolerance <= away < BESIDE * tolerance
         if adapts and sums[0] >= refit:
             refit = 2.0 * sums[0]
             plane_of(sums, sums[0], value, axes)
