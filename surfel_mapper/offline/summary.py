@@ -111,7 +111,7 @@ def uncertain_text(summary: Mapping[str, Any]) -> str:
     """Return why a map is in doubt, or lacks more scans than usual; empty if neither is so."""
     texts = [apart_text(summary), tracking_doubt(summary), missing_text(summary)]
     texts += [summary.get(name, '') for name in ('mount_changes', 'pose_doubt')]
-    if not summary['surfels']:
+    if not summary['surfels'] and not texts[2]:
         texts.append(
             'the map has no surfels: no voxel has map.min_points points. Are the points not in '
             'metres, or the voxels too small?'
