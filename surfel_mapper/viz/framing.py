@@ -13,7 +13,6 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.viz.discs import DrawnDiscs
 from surfel_mapper.viz.rendering import direction
 
@@ -62,9 +61,9 @@ def upright(discs: DrawnDiscs) -> Array:
     return np.stack([np.cross(across, up), across, up])
 
 
-def levelled(surfels: Surfels) -> Array:
+def levelled(discs: DrawnDiscs) -> Array:
     """Return the rotation (3, 3) to z up of a map in the frame of a camera; of others, none."""
-    R = upright(DrawnDiscs.of(surfels))
+    R = upright(discs)
     return R if R[2, 2] < 0.7 else np.eye(3)
 
 

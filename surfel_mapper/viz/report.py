@@ -29,6 +29,7 @@ from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.charts import histogram, lines, NO_DATA, short
+from surfel_mapper.viz.discs import DrawnDiscs
 from surfel_mapper.viz.framing import levelled
 from surfel_mapper.viz.history import History
 from surfel_mapper.viz.markup import as_html, html_figures, html_table
@@ -207,7 +208,8 @@ def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str
         stage: np.array(history.milliseconds[stage])
         for stage in sorted(history.milliseconds, key=stage_order)
     }
-    slope = np.degrees(np.arccos(np.clip(np.abs(surfels.normal @ levelled(surfels)[2]), 0, 1)))
+    up = levelled(DrawnDiscs.of(surfels))[2]
+    slope = np.degrees(np.arccos(np.clip(np.abs(surfels.normal @ up), 0.0, 1.0)))
     dropped = {'dropped': history.dropped}
     charts = {
         'Voxels over time': lines(seconds, {'voxels': history.voxels}, 'time (s)', 'voxels'),

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+import math
 from pathlib import Path
 from typing import Any
 
@@ -197,20 +198,28 @@ class Scene:
             about = self.rerun.AnyValues(origin_m=self.origin_m)
             self._stream.log('map', about, static=True)
 
-    def look(self, low: Array, high: Array, target: Array, hidden: Sequence[str] = ()) -> None:
+    def look(
+        self,
+        low: Array,
+        high: Array,
+        target: Array,
+        level: Array,
+        hidden: Sequence[str] = (),
+    ) -> None:
         """
         Look at a target from obliquely above, as far away as a box, (3,) m each, needs.
 
-        Hidden paths are shown once their eye in the panel is clicked.
+        Up is the third row of a rotation ``level``. Hidden paths are shown once their eye in the
+        panel is clicked.
         """
         import rerun.blueprint as blueprint
 
-        size = float(np.linalg.norm(high[:2] - low[:2]))
-        across = 1 if high[0] - low[0] > high[1] - low[1] else 0
+        size_m = np.abs(level @ (high - low))
+        across = 1 if size_m[0] > size_m[1] else 0
         back = np.array([0.0, 0.0, 0.55])
         back[across] = -0.75
-        eye = target + back * max(size, 2.0) * 0.6
-        controls = blueprint.EyeControls3D(position=eye, look_target=target, eye_up=[0, 0, 1])
+        eye = target + level.T @ back * max(math.hypot(*size_m[:2]), 2.0) * 0.6
+        controls = blueprint.EyeControls3D(position=eye, look_target=target, eye_up=level[2])
         name = 'map'
         if self.origin_m.any():
             name = 'map, m from ' + ' '.join(f'{value:.10g}' for value in self.origin_m)

@@ -25,6 +25,7 @@ from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.contents import Content
 from surfel_mapper.viz.detail import DetailedMap
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
+from surfel_mapper.viz.framing import levelled
 from surfel_mapper.viz.scene import ORANGE, POINT_RADIUS_M, RED, Scene
 
 Array = npt.NDArray[np.float64]
@@ -90,7 +91,8 @@ def show_contents(
         positions = [content.positions() - origin_m for content in contents]
     meshes = [f'map/{content.name}' for content in contents if isinstance(content.shape, Mesh)]
     hidden = meshes if any(map(len, tiles.values())) else []
-    scene.look(*box_of(positions), looked_at, hidden)
+    level = levelled(max(tiles.values(), key=len)) if tiles else np.eye(3)
+    scene.look(*box_of(positions), looked_at, level, hidden)
     for path, discs in tiles.items():
         scene.discs(path, discs, static=True)
     for content in contents:

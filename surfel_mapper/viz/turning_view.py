@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.discs import as_bytes, COLUMNS, ramp, SPREAD, UNITS
+from surfel_mapper.viz.discs import as_bytes, COLUMNS, DrawnDiscs, ramp, SPREAD, UNITS
 from surfel_mapper.viz.framing import levelled
 from surfel_mapper.viz.mesh import MAX_TRIANGLES, mesh_data
 
@@ -145,7 +145,7 @@ def view_data(
         'layers': [
             mesh_data(mesh, low, size, MAX_TRIANGLES // len(layers)) for mesh in layers.values()
         ],
-        'level': levelled(surfels).tolist(),
+        'level': levelled(DrawnDiscs.of(surfels)).tolist(),
         'middle': (low + 0.5 * size + origin_m).tolist(),
     }
 

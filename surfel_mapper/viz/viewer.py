@@ -20,6 +20,7 @@ from surfel_mapper.layers.drawings import Drawing, MeshDrawing, RingsDrawing
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.messages.model_messages import quaternions
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
+from surfel_mapper.viz.framing import levelled
 from surfel_mapper.viz.scene import AROUND_M, ORANGE, POINT_RADIUS_M, RED, Scene
 
 if TYPE_CHECKING:
@@ -105,7 +106,8 @@ class Viewer:
         if not self._is_placed:
             self._is_placed = True
             scene.set_origin(self._mapper.map.origin_m)
-            scene.look(position - AROUND_M, position + AROUND_M, position)
+            level = levelled(self._discs(update.changed))
+            scene.look(position - AROUND_M, position + AROUND_M, position, level)
         scene.set_stamp(update.stamp_ns)
         pose = rerun.Transform3D(translation=position, mat3x3=update.T_map_sensor[:3, :3])
         scene.log('map/sensor', pose)

@@ -57,7 +57,7 @@ def test_the_ground_of_a_camera_is_where_its_y_points():
 
 
 def test_only_maps_in_the_frame_of_a_camera_are_levelled():
-    floor = sheet(0.0, 1.0, 1.0)
+    floor = DrawnDiscs.of(sheet(0.0, 1.0, 1.0))
     np.testing.assert_array_equal(levelled(floor), np.eye(3))
     R_tilted = Rotation.from_euler('x', 20.0, degrees=True).as_matrix()
     tilted = replace(floor, normal=floor.normal @ R_tilted.T)

@@ -165,6 +165,33 @@ def hidden(tmp_path):
     }
 
 
+def look_of(tmp_path):
+    """Return position, target and up of the eye in the blueprint of the recording of a view."""
+    from rerun import chunk as reader
+
+    file = reader.RrdReader(str(tmp_path / 'shown.rrd'))
+    (store,) = file.blueprints()
+    values = {}
+    for chunk in file.stream(store=store).to_chunks():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.startswith('EyeControls3D:'):
+                values[name.split(':')[1]] = np.array(batch.column(name)[-1].as_py()[0])
+    return values
+
+
+def test_a_map_in_the_frame_of_a_camera_is_looked_at_upright(tmp_path):
+    surfel_map = SurfelMap(0.5)
+    x, z, y = ground().T  # y of a camera is down
+    surfel_map.add(np.column_stack([x, 3.0 - y, z]), origin=[0.0, 0.0, 0.0])
+    surfel_map.save(tmp_path / 'map.npz')
+    shown(tmp_path, tmp_path / 'map.npz')
+
+    eye = look_of(tmp_path)
+    np.testing.assert_allclose(eye['eye_up'], [0.0, -1.0, 0.0], atol=0.05)
+    assert (eye['position'] - eye['look_target'])[1] < -1.0
+
+
 def test_surfels_of_ply_are_discs_with_their_values(tmp_path, capsys):
     surfel_map = ground_map(UTM)
     surfel_map.save(tmp_path / 'map.ply')
