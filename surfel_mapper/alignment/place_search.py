@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
+import scipy  # loads scipy.fft at its first use: 0.2 s with Python 3.10
 
 from surfel_mapper.geometry import pose_matrix, Transform
 
@@ -72,9 +72,9 @@ class PlaceSearch:
         rows = self._pixels(points[:, :2], self._low)
         np.minimum.at(self._lowest_m, (rows[:, 0], rows[:, 1]), points[:, 2])
         self._padded = [
-            fft.next_fast_len(int(size) + 2 * REACH + 1, real=True) for size in self._shape
+            scipy.fft.next_fast_len(int(size) + 2 * REACH + 1, real=True) for size in self._shape
         ]
-        self._spectrum = fft.rfft2(heights(rows, self._shape), self._padded)
+        self._spectrum = scipy.fft.rfft2(heights(rows, self._shape), self._padded)
 
     def poses(self, points: Floats) -> list[Transform]:
         """
@@ -106,8 +106,8 @@ class PlaceSearch:
         """Return likeness, x, y and heading of the best positions (K, 4) at a heading."""
         at = self._pixels(turned_xy(points, angle_deg), np.full(2, -REACH * self._pixel_m))
         image = heights(at, np.full(2, 2 * REACH + 1))
-        product = self._spectrum * np.conj(fft.rfft2(image, self._padded))
-        likeness = fft.irfft2(product, self._padded) / max(float(image.sum()), 1.0)
+        product = self._spectrum * np.conj(scipy.fft.rfft2(image, self._padded))
+        likeness = scipy.fft.irfft2(product, self._padded) / max(float(image.sum()), 1.0)
         best = np.argpartition(likeness.ravel(), -PEAKS)[-PEAKS:]
         shift = np.column_stack(np.unravel_index(best, likeness.shape))
         shift = np.where(shift >= self._shape, shift - self._padded, shift)
