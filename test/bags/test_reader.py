@@ -3,7 +3,6 @@
 """Bags of every kind read the same; damaged ones are refused with a clear error."""
 
 import logging
-import os
 from pathlib import Path
 import re
 import shutil
@@ -435,12 +434,8 @@ def test_a_message_that_is_not_of_its_type_is_a_bag_error(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['hall_os0_full', 'hall_os0_long'])
-def test_real_bags_yield_as_many_messages_as_they_state(name):
-    if 'SURFEL_MAPPER_TEST_DATA' not in os.environ:
-        pytest.skip('SURFEL_MAPPER_TEST_DATA is not set')
-    path = Path(os.environ['SURFEL_MAPPER_TEST_DATA'], 'data', 'bags', name)
-
-    with BagReader(path) as reader:
+def test_real_bags_yield_as_many_messages_as_they_state(data_folder, name):
+    with BagReader(data_folder / 'data' / 'bags' / name) as reader:
         scans = [reader.decode(message) for message in reader.messages(['/points'])]
         assert len(scans) == reader.topics.num_messages(['/points']) > 20
     assert all(scan.width * scan.point_step == len(scan.data) for scan in scans)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """PLY files are read back equal, by this package and by plyfile; damage is named."""
 
-import os
-from pathlib import Path
 import struct
 
 import numpy as np
@@ -157,11 +155,9 @@ def test_a_missing_file_is_named(tmp_path):
         read_points(tmp_path / 'absent.ply')
 
 
-def test_scans_of_real_lidars_are_read_like_plyfile_reads_them():
-    if 'SURFEL_MAPPER_TEST_DATA' not in os.environ:
-        pytest.skip('SURFEL_MAPPER_TEST_DATA is not set: no real scans')
+def test_scans_of_real_lidars_are_read_like_plyfile_reads_them(data_folder):
     plyfile = pytest.importorskip('plyfile')
-    paths = sorted(Path(os.environ['SURFEL_MAPPER_TEST_DATA'], 'data/scans').glob('*.ply'))
+    paths = sorted((data_folder / 'data/scans').glob('*.ply'))
     assert paths
     for path in paths:
         columns, vertex = read_points(path), plyfile.PlyData.read(path)['vertex']
