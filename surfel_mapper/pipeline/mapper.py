@@ -31,7 +31,7 @@ from surfel_mapper.mapping.window import checked_scans, WindowedScan
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.pipeline.drops import ScanOutcome
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
-from surfel_mapper.pipeline.regions import Prism, Region
+from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_pipeline import ScanPipeline
 from surfel_mapper.pipeline.update import Update
@@ -497,17 +497,9 @@ class Mapper:
         (E, 3) int32
             Indices of the surfels (``map.min_points``) that were removed.
 
-        Raises
-        ------
-        ValueError
-            If the edges of a polygon cross too many rows of voxels. Nothing has changed then.
-
         """
         check_kind('region', region, Region)
         voxel_index = self.map.moments().voxel_index
-        if isinstance(region, Prism):
-            rows = np.unique(voxel_index[:, 1]).astype(np.float64)
-            region.check_cost((rows + 0.5) * self.map.voxel_size_m)
         centers = (voxel_index.astype(np.float64) + 0.5) * self.map.voxel_size_m
         inside = voxel_index[region.contains(centers)]
         self._pipeline.layers.clear_region(region.contains)

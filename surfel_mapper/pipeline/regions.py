@@ -10,13 +10,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.pipeline.kernels.polygons import cross_rows, mark_inside
-
-MAX_CORNERS = 10_000
+MAX_CORNERS = 1000
 """Limit of the corners of a polygon."""
-
-MAX_CROSSINGS = 500_000
-"""Limit of the rows of voxels that the edges of a polygon cross; these take 20 ms."""
 
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -114,40 +109,18 @@ class Prism:
             )
 
     def contains(self, points: Floats) -> Mask:
-        """Return which points are inside; they cost least if many have the same y."""
+        """
+        Return which points are inside: the edges that a ray along x crosses are counted.
+
+        Source: Shimrat 1962, Algorithm 112, Position of point relative to polygon.
+        """
+        order = np.argsort(points[:, 1])
+        x, y = points[order, 0], points[order, 1]
+        is_odd = np.zeros(len(points), bool)
         corners = np.array(self.corners, np.float64)
-        x, y = points[:, 0], points[:, 1]
-        inside = (corners.min(axis=0) <= points[:, :2]).all(axis=1)
-        inside &= (points[:, :2] <= corners.max(axis=0)).all(axis=1)
-        (near,) = np.nonzero(inside)
-        rows, row = np.unique(y[near], return_inverse=True)
-        first, last = self._rows_crossed(rows)
-        change = np.zeros(len(rows) + 1, np.int64)  # of the number of edges, at each row
-        np.add.at(change, first, 1)
-        np.subtract.at(change, last, 1)
-        starts = np.concatenate([[0], np.cumsum(np.cumsum(change)[:-1])])
-        crossings = np.empty(starts[-1])
-        cross_rows(corners, rows, first, last, starts, crossings)
-        marks = np.empty(len(near), np.bool_)
-        mark_inside(x[near], row.reshape(-1), starts, crossings, marks)
-        inside[near] = marks
-        return np.asarray(inside)
-
-    def check_cost(self, rows: Floats) -> None:
-        """Raise ValueError if the edges cross rows of points at these y, sorted, too often."""
-        first, last = self._rows_crossed(rows)
-        cost = int((last - first).sum())
-        if cost > MAX_CROSSINGS:
-            raise ValueError(
-                f'polygon whose {len(self.corners)} edges cross {cost} rows of voxels, expected '
-                f'at most {MAX_CROSSINGS}; draw its outline with fewer corners'
-            )
-
-    def _rows_crossed(self, rows: Floats) -> tuple[npt.NDArray[np.int64], ...]:
-        """Return the first row that the edge ending at each corner crosses, and one past it."""
-        end = np.array([y for _, y in self.corners])
-        start = np.roll(end, 1)
-        return (
-            np.searchsorted(rows, np.minimum(start, end)),
-            np.searchsorted(rows, np.maximum(start, end)),
-        )
+        for (x0, y0), (x1, y1) in zip(np.roll(corners, 1, axis=0), corners, strict=True):
+            beside = slice(*np.searchsorted(y, sorted((y0, y1))))
+            is_odd[beside] ^= x[beside] < x0 + (y[beside] - y0) / (y1 - y0) * (x1 - x0)
+        inside = np.empty_like(is_odd)
+        inside[order] = is_odd
+        return inside

@@ -50,7 +50,6 @@ REFERENCES = {
     'models/kernels/surfel_links.py': 'models/test_live.py',
     'models/kernels/voxel_means.py': 'models/test_thinning.py',
     'models/kernels/voxel_points.py': 'models/kernels/test_growth.py',
-    'pipeline/kernels/polygons.py': 'pipeline/test_regions.py',
     'sensors/kernels/depth.py': 'sensors/test_depth.py',
     'sensors/kernels/deskew.py': 'sensors/test_deskew.py',
     'simulation/kernels/raycast.py': 'simulation/kernels/test_raycast.py',
