@@ -95,6 +95,6 @@ def test_the_digest_is_that_of_python_integers():
     assert reference.digest(moments, 0.5) == DIGEST
 
 
-@pytest.mark.parametrize('how', [{}, {'map.threads': 3}, {'interpreted': True}], ids=str)
+@pytest.mark.parametrize('how', [{}, {'interpreted': True}], ids=str)
 def test_every_way_to_run_gives_the_digest(bag, tmp_path, how):
     assert replayed(bag, tmp_path, **how) == DIGEST

@@ -65,13 +65,6 @@ class MapConfig(Stage):
         high=2**62,
         live=True,
     )
-    threads: int = setting(
-        0,
-        'With two or more, another thread prepares the next scan; the map does not depend on it. '
-        '0: one in a node, two in a replay by one process if there are two cores.',
-        low=0,
-        high=64,
-    )
     intensity: bool = setting(
         False, 'Sum the intensity of the points too; clouds without one are dropped.'
     )

@@ -108,16 +108,6 @@ class Filter(Settings):
         """Return the name of a parameter with that of the filter."""
         return f'{cls.name or cls.__name__}: {key}'
 
-    @property
-    def is_repeatable(self) -> bool:
-        """
-        Whether a scan gives the same result every time.
-
-        A filter that counts its scans returns False, and scans are filtered one after the other,
-        never ahead of time by another thread.
-        """
-        return True
-
     def check(self) -> None:
         """Check conditions on several parameters; raise ConfigError."""
 

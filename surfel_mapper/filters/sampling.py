@@ -101,11 +101,6 @@ class FixStepSampling(Filter):
         default_factory=itertools.count, init=False, repr=False, compare=False
     )
 
-    @property
-    def is_repeatable(self) -> bool:
-        """Whether the step stays."""
-        return self.step_factor == 1.0
-
     def step(self, calls: int) -> int:
         """Return the step after a number of scans."""
         if calls == 0 or self.step_factor == 1.0:

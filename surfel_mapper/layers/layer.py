@@ -64,8 +64,7 @@ class InsertedScan:
     T_map_sensor : (4, 4) float64
         Its pose in the map.
     keys : (K,) int64
-        Packed indices of the voxels that hold its points, each once; their order depends on
-        ``map.threads``.
+        Packed indices of the voxels that hold its points, each once.
     num_points : int
         Points that entered the map.
     evictions : tuple of Eviction

@@ -3,10 +3,9 @@
 """
 Reducer: reduces the points of a scan to moments.
 
-The scratch memory is kept from scan to scan; concurrent calls use separate memory, so several
-threads may reduce scans at the same time. A scan with more points of a voxel than the packed sums
-hold is reduced once more in parts: a wall 0.6 m from a camera of 640 x 480, 77,000 points a voxel,
-takes four times as long as one at 1.2 m, with 48,000 (4.8 and 1.2 ms).
+The scratch memory is kept from scan to scan. A scan with more points of a voxel than the packed
+sums hold is reduced once more in parts: a wall 0.6 m from a camera of 640 x 480, 77,000 points a
+voxel, takes four times as long as one at 1.2 m, with 48,000 (4.8 and 1.2 ms).
 """
 
 from __future__ import annotations
@@ -108,7 +107,7 @@ class Reducer:
     def __init__(self, voxel_size_m: float, columns: tuple[str, ...] = ()) -> None:
         self.voxel_size_m = voxel_size_m
         self._columns = columns
-        self._idle = [Scratch()]
+        self._scratch: Scratch | None = Scratch()
 
     def reduce(
         self,
@@ -147,10 +146,7 @@ class Reducer:
         scale = (1 << BITS) / self.voxel_size_m
         quantisation = (pose, scale, squared_limits(min_range_m, max_range_m))
         seen_from = UNKNOWN if origin is None else as_origin(origin)
-        try:
-            scratch = self._idle.pop()
-        except IndexError:  # all in use by other threads
-            scratch = Scratch()
+        scratch, self._scratch = self._scratch or Scratch(), None  # an error leaves it in disorder
         moments = self._moments(points.T, quantisation, seen_from, scratch)
         if values is not None:
             if ENTRIES * len(moments) > len(scratch.table):
@@ -160,7 +156,7 @@ class Reducer:
             sum_channels(points.T, *quantisation, moments.key, scratch.table, values, sums)
             scratch.table.fill(-1)
             moments = replace(moments, channel_names=channel_names(self._columns), channels=sums)
-        self._idle.append(scratch)
+        self._scratch = scratch
         num_reduced = len(points) - sum(moments.left_out.values())
         object.__setattr__(moments, 'num_reduced', num_reduced)
         return moments

@@ -185,8 +185,7 @@ class SurfelMap(MomentMap):
         """
         Return the moments that points have in this map, without adding them.
 
-        Does not access the voxels of the map, so another thread may reduce the next scan while
-        this one is inserted.
+        Does not access the voxels of the map.
 
         A point is quantised once, X = floor((((R0 x + R1 y) + R2 z) + t) 65536 / voxel size)
         in float64. The voxel index is X >> 16 and the place in the voxel (X & 65535) - 32768.

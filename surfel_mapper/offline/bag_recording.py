@@ -335,7 +335,7 @@ def feed(
                 number = first[message.topic] + counts[message.topic]
                 (images.add_image if images else add)(message, number)
             counts[message.topic] += 1
-        yield from mapper.insert_ready(more_follows=True)
+        yield from mapper.insert_ready()
     if scenes:
         mapper.end_images()
     mapper.end_scans()

@@ -49,13 +49,9 @@ from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import causes_text, uncertain_text
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.checkpoints import load_start
-from surfel_mapper.threads import usable_cores
 from surfel_mapper.viz.history import History
 from surfel_mapper.viz.server import import_rerun
 from surfel_mapper.viz.viewer import Viewer
-
-REPLAY_THREADS = 2
-"""Threads of a replay if there are the cores: one reduces the next scan."""
 
 SAME_TIME_NS = 10_000_000
 """A pose is compared with a true pose at most 10 ms apart."""
@@ -274,8 +270,6 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
     check_layer_formats(options.formats, settings)
     if options.align:
         settings = settings.replace({'window.keep_points': True})
-    if not settings.map.threads:
-        settings = settings.replace({'map.threads': min(usable_cores(), REPLAY_THREADS)})
     return settings if options.window else settings.replace(all_scans())
 
 

@@ -193,7 +193,7 @@ class ScanFolder:
             if stopped():
                 break
             self._add(mapper, number, frame)
-            yield from mapper.insert_ready(more_follows=True)
+            yield from mapper.insert_ready()
         mapper.end_scans()
         yield from mapper.insert_ready()
         mapper.finish()

@@ -304,21 +304,13 @@ class Mapper:
         if self.registered is not None:
             self.registered.scans_ended = True
 
-    def insert_ready(self, *, more_follows: bool = False) -> Iterator[Update]:
+    def insert_ready(self) -> Iterator[Update]:
         """
         Map the waiting scans whose poses are there, in order; yield an Update for each.
 
         A scan whose pose cannot come any more, or did not come in time, is dropped and counted.
-
-        Parameters
-        ----------
-        more_follows : bool
-            Whether more input comes at once, as from a bag. Then the newest scan may be left for
-            a later call, while another thread (``map.threads``) reduces it. The map is the
-            same to the bit. Call it once with False at the end.
-
         """
-        return self._pipeline.run(more_follows)
+        return self._pipeline.run()
 
     def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> bool:
         """

@@ -8,7 +8,6 @@ A scan that the motion gate, the filters or the registration leave out is refuse
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -90,33 +89,6 @@ class Preparation:
         self._drops = drops
         self.chain = Chain.load(config.filters) if config.filters else Chain()
 
-    @property
-    def is_independent(self) -> bool:
-        """Whether a scan can be prepared before the one before it is mapped."""
-        return (
-            all(filter_.is_repeatable for filter_ in self.chain.filters)
-            and not self._needs_free_rays
-            and self._images is None
-            and self._poses.registered is None
-        )
-
-    def ahead(self, scan: Scan, pose: Transform) -> Callable[[], Prepared]:
-        """
-        Look up the poses that a scan needs; return the function that deskews and filters it.
-
-        The function reads nothing that the mapping changes, so another thread may call it.
-        """
-        deskewing = None if scan.times is None else self._poses.deskewing(scan, scan.times)
-        chain = self.chain
-        T_base_sensor = self._poses.of_base(scan) if chain.filters else None
-
-        def prepare() -> Prepared:
-            return filtered_scan(
-                scan if deskewing is None else deskewing(), pose, chain, T_base_sensor
-            )
-
-        return prepare
-
     def load_filters(self, path: str) -> None:
         """
         Load the chain of filters of a file, if its path has changed.
@@ -150,7 +122,6 @@ class Preparation:
         pose: Transform,
         config: Config,
         laps: Laps,
-        begun: Callable[[], Prepared] | None = None,
     ) -> list[Prepared]:
         """
         Deskew, filter and register a scan; return the scans that can be mapped now.
@@ -168,8 +139,6 @@ class Preparation:
             All settings.
         laps : Laps
             Takes the time of each stage.
-        begun : callable, optional
-            Returns the result of another thread by ``ahead``, and raises its errors.
 
         Raises
         ------
@@ -185,12 +154,10 @@ class Preparation:
         is_gated = bool(gate.gate_distance_m or gate.gate_angle_deg)
         if is_gated and registered is None:
             self._check_motion(scan, pose, gate)
-        prepared = self._filtered(scan, pose, laps) if begun is None else begun()
+        prepared = self._filtered(scan, pose, laps)
         if self.chain.filters:
             laps.end('filter')
             self._count_steps(prepared)
-        elif begun is not None and times is not None:
-            laps.end('deskew')
         if self._around.surfel_map.columns:
             self._check_columns(prepared.filtered)
         if registered is None:
@@ -214,11 +181,13 @@ class Preparation:
             laps.end('images')
         if not self.chain.filters:
             return Prepared(scan, scan, pose)
-        return filtered_scan(scan, pose, self.chain, self._poses.of_base(scan))
+        seen = replace(scan, T_base_sensor=self._poses.of_base(scan), T_map_sensor=pose)
+        filtered, steps = self.chain.run(seen)
+        return Prepared(scan, filtered, pose, steps)
 
     def _deskewed(self, scan: Scan) -> Scan:
         """Return a scan with all points in the sensor frame at its stamp."""
-        return scan if scan.times is None else self._poses.deskewing(scan, scan.times)()
+        return scan if scan.times is None else self._poses.deskewed(scan, scan.times)
 
     def _count_steps(self, prepared: Prepared) -> None:
         """Count what the filters did; raise if they left no points."""
@@ -291,26 +260,6 @@ class Preparation:
         T_map_last = self._around.window.last_pose(scan.frame_id)
         if T_map_last is not None and stands_still(T_map_last, pose, gate):
             raise ScanRefusedError(GATED)
-
-
-def filtered_scan(
-    scan: Scan, pose: Transform, chain: Chain, T_base_sensor: Transform | None
-) -> Prepared:
-    """
-    Return a deskewed scan filtered.
-
-    Filters that need the pose on the robot refuse None.
-
-    Raises
-    ------
-    FilterError
-        If a filter cannot work.
-
-    """
-    if not chain.filters:
-        return Prepared(scan, scan, pose)
-    filtered, steps = chain.run(replace(scan, T_base_sensor=T_base_sensor, T_map_sensor=pose))
-    return Prepared(scan, filtered, pose, steps)
 
 
 def stands_still(T_map_last: Transform, T_map_sensor: Transform, gate: WindowConfig) -> bool:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from surfel_mapper.alignment.registration import RegistrationResult
 from surfel_mapper.filters.chain import Step
 from surfel_mapper.geometry import Transform
-from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.scan import Scan
 
 
@@ -32,8 +31,6 @@ class Prepared:
         If poses come from registration to the map.
     T_fixed_body : (4, 4) float64, optional
         Pose of the tracked frame then.
-    windowed : WindowedScan or Exception, optional
-        Its moments at this pose, or the error of reducing it, if another thread has done so.
 
     """
 
@@ -43,4 +40,3 @@ class Prepared:
     steps: tuple[Step, ...] = ()
     registration: RegistrationResult | None = None
     T_fixed_body: Transform | None = None
-    windowed: WindowedScan | Exception | None = None

@@ -4,15 +4,13 @@
 ScanPipeline: the way of a scan from its stamp to its update; ``run`` is that sequence.
 
 Every stage is a module beside this one or a part below. All stages run in the thread that calls
-``run``, one scan after the other. With two ``map.threads`` another thread deskews, filters and
-reduces the next scan meanwhile (look_ahead.py).
+``run``, one scan after the other.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 import logging
 from typing import Any
@@ -20,14 +18,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.compilation import clock, CompileStage
+from surfel_mapper.compilation import CompileStage
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Counters, Laps
 from surfel_mapper.errors import (
     AlignmentError,
     CloudFormatError,
     MapError,
-    PoseError,
     ScanRefusedError,
 )
 from surfel_mapper.geometry import compose, inverse, Transform
@@ -48,14 +45,13 @@ from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.pipeline.drops import described, Drops, ScanOutcome
 from surfel_mapper.pipeline.layer_stack import LayerStack
 from surfel_mapper.pipeline.local_map import LocalMap
-from surfel_mapper.pipeline.look_ahead import LookAhead
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import has_own_frame, MapOrigin
 from surfel_mapper.pipeline.mapping_stages import warm_up_stages as map_stages
 from surfel_mapper.pipeline.preparation import moments_at, Preparation, reduced
 from surfel_mapper.pipeline.prepared import Prepared
 from surfel_mapper.pipeline.scan_images import ScanImages
-from surfel_mapper.pipeline.scan_poses import PosedScan, ScanPoses, ScanQueue
+from surfel_mapper.pipeline.scan_poses import ScanPoses, ScanQueue
 from surfel_mapper.pipeline.stamp_guard import Judged, Order, StampGuard
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.pipeline.window_aligner import Alignment, WindowAligner
@@ -120,28 +116,18 @@ class ScanPipeline:
         self._local_map: LocalMap | None = None
         if self.poses.registered is not None:
             self._keep_local_map()
-        threads = config.map.threads
-        self._look_ahead = LookAhead(self.map, threads) if threads > 1 else None
         fixed = config.frames.fixed
         own_frame = f'{fixed}_local' if has_own_frame(config) else fixed
         self.map_frame = config.align.map_frame or own_frame
         self.arrived: deque[Scan] = deque()
         self._unreported: tuple[int, list[npt.NDArray[np.int32]]] | None = None
-        self._clears_map, self._checks_units = False, True
+        self._checks_units = True
 
-    def run(self, more_follows: bool) -> Iterator[Update]:
-        """
-        Take the scans that arrived through all stages, in order; yield an update of each mapped.
-
-        Parameters
-        ----------
-        more_follows : bool
-            See Mapper.insert_ready.
-
-        """
+    def run(self) -> Iterator[Update]:
+        """Take the scans that arrived through all stages; yield an update of each mapped."""
         while self.arrived:  # each is used, held until the next message, or dropped
             self._settle(self.guard.judge(self.arrived.popleft()))
-        for laps, T_map_fixed, ready in self._ready(more_follows):
+        for laps, T_map_fixed, ready in self._ready():
             for prepared in ready:
                 inserted, update, alignment, results = None, None, None, dict[str, Any]()
                 try:
@@ -167,9 +153,9 @@ class ScanPipeline:
                     yield update
                 laps = Laps()
 
-    def _ready(self, more_follows: bool) -> Iterator[tuple[Laps, Transform, Sequence[Prepared]]]:
+    def _ready(self) -> Iterator[tuple[Laps, Transform, Sequence[Prepared]]]:
         """Yield scans deskewed, filtered and registered, with their times and T_map_fixed."""
-        while (posed := self._next_posed(more_follows)) is not None:
+        while posed := self.queue.next_posed(self.guard.newest_of, self.config.pose):
             laps = Laps()
             yield laps, self.aligner.T_map_fixed, self._prepared(*posed, laps)
         registered, aligner = self.poses.registered, self.aligner
@@ -252,12 +238,7 @@ class ScanPipeline:
             self.queue.push(message)
 
     def _start_anew(self, scan: Scan, back_s: float) -> None:
-        """
-        Clear the map after time was set back, and drop the poses of the time before.
-
-        Scans that have their poses are mapped first, so that the map does not depend on
-        ``more_follows``; those that wait for theirs are dropped.
-        """
+        """Clear the map after time was set back, and drop scans and poses of the time before."""
         reset_after_s = self.config.input.reset_after_s
         _log.warning(
             'scan in frame %s: time went back by %.3f s, more than input.reset_after_s '
@@ -268,47 +249,12 @@ class ScanPipeline:
         )
         self.counters.resets += 1
         self.queue.drop_waiting('cleared', 'the map was cleared')
-        self._clears_map = True
-        if not self.queue.posed:
-            self._clear_map()
+        self._clear_map()
         if self.poses.registered is not None:
             self.poses.registered.restart()
         newest_ns = self.poses.transforms.newest_ns
         if newest_ns is not None and (newest_ns - scan.stamp_ns) / 1e9 > reset_after_s:
             self.poses.transforms.clear()  # else the scan would be mapped at a pose of that time
-
-    def _next_posed(self, more_follows: bool) -> PosedScan | None:
-        """Return the next scan and its T_fixed_sensor; None until more input comes."""
-        posed = self.queue.posed
-        if self._clears_map and posed:  # of the time before time was set back
-            return posed.popleft()
-        if self._clears_map:
-            self._clear_map()
-        ahead = int(self._look_ahead is not None and self._can_look_ahead)
-        keeps = ahead if more_follows else 0
-        if self.queue.fill_posed(1 + ahead, self.guard.newest_of, self.config.pose) > keeps:
-            return posed.popleft()
-        if posed:
-            start = clock()
-            self._begin(*posed[0])
-            self.counters.add_seconds('reduce', clock() - start)
-        return None
-
-    @property
-    def _can_look_ahead(self) -> bool:
-        """Whether the next scan can be prepared while one is mapped."""
-        return self.config.map.mode != 'frozen' and self.preparation.is_independent
-
-    def _begin(self, scan: Scan, T_fixed_sensor: Transform) -> None:
-        """
-        Begin to prepare and reduce a scan in another thread.
-
-        Without the poses of its sweep nothing is begun; the scan is counted later.
-        """
-        assert self._look_ahead is not None, 'no scan has its pose early otherwise'
-        pose = self.aligner.to_map(T_fixed_sensor)
-        with suppress(PoseError):
-            self._look_ahead.begin(scan, pose, self.config, self.preparation.ahead)
 
     def _prepared(self, scan: Scan, T_fixed_sensor: Transform, laps: Laps) -> Sequence[Prepared]:
         """
@@ -318,13 +264,11 @@ class ScanPipeline:
         confirms it comes with those that have waited.
         """
         ready: Sequence[Prepared] = ()
-        pose, begun = T_fixed_sensor, None
+        pose = T_fixed_sensor
         if self.aligner.is_corrected:
             pose = self.aligner.to_map(T_fixed_sensor)
         try:
-            if self._look_ahead is not None:
-                begun = self._look_ahead.take(scan, pose, self.config)
-            ready = self.preparation.prepare(scan, pose, self.config, laps, begun)
+            ready = self.preparation.prepare(scan, pose, self.config, laps)
         except Exception as error:  # MemoryError too: the next scan may fit
             self.drops.failure(scan, error, laps.milliseconds)
         if not ready and len(laps.milliseconds) > 1:
@@ -335,18 +279,11 @@ class ScanPipeline:
         """Return a scan corrected by the alignments since its pose, those of scans before it."""
         T_fixed_sensor = compose(inverse(T_map_fixed), prepared.T_map_sensor)
         pose = self.aligner.to_map(T_fixed_sensor)
-        return replace(prepared, T_map_sensor=pose, windowed=None)
+        return replace(prepared, T_map_sensor=pose)
 
     def _reduced(self, prepared: Prepared, laps: Laps) -> WindowedScan:
-        """Return the moments of a scan; the next one is then prepared by another thread."""
-        windowed = prepared.windowed
-        if isinstance(windowed, Exception):
-            raise windowed
-        if windowed is None:
-            scan, pose = prepared.filtered, prepared.T_map_sensor
-            windowed = reduced(scan, pose, self.map, self.config)
-        if self.queue.posed:
-            self._begin(*self.queue.posed[0])
+        """Return the moments of a scan."""
+        windowed = reduced(prepared.filtered, prepared.T_map_sensor, self.map, self.config)
         laps.end('reduce')
         left_out = windowed.moments.left_out
         self.counters.points_left_out.update(left_out)
@@ -519,14 +456,13 @@ class ScanPipeline:
         """Drop all scans; see Mapper.clear."""
         self.judge_stamps()
         self._settle(self.guard.release())
-        self.queue.drop_all('cleared', 'the map was cleared')
+        self.queue.drop_waiting('cleared', 'the map was cleared')
         if self.poses.registered is not None:
             self.poses.registered.finish()
         self._clear_map()
 
     def _clear_map(self) -> None:
         """Empty map, window and layers, unless the map is frozen."""
-        self._clears_map = False
         self.poses.forget_mounts()
         if self.config.map.mode != 'frozen':
             self._empty()

@@ -37,7 +37,7 @@ from surfel_mapper.pipeline.stamp_guard import source_of
 from surfel_mapper.poses import MAX_TRANSFORMS, MountChanges, TransformBuffer
 from surfel_mapper.poses.buffer import FrameMove
 from surfel_mapper.scan import PointTimes, Scan
-from surfel_mapper.sensors.deskew import deskewing
+from surfel_mapper.sensors.deskew import deskewed
 
 MAX_SENSORS = 64
 """Frames of sensors that are kept; frame names may change without end."""
@@ -218,12 +218,12 @@ class ScanPoses:
             self.registered.predict(frame_id, times.first_ns)
             self.registered.predict(frame_id, times.last_ns)
 
-    def deskewing(self, scan: Scan, times: PointTimes) -> Callable[[], Scan]:
-        """Look up the poses within a sweep; return the function that deskews the scan."""
+    def deskewed(self, scan: Scan, times: PointTimes) -> Scan:
+        """Return a scan deskewed by the poses within its sweep."""
         fixed, sensor = self.fixed, scan.frame_id
         stamps = self.transforms.stamps(fixed, sensor, times.first_ns, times.last_ns)
         min_range_m = self._config.input.min_range_m
-        return deskewing(scan, partial(self._at, sensor), stamps, min_range_m)
+        return deskewed(scan, partial(self._at, sensor), stamps, min_range_m)
 
     def of_base(self, scan: Scan) -> Transform | None:
         """Return T_base_sensor at the stamp of a scan; None if unknown."""
@@ -266,7 +266,7 @@ PosedScan = tuple[Scan, Transform]
 
 class ScanQueue:
     """
-    A bounded queue of scans, and behind it the scans that have their poses.
+    A bounded queue of scans that wait for their poses.
 
     Parameters
     ----------
@@ -285,8 +285,6 @@ class ScanQueue:
         See above.
     waiting : deque of Scan
         The scans that wait for their poses.
-    posed : deque of (Scan, (4, 4) float64)
-        The next scans to map, and their T_fixed_sensor.
     ended : bool
         No poses come any more: a scan without one is dropped at once, for those behind it.
     is_open : bool
@@ -302,7 +300,6 @@ class ScanQueue:
         self._images = images
         self._drops = drops
         self.waiting: deque[Scan] = deque()
-        self.posed: deque[PosedScan] = deque()
         self.ended = False
         self.is_open = True
 
@@ -329,23 +326,21 @@ class ScanQueue:
         at = f'scan at {odd_ns / 1e9:.6f} s in frame {scan.frame_id!r}'
         self._drops.warn('odd_stamp', f'{at}: {reason}, but it is mapped')
 
-    def fill_posed(
-        self, number: int, newest_of: Callable[[Scan], int | None], config: PoseConfig
-    ) -> int:
+    def next_posed(
+        self, newest_of: Callable[[Scan], int | None], config: PoseConfig
+    ) -> PosedScan | None:
         """
-        Fill ``posed`` to a number of scans, if their poses are there; return its length.
+        Return the next scan whose pose is there, and drop those without; None until more comes.
 
         Parameters
         ----------
-        number : int
-            Length to fill it to.
         newest_of : callable
             Returns the newest stamp of scans that tells how long a scan has waited.
         config : PoseConfig
             Longest waits.
 
         """
-        while self.is_open and self.waiting and len(self.posed) < number:
+        while self.is_open and self.waiting:
             scan = self.waiting[0]
             pose_or_reason = self._pose_of(scan, newest_of(scan), config)
             if pose_or_reason is None:
@@ -354,19 +349,13 @@ class ScanQueue:
             if isinstance(pose_or_reason, str):
                 self._drops.scan(scan, 'no_pose', pose_or_reason)
             else:
-                self.posed.append((scan, pose_or_reason))
-        return len(self.posed)
+                return scan, pose_or_reason
+        return None
 
     def drop_waiting(self, cause: str, reason: str) -> None:
         """Drop every scan that waits for its pose."""
         while self.waiting:
             self._drops.scan(self.waiting.popleft(), cause, reason)
-
-    def drop_all(self, cause: str, reason: str) -> None:
-        """Drop every scan, with its pose or without."""
-        while self.posed:
-            self._drops.scan(self.posed.popleft()[0], cause, reason)
-        self.drop_waiting(cause, reason)
 
     def _pose_of(
         self, scan: Scan, newest_scan_ns: int | None, config: PoseConfig

@@ -279,7 +279,7 @@ class MappingThread:
             with self._mapper.guarded('a task between two scans'):
                 run_call(item)
         with self._mapper.guarded('mapping'):
-            for update in self._mapper.insert_ready(more_follows=self.num_clouds > 0):
+            for update in self._mapper.insert_ready():
                 with self._mapper.guarded('publishing'):
                     on_update(update)
         return True

@@ -147,14 +147,14 @@ def point_times(
     return PointTimes(offsets, scan.stamp_ns + first, scan.stamp_ns + last)
 
 
-def deskewing(
+def deskewed(
     scan: Scan,
     pose_at: Callable[[int], Transform],
     stamps_ns: Iterable[int] = (),
     min_range_m: float = 0.0,
-) -> Callable[[], Scan]:
+) -> Scan:
     """
-    Look up the poses within a sweep; return the function that deskews it, for another thread.
+    Return a scan with all points in the sensor frame at its stamp.
 
     Parameters
     ----------
@@ -169,9 +169,8 @@ def deskewing(
 
     Returns
     -------
-    callable
-        Returns the scan with the points in the same order, (N, 3) float64, all in the sensor frame
-        at the stamp; those without a time are nan.
+    Scan
+        The points in the same order, (N, 3) float64; those without a time are nan.
 
     """
     times = scan.times
@@ -183,22 +182,19 @@ def deskewing(
     to_stamp = inverse(pose_at(scan.stamp_ns) if at_stamp is None else at_stamp)
     transforms = np.ascontiguousarray([compose(to_stamp, pose)[:3] for pose in poses])
 
-    def move() -> Scan:
-        moved = np.empty((len(scan), 3), order='F')
-        move_points(
-            np.require(scan.points, None, ['F', 'A', 'W']).T,
-            times.offsets,
-            np.array(knots) - scan.stamp_ns,
-            transforms,
-            np.array([*turns, np.zeros(3)]),
-            min_range_m * min_range_m,
-            moved.T,
-        )
-        if times.offsets.min(initial=0) == UNTIMED:
-            moved[times.offsets == UNTIMED] = np.nan
-        return replace(scan, points=moved, times=None)
-
-    return move
+    moved = np.empty((len(scan), 3), order='F')
+    move_points(
+        np.require(scan.points, None, ['F', 'A', 'W']).T,
+        times.offsets,
+        np.array(knots) - scan.stamp_ns,
+        transforms,
+        np.array([*turns, np.zeros(3)]),
+        min_range_m * min_range_m,
+        moved.T,
+    )
+    if times.offsets.min(initial=0) == UNTIMED:
+        moved[times.offsets == UNTIMED] = np.nan
+    return replace(scan, points=moved, times=None)
 
 
 def warm_up() -> None:
@@ -213,7 +209,7 @@ def warm_up() -> None:
         times = point_times(scan, unit='ns', reference='epoch')
     for dtype in (np.float32, np.float64):
         points = scan.points.astype(dtype, order='F')
-        deskewing(replace(scan, points=points, times=times), lambda _: np.eye(4))()
+        deskewed(replace(scan, points=points, times=times), lambda _: np.eye(4))
 
 
 def readable(column: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -102,7 +102,7 @@ def test_a_stopped_replay_writes_the_scans_so_far(bag, tmp_path):
         stopped=lambda: len(done) >= 3,
     )
     assert result.summary['interrupted']
-    assert 3 <= result.summary['scans']['mapped'] <= 5  # two may be reduced ahead
+    assert result.summary['scans']['mapped'] == 3
 
     with pytest.raises(MapError, match='stopped before a scan was mapped'):
         replay(bag, output=tmp_path / 'none', stopped=lambda: True)
@@ -189,10 +189,8 @@ def test_the_trajectory_is_that_of_the_map_if_time_was_set_back():
     for stamp_s in (100, 101, 50, 52):
         points = np.full((5, 3), float(stamp_s), np.float32)
         mapper.add_scan(Scan(points=points, stamp_ns=stamp_s * 10**9, frame_id='lidar'))
-        for update in mapper.insert_ready(more_follows=True):
+        for update in mapper.insert_ready():
             trajectory.add(update)
-    for update in mapper.insert_ready():
-        trajectory.add(update)
     assert trajectory.stamps_ns == [50 * 10**9, 52 * 10**9]
     assert (len(trajectory.poses), mapper.map.num_points) == (2, 10)
 

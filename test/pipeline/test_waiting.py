@@ -204,15 +204,13 @@ def test_scans_that_wait_when_time_is_set_back_are_counted_as_cleared():
     assert_counts_add_up(mapper, waiting=3)
 
 
-@pytest.mark.parametrize('more_follows', [False, True])
-def test_scans_with_their_poses_are_mapped_before_time_is_set_back(more_follows):
-    mapper = mapper_with(pose__source='identity', map__threads=2, map__min_points=1)
+def test_scans_with_their_poses_are_mapped_before_time_is_set_back():
+    mapper = mapper_with(pose__source='identity', map__min_points=1)
     stamps_s = [100.0, 100.1, 100.2, 100.3, 1.0, 2.0, 3.0]
     updates = []
     for stamp_s in stamps_s:
         mapper.add_scan(scan_at(stamp_s))
-        updates += mapper.insert_ready(more_follows=more_follows)
-    updates += mapper.insert_ready()
+        updates += mapper.insert_ready()
     assert [update.stamp_ns / 1e9 for update in updates] == stamps_s
     assert mapper.counters.resets == 1
     assert len(mapper.window) == 3
@@ -298,9 +296,8 @@ def sweep_at(stamp_s):
     return replace(scan, columns={'t': np.linspace(0, 10**8, len(scan)).astype(np.uint32)})
 
 
-@pytest.mark.parametrize('threads', [1, 2])
-def test_a_sweep_with_a_gap_of_poses_in_its_middle_waits_for_them(threads, caplog):
-    mapper = mapper_with(pose__max_gap_s=0.03, deskew__enabled=True, map__threads=threads)
+def test_a_sweep_with_a_gap_of_poses_in_its_middle_waits_for_them(caplog):
+    mapper = mapper_with(pose__max_gap_s=0.03, deskew__enabled=True)
     early = [0.90 + 0.01 * step for step in range(13)]  # to 1.02
     late = [1.08 + 0.01 * step for step in range(13)]  # to 1.20
     for stamp_s in (*early, *late):

@@ -39,7 +39,7 @@ LAYERS = {
 }
 WITHOUT_POSES = {'pose.source': 'registration'}
 
-ONE_THREAD = {'map.threads': 1, 'layers.tsdf.threads': 1}
+ONE_THREAD = {'layers.tsdf.threads': 1}
 """No pool of threads is left in the process that forks."""
 
 VERBS = ('node', 'play', 'replay')

@@ -15,7 +15,7 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
 from surfel_mapper.sensors.deskew import (
-    deskewing,
+    deskewed,
     MAX_TURN_RAD,
     point_times,
     UNTIMED,
@@ -208,7 +208,7 @@ def test_times_count_from_the_stamp_in_whole_nanoseconds(call, dtype):
 
 def test_points_without_a_time_are_left_out():
     scan = sweep(np.array([0.0, np.nan, 0.1, np.inf]))
-    still = deskewing(scan.with_times(point_times(scan)), lambda _: np.eye(4))().points
+    still = deskewed(scan.with_times(point_times(scan)), lambda _: np.eye(4)).points
     assert np.isnan(still).all(axis=1).tolist() == [False, True, False, True]
     np.testing.assert_array_equal(still[[0, 2]], scan.points[[0, 2]])
 
@@ -252,7 +252,7 @@ def test_every_point_gets_the_pose_at_its_own_time(rate_hz, span_ms, dtype):
     times = scan.times
     stamps = buffer.stamps('odom', 'lidar', times.first_ns, times.last_ns)
 
-    found = deskewing(scan, pose_at(buffer), stamps)()
+    found = deskewed(scan, pose_at(buffer), stamps)
 
     to_stamp = inverse(pose_at(buffer)(START_NS))
     for point, offset, moved in zip(scan.points, times.offsets, found.points, strict=True):
@@ -270,14 +270,14 @@ def test_without_motion_no_point_moves():
         buffer.add('odom', 'lidar', START_NS + offset, pose)
     points = np.random.default_rng(1).normal(size=(50, 3))
     scan = with_times(points, np.arange(50) * MS, np.float64)
-    found = deskewing(scan, pose_at(buffer))()
+    found = deskewed(scan, pose_at(buffer))
     np.testing.assert_allclose(found.points, points, atol=1e-14)
 
 
 def test_points_without_a_return_or_too_near_are_not_moved():
     points = np.array([[0, 0, 0], [0.05, 0, 0], [np.nan, 1, 1], [1, 1, np.inf], [3, 0, 0]])
     scan = with_times(points, np.full(5, 90 * MS))
-    found = deskewing(scan, pose_at(moving(10)), min_range_m=0.1)().points
+    found = deskewed(scan, pose_at(moving(10)), min_range_m=0.1).points
     np.testing.assert_array_equal(found[:2], np.zeros((2, 3)))
     assert not np.isfinite(found[2:4]).all(axis=1).any()
     assert np.abs(found[4] - points[4]).max() > 1.0
@@ -291,7 +291,7 @@ def test_between_poses_far_apart_more_are_looked_up():
         half = 0.5 * (stamp_ns - START_NS) / 1e9  # 1 rad/s
         return pose_matrix([0, 0, 0], [0, 0, np.sin(half), np.cos(half)])
 
-    deskewing(with_times(np.ones((2, 3)), np.array([0, 100 * MS])), turning)
+    deskewed(with_times(np.ones((2, 3)), np.array([0, 100 * MS])), turning)
     assert len(set(asked)) >= 0.1 / MAX_TURN_RAD
     assert np.diff(sorted(set(asked))).max() <= MAX_TURN_RAD * 1e9
 

@@ -109,17 +109,16 @@ def test_infinite_points_free_the_space_before_them_and_missing_ones_do_not(noth
 
 
 @pytest.mark.parametrize(
-    ('threads', 'transpose'),
-    [(1, False), (2, False), (1, True)],
-    ids=['one thread', 'two threads', 'a row for each azimuth'],
+    'transpose',
+    [False, True],
+    ids=['a column for each azimuth', 'a row for each azimuth'],
 )
-def test_rays_without_a_return_are_deskewed_by_the_time_of_their_column(threads, transpose):
+def test_rays_without_a_return_are_deskewed_by_the_time_of_their_column(transpose):
     turning = np.array([0.3, -0.4, 1.5])  # rad/s
     settings = {
         'pose.source': 'odometry',
         'frames.base': 'lidar',
         'deskew.enabled': True,
-        'map.threads': threads,
         'map.min_points': 1,
         'layers.tsdf.enabled': True,
         'layers.tsdf.voxel_size_m': 0.2,
