@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         with shown_progress(args, 'message') as show:
             surveyed = survey(reader, lambda: show(next(read), total))
         made = offers(surveyed)
-        content = {**as_mapping(reader, surveyed, made), 'replay': chosen(args.bag)}
+        content = {**as_mapping(reader, surveyed, made), 'replay': chosen(reader)}
     show_lines(json.dumps(content) if args.json else report(printable(content), made))
     return CUT if args.strict and content['cut'] else 0
 
@@ -161,18 +161,18 @@ def replay_line(replay: dict[str, Any], path: Path) -> str:
     return f'{line}\n  surfel-mapper replay {shlex.quote(str(path))} --output {name}_map'
 
 
-def chosen(path: Path) -> dict[str, Any]:
+def chosen(reader: BagReader) -> dict[str, Any]:
     """Return the source of poses for a replay without settings, or why that is refused."""
     from surfel_mapper.config import Config
     from surfel_mapper.errors import BagError
-    from surfel_mapper.offline.recording import open_recording
+    from surfel_mapper.offline.bag_recording import BagRecording
     from surfel_mapper.offline.request import Request
 
     try:
-        with open_recording(Request(path=path), Config()) as recording:
-            description = recording.describe()
+        recording = BagRecording(reader, Request(path=reader.path), Config(), None)
     except BagError as error:  # several topics of clouds, or none: a topic has to be named
         return {'refused': str(error)}
+    description = recording.describe()
     return {name: description[name] for name in CHOICE}
 
 

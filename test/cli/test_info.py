@@ -76,12 +76,13 @@ def test_json_holds_the_same(tmp_path, capsys):
     ]
 
 
-def test_a_bag_that_is_cut_off_is_shown_as_far_as_it_goes(tmp_path, capsys):
+def test_a_bag_that_is_cut_off_is_shown_as_far_as_it_goes(tmp_path, capsys, caplog):
     path = write_mcap(tmp_path / 'a.mcap', drive())
     cut(path, 0.5)
 
     assert main(['info', str(path)]) == 0
     assert 'damaged: ' in capsys.readouterr().out
+    assert caplog.text.count('is cut off or damaged') == 1
     assert main(['info', str(path), '--strict', '--json']) == 3
     content = json.loads(capsys.readouterr().out)
     assert 'a.mcap: the file is cut off or damaged at byte ' in content['cut'][0]
