@@ -35,10 +35,11 @@ STAGES = (
     'tsdf',
     'models',
     'normals',
+    'clocks',
     'record',
     'total',
 )
-"""Timed stages in the order of a scan; ``total`` is all but reading, decoding and recording."""
+"""Timed stages in the order of a scan; ``total`` is all but read, decode, clocks and record."""
 
 LATEST = 1000
 """Number of scans whose times are kept for the percentiles."""

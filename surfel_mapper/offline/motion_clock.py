@@ -90,6 +90,8 @@ class MotionClock:
     ----------
     doubt : str
         That the poses have other motions than the scans, at any shift; empty if not.
+    is_used : bool
+        Whether poses with times come in; not with depth images.
 
     """
 
@@ -101,7 +103,7 @@ class MotionClock:
         config = mapper.config
         is_timed = self._path is None or self._path.has_stamps
         is_given = config.pose.source not in ('identity', 'registration')
-        self._is_used = is_timed and is_given and config.input.kind == 'cloud'
+        self.is_used = is_timed and is_given and config.input.kind == 'cloud'
         self._registration = Registration(replace(config.registration, search_deg=0.0), VOXEL_M)
         self._every = max(recording.num_scans // PAIRS, 1)
         self._topic = self._frame_id = ''
@@ -114,7 +116,7 @@ class MotionClock:
     def add(self, update: Update) -> None:
         """Note the pose of a scan, and align it to an earlier one if a pair is due."""
         scan, row = update.filtered, len(self._stamps_ns)
-        if not self._is_used or update.registration is not None:
+        if not self.is_used or update.registration is not None:
             return
         if not row:
             self._topic, self._frame_id = scan.topic, scan.frame_id

@@ -10,7 +10,7 @@ that maps nothing is an error, because an empty map looks like a result.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -156,11 +156,10 @@ def replay(
         mapper.outcomes, mapper.pose_source = [], recording.describe()['poses_from']
         history, motion_clock = History(), MotionClock(mapper, recording)
         with listeners(directory, options, mapper) as listening:
-            listen: list[Callable[[Update], object]] = [
-                partial(history.add, mapper),
-                motion_clock.add,
-                *listening,
-            ]
+            listen: dict[str, Sequence[Callable[[Update], object]]] = {
+                'clocks': [motion_clock.add] * motion_clock.is_used,
+                'record': [partial(history.add, mapper), *listening],
+            }
             mapper.derives = bool(listening)  # the files hold the surfels of the end
             start_s = clock()
             trajectory, was_stopped = mapped(recording, mapper, listen, progress, stopped)
@@ -235,7 +234,7 @@ def map_recording(
             config = config.replace({'map.voxel_size_m': voxel_size_m})
         mapper = started_mapper(with_loops(config, options, Path(scratch)))
         mapper.derives = False
-        mapped(recording, mapper, (), progress, lambda: False)
+        mapped(recording, mapper, {}, progress, lambda: False)
         refuse_empty(recording, mapper, was_stopped=False)
         align(mapper, options)
         figures = {**recording.describe(), **mapper.summary()}
@@ -422,18 +421,19 @@ def normals_bag(directory: Path, mapper: Mapper, files: ExitStack) -> NormalsBag
 def mapped(
     recording: Recording,
     mapper: Mapper,
-    listen: Sequence[Callable[[Update], object]],
+    listen: Mapping[str, Sequence[Callable[[Update], object]]],
     progress: Callable[[int, int], object],
     stopped: Callable[[], bool],
 ) -> tuple[ScanTrajectory, bool]:
-    """Map all scans; return their poses, and whether mapping was stopped."""
+    """Map all scans, listeners timed by stage; return the poses, and whether it was stopped."""
     trajectory, total = ScanTrajectory(mapper), recording.num_scans
     for update in recording.replay(mapper, stopped):
-        with mapper.counters.timed('record'):
-            trajectory.add(update)
-            for callback in listen:
-                callback(update)
-            progress(mapper.counters.received, total)
+        trajectory.add(update)
+        for stage, callbacks in listen.items():
+            with mapper.counters.timed(stage):
+                for callback in callbacks:
+                    callback(update)
+        progress(mapper.counters.received, total)
     return trajectory, stopped()
 
 

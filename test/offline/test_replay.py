@@ -157,7 +157,7 @@ def test_the_stages_are_parts_of_the_wall_time(bag, tmp_path):
     summary = replay(bag, output=tmp_path / 'out').summary
 
     stages = {name: s for name, s in summary['stage_s'].items() if name != 'total'}
-    assert {'read', 'decode', 'reduce', 'insert', 'normals', 'record'} <= set(stages)
+    assert {'read', 'decode', 'reduce', 'insert', 'normals', 'clocks', 'record'} <= set(stages)
     assert 0.0 < sum(stages.values()) <= summary['replay_s']
     line = next(line for line in as_text(summary, []).splitlines() if line.startswith('read '))
     means, _, mapping = line.partition(' a scan   ')
