@@ -47,7 +47,10 @@ DEFAULT = ('json',)
 """Formats without --formats."""
 
 SHORTCUTS = {
-    '--voxel-size': ('models.voxel_size_m', 'm (0.04; for a map half its voxel size)'),
+    '--voxel-size': (
+        'models.voxel_size_m',
+        'm (for a cloud 0.04 to 0.3 by its extent; for a map half its voxel size)',
+    ),
     '--noise': ('models.noise_m', 'sigma of the range of the sensor, m (lidar: 0.02)'),
     '--noise-per-range-sq': (
         'models.noise_per_range_sq',
@@ -55,6 +58,10 @@ SHORTCUTS = {
     ),
 }
 """Options for the settings that matter first."""
+
+SIZES_M, DISTANCE_VOXELS = (0.04, 0.3), 50
+"""Limits of the default voxel size for a cloud, m, and the number of voxels in the median distance
+of the points from their middle: frames of depth cameras get 0.04 m, a street 0.3 m."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -134,7 +141,6 @@ def read(
     args: argparse.Namespace,
 ) -> tuple[npt.NDArray[Any], float, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return points (N, 3), default voxel size, viewpoint (3,) and origin (3,) of the map, m."""
-    from surfel_mapper.config import ModelsConfig
     from surfel_mapper.files.pcd import read_viewpoint
     from surfel_mapper.models.fitting import above, surfel_points
 
@@ -148,7 +154,7 @@ def read(
         voxel_size_m, viewpoint = 0.5 * surfel_map.voxel_size_m, above(surfels)
     else:
         points = cloud_of(args)
-        voxel_size_m, viewpoint = ModelsConfig().voxel_size_m, np.zeros(3)
+        voxel_size_m, viewpoint = voxel_size_of(points), np.zeros(3)
         if args.cloud.suffix.lower() == '.pcd':
             viewpoint = np.array(read_viewpoint(args.cloud)[:3])
     if args.viewpoint is not None:
@@ -200,10 +206,20 @@ def cloud_of(args: argparse.Namespace) -> npt.NDArray[Any]:
     return np.ascontiguousarray(points)
 
 
+def voxel_size_of(points: npt.NDArray[Any]) -> float:
+    """Return the default voxel size for a cloud (N, 3), m."""
+    points = points[np.isfinite(points).all(axis=1) & points.any(axis=1)]  # 0, 0, 0: no return
+    if not len(points):
+        return SIZES_M[0]
+    distances_m = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return float(np.clip(round(float(np.median(distances_m)) / DISTANCE_VOXELS, 2), *SIZES_M))
+
+
 def figures(model: MultiModel, evaluation: Any, num_points: int) -> dict[str, Any]:
     """Return the figures of the report; None for undefined ones."""
     values = {
         'points': num_points,
+        'voxel_size_m': model.voxel_size_m,
         'thinned': model.num_thinned,
         'planes': evaluation.num_planes,
         'surfaces': evaluation.num_surfaces,
@@ -221,8 +237,8 @@ def report(content: dict[str, Any]) -> str:
     """Return the figures as two lines of text."""
     c = {name: float('nan') if value is None else value for name, value in content.items()}
     return (
-        f'points {c["points"]} (thinned to {c["thinned"]})   planes {c["planes"]}   '
-        f'surfaces {c["surfaces"]}   Gaussians {c["gaussians"]}\n'
+        f'points {c["points"]} (thinned to {c["thinned"]} in voxels of {c["voxel_size_m"]:g} m)   '
+        f'planes {c["planes"]}   surfaces {c["surfaces"]}   Gaussians {c["gaussians"]}\n'
         f'precision {1e3 * c["precision_rms_m"]:.1f} mm   '
         f'completeness {1e3 * c["completeness_rms_m"]:.1f} mm   '
         f'coverage {100 * c["coverage"]:.1f} %   '

@@ -82,6 +82,19 @@ def test_settings_are_options(tmp_path, capsys, size):
     assert figures['planes'] == 0 < figures['gaussians']
 
 
+@pytest.mark.parametrize(('side_m', 'voxel_size_m'), [(2.0, 0.04), (20.0, 0.16), (80.0, 0.3)])
+def test_default_voxels_follow_the_extent_of_a_cloud(tmp_path, capsys, side_m, voxel_size_m):
+    # half of a square of 20 m is within sqrt(2 / pi) * 10 m = 8.0 m of its middle
+    square = sheet(side_m, side_m, 0.01 * side_m, centre=(3.0, 0.0, 1.0)).astype(np.float32)
+    no_return = np.zeros((2 * len(square), 3), np.float32)
+    write_cloud(tmp_path / 'a.ply', np.concatenate([square, no_return]))
+    arguments = ['extract', str(tmp_path / 'a.ply'), '-o', str(tmp_path / 'out'), '--overwrite']
+    assert main([*arguments, '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['voxel_size_m'] == pytest.approx(voxel_size_m)
+    assert main([*arguments, '--voxel-size', '0.25']) == 0
+    assert 'in voxels of 0.25 m)' in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ('setting', 'message'),
     [
