@@ -89,7 +89,7 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     numbers, grids = np.diff(groups.starts), cells.grids()
     rms_m = rms_across(covariances, frames[:, 2], numbers)
     patches: list[Plane | None] = []
-    next_ids = [0, number - np.count_nonzero(curved)]
+    next_ids = [0, number - int(np.count_nonzero(curved))]
     for k, kind in enumerate(curved.astype(np.int64).tolist()):
         plane = Plane(
             id=next_ids[kind],
