@@ -43,8 +43,9 @@ Array = npt.NDArray[np.float64]
 PORT = 9876
 """Port of the window, that of rerun; one that is open there already is used."""
 
-PICKED = -0.5
-"""Radius of the point that is picked, which rerun takes as pixels since it is negative."""
+PICKED, SENSOR_RADIUS = -0.5, -4.0
+"""Radii of the point that is picked and of a sensor, which rerun takes as pixels since they are
+negative: in metres the sensor would be large in a room, or small in a street."""
 
 POINT_RADIUS_M = 0.02
 

@@ -26,7 +26,7 @@ from surfel_mapper.viz.contents import Content
 from surfel_mapper.viz.detail import DetailedMap
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
 from surfel_mapper.viz.framing import levelled
-from surfel_mapper.viz.scene import ORANGE, POINT_RADIUS_M, RED, Scene
+from surfel_mapper.viz.scene import ORANGE, POINT_RADIUS_M, RED, Scene, SENSOR_RADIUS
 
 Array = npt.NDArray[np.float64]
 
@@ -194,7 +194,7 @@ def show_way(scene: Scene, path: str, poses: Trajectory, origin_m: Array) -> str
     if poses.stamp_ns is None or not len(poses):
         return f'{counted(len(poses), "pose")} without stamps'
     scene.poses(f'{path}/sensor', poses.stamp_ns, xyz, poses.q_xyzw)
-    sensor = scene.rerun.Points3D(np.zeros((1, 3)), radii=0.3, colors=[ORANGE])
+    sensor = scene.rerun.Points3D(np.zeros((1, 3)), radii=SENSOR_RADIUS, colors=[ORANGE])
     scene.log(f'{path}/sensor', sensor, static=True)
     return f'{counted(len(poses), "pose")} over {np.ptp(poses.stamp_ns) / 1e9:.1f} s'
 

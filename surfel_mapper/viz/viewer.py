@@ -21,7 +21,14 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.messages.model_messages import quaternions
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
 from surfel_mapper.viz.framing import levelled
-from surfel_mapper.viz.scene import AROUND_M, ORANGE, POINT_RADIUS_M, RED, Scene
+from surfel_mapper.viz.scene import (
+    AROUND_M,
+    ORANGE,
+    POINT_RADIUS_M,
+    RED,
+    Scene,
+    SENSOR_RADIUS,
+)
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
@@ -115,7 +122,7 @@ class Viewer:
         scene.log('map/sensor/scan', scan)
         scene.log('map/trajectory', rerun.LineStrips3D([self._way()], colors=[RED]))
         window = np.array([scan.T_map_sensor[:3, 3] for scan in self._mapper.window])
-        poses = rerun.Points3D(window.reshape(-1, 3), radii=0.15, colors=[ORANGE])
+        poses = rerun.Points3D(window.reshape(-1, 3), radii=SENSOR_RADIUS, colors=[ORANGE])
         scene.log('map/window', poses)
         if whole:
             self._show_map()
