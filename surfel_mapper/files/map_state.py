@@ -4,10 +4,8 @@
 Saving and loading a map with its window, exactly: the digests before and after are equal.
 
 The file has the integers of every voxel, and for each scan of the window its moments, stamp, pose,
-frame and, if kept, points; so a loaded map continues as if it had never stopped. Without the
-frames, in files of earlier versions, those of all scans are empty; without numbers of scans a
-voxel gets those of the window, and one more if it holds further points. Files are not trusted:
-voxels and counts are checked, and the digest is compared.
+frame and, if kept, points; so a loaded map continues as if it had never stopped. Files are not
+trusted: voxels and counts are checked, and the digest is compared.
 """
 
 from __future__ import annotations
@@ -41,13 +39,10 @@ KIND = 'surfel map'
 FILE = 'map.npz'
 """Name of the file in the output directory of a replay."""
 
-NO_ORIGIN = (0.0, 0.0, 0.0)
-"""Origin of maps in files of before there were origins."""
-
 NAMES = ('key', 'count', 'total', 'product', 'view', 'channels')
 
 SCANS = 'num_scans'
-"""Name of the optional array of numbers of scans; without it there is one scan."""
+"""Name of the array of numbers of scans, which only the map has."""
 
 
 def save_map(
@@ -137,8 +132,6 @@ def load_map(
         for scan in scans:
             of_window.insert(scan.moments)
         check_held(surfel_map.moments(), of_window.moments())
-        if f'map.{SCANS}' not in arrays:
-            surfel_map = with_scans_of(surfel_map, of_window.moments())
     check_digest(path, attributes, surfel_map)
     return surfel_map, scans
 
@@ -156,7 +149,7 @@ def empty_map(
         stated_m,
         columns=tuple(attributes['columns']),
         level=attributes['level'],
-        origin_m=attributes.get('origin_m', NO_ORIGIN),
+        origin_m=attributes['origin_m'],
     )
 
 
@@ -165,23 +158,6 @@ def check_digest(path: str | Path, attributes: Mapping[str, Any], surfel_map: Su
     digest, stated = surfel_map.digest(), attributes.get('digest')
     if digest != stated:
         raise FileFormatError(f'{path}: damaged: digest {digest}, expected {stated}')
-
-
-def with_scans_of(surfel_map: SurfelMap, window: ScanMoments) -> SurfelMap:
-    """
-    Return a map of a file without numbers of scans, with those of its window.
-
-    If a voxel holds further points, they count as one scan more: it stays when the window leaves.
-    """
-    whole = surfel_map.moments()
-    rows = np.searchsorted(whole.key, window.key)
-    num_scans = np.zeros(len(whole), np.int64)
-    num_scans[rows] = window.scans
-    num_points = np.zeros(len(whole), np.int64)
-    num_points[rows] = window.count
-    counted = surfel_map.emptied()
-    counted.insert(replace(whole, num_scans=num_scans + (whole.count > num_points)))
-    return counted
 
 
 def check_held(whole: ScanMoments, kept: ScanMoments) -> None:
@@ -253,7 +229,7 @@ def _scans(
 ) -> list[WindowedScan]:
     """Return the scans of the window."""
     num_scans = _num_scans(arrays)
-    frame_ids = attributes.get('frame_ids', [''] * num_scans)
+    frame_ids = attributes['frame_ids']
     if not (isinstance(frame_ids, list) and all(isinstance(name, str) for name in frame_ids)):
         raise ValueError(f'frames of scans: {frame_ids!r:.60}, expected a list of names')
     if len(frame_ids) != num_scans:
@@ -283,19 +259,21 @@ def _scan(arrays: dict[str, npt.NDArray[Any]], number: int, surfel_map: SurfelMa
     )
 
 
+def names_of(prefix: str) -> tuple[str, ...]:
+    """Return the names of the moments under a prefix."""
+    return (*NAMES, SCANS) if prefix == 'map' else NAMES
+
+
 def _arrays(prefix: str, moments: ScanMoments) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of moments by their names in the file."""
-    names = [*NAMES, *([] if moments.num_scans is None else [SCANS])]
-    return {f'{prefix}.{name}': getattr(moments, name) for name in names}
+    return {f'{prefix}.{name}': getattr(moments, name) for name in names_of(prefix)}
 
 
 def _moments(
     arrays: dict[str, npt.NDArray[Any]], prefix: str, surfel_map: SurfelMap
 ) -> ScanMoments:
     """Return the moments under a prefix."""
-    columns = {name: arrays[f'{prefix}.{name}'] for name in NAMES}
-    if f'{prefix}.{SCANS}' in arrays:
-        columns[SCANS] = arrays[f'{prefix}.{SCANS}']
+    columns = {name: arrays[f'{prefix}.{name}'] for name in names_of(prefix)}
     return checked_moments(columns, surfel_map, prefix)
 
 

@@ -13,7 +13,7 @@ columns by name. Reading and writing are one module because they share the names
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 import json
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,6 @@ SUMS = ('sum_x', 'sum_y', 'sum_z')
 PRODUCTS = ('sum_xx', 'sum_xy', 'sum_xz', 'sum_yy', 'sum_yz', 'sum_zz')
 VIEWS = ('view_x', 'view_y', 'view_z')
 SCANS = 'num_scans'
-"""Missing in files of earlier versions: one scan for each voxel then."""
 DERIVED = ('x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity', 'curvature')
 """With the columns of QUALITY and COVARIANCE the derived columns, which are not read."""
 
@@ -112,9 +111,8 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
         content = parquet.ParquetFile(file)
         attributes = read_attributes(path, content.schema_arrow.metadata or {})
         surfel_map = empty_map(path, attributes, voxel_size_m)
-        in_file = content.schema_arrow.names
-        names = moment_names(surfel_map, in_file)
-        unknown = {*in_file} - {*names, *DERIVED, *QUALITY, *COVARIANCE}
+        names = moment_names(surfel_map)
+        unknown = {*content.schema_arrow.names} - {*names, *DERIVED, *QUALITY, *COVARIANCE}
         if unknown:
             raise ValueError(f'unknown columns {sorted(unknown)}')
         columns = moment_columns(content.read(columns=[*names]), surfel_map)
@@ -190,11 +188,10 @@ def channel_columns(surfel_map: SurfelMap) -> tuple[str, ...]:
     return tuple(f'sum_{name}' for name in channel_names(surfel_map.columns))
 
 
-def moment_names(surfel_map: SurfelMap, in_file: Sequence[str]) -> tuple[str, ...]:
+def moment_names(surfel_map: SurfelMap) -> tuple[str, ...]:
     """Return the names of the columns of a file from which a map is rebuilt."""
-    scans = (SCANS,) if SCANS in in_file else ()
     channels = channel_columns(surfel_map)
-    return (*INDEX, 'num_points', *scans, *SUMS, *PRODUCTS, *VIEWS, *channels)
+    return (*INDEX, 'num_points', SCANS, *SUMS, *PRODUCTS, *VIEWS, *channels)
 
 
 def read_attributes(path: str | Path, metadata: Mapping[bytes, bytes]) -> dict[str, Any]:
@@ -228,11 +225,10 @@ def moment_columns(table: Any, surfel_map: SurfelMap) -> Columns:
             np.array(columns, np.int64).reshape(len(names), table.num_rows).T
         )
 
-    has_scans = SCANS in table.column_names
     return {
         'key': pack_keys(stacked(INDEX)),
         'count': int64_column(table, 'num_points'),
-        SCANS: int64_column(table, SCANS) if has_scans else np.ones(table.num_rows, np.int64),
+        SCANS: int64_column(table, SCANS),
         'total': stacked(SUMS),
         'product': stacked(PRODUCTS),
         'view': stacked(VIEWS),

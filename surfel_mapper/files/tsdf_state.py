@@ -121,7 +121,6 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
 def checked(blocks: BlockMap, arrays: dict[str, npt.NDArray[Any]]) -> Blocks:
     """Return the content of a file; raise ValueError if it is impossible."""
     count = len(arrays['index'])
-    arrays.pop('stamps', None)  # none, in files of earlier versions
     if unknown := sorted({*arrays} - {*ARRAYS}):
         raise ValueError(f'unknown arrays {unknown}')
     for name, dtype in ARRAYS.items():

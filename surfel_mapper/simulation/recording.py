@@ -144,9 +144,7 @@ def load_simulation(path: str | Path) -> Simulation:
     with refusing(file):
         document = json.loads(read_small_file(file))
         try:
-            course = _tuples(document['drive'])
-            course.pop('corners', None)  # of earlier versions, which had routes
-            lidar, drive = Lidar(**_tuples(document['lidar'])), Drive(**course)
+            lidar, drive = Lidar(**_tuples(document['lidar'])), Drive(**_tuples(document['drive']))
             return Simulation(
                 world, lidar, drive, num_scans=document['num_scans'], rolling=document['rolling']
             )
