@@ -44,7 +44,7 @@ RULES = float(LEAST_POINTS), LEAST_SHARE, CLOSED_BY
 
 
 def covered(
-    model: MultiModel, points: npt.NDArray[Any], view: Array, numbers: Indices | None = None
+    model: MultiModel, points: npt.NDArray[Any], numbers: Indices, view: Array
 ) -> MultiModel:
     """
     Return models whose dense patches cover cells of one voxel.
@@ -55,10 +55,10 @@ def covered(
         Models of the points; the ids of patches are 0, 1, 2, ... in order.
     points : (N, 3) float32 or float64, m
         The points of the labels.
+    numbers : (N,) int64
+        Number of points of the cloud that each stands for.
     view : (3,) float64, m
         Position of the sensor.
-    numbers : (N,) int64, optional
-        Number of points of the cloud that each stands for; 1 if omitted.
 
     """
     patches, pitch_m = model.patches, model.voxel_size_m
@@ -68,6 +68,7 @@ def covered(
     grids = cells_over([patch.grid for patch in patches], pitch_m)
     total = grids[0][-1] + grids[2][-1].prod()
     counts, weights, filled = np.zeros(total, np.int64), np.zeros(total), np.zeros(total, np.uint8)
+    points = np.ascontiguousarray(points, np.float64)  # one kernel for both types
     count_points(points, model.labels, frames, view, grids, pitch_m, counts, weights, numbers)
     gaps, coarse = np.empty(len(patches)), inner_cells([patch.grid for patch in patches])
     cover_cells(counts, weights, grids, pitch_m, coarse, RULES, filled, gaps)

@@ -196,8 +196,8 @@ def fit_points(fine: Thinned, config: ModelsConfig, view: Array, laps: list[floa
         fitted = owner_patches(joined, config, view)
     model = owner_models(thinned, voxels, joined, fitted, config)
     if not is_parted:
-        return covered(model, fine.points, view)
-    model = covered(model, fine.means, view, np.diff(fine.starts))
+        return covered(model, fine.points, np.ones(len(fine.points), np.int64), view)
+    model = covered(model, fine.means, np.diff(fine.starts), view)
     return replace(model, labels=fine.point_labels(model.labels))
 
 

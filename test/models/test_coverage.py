@@ -26,25 +26,26 @@ def covering(points, config=CONFIG, view=VIEW):
 
 def test_counts_and_weights_are_those_of_a_loop_over_points():
     rng = np.random.default_rng(0)
-    points = rng.uniform(-1.0, 1.0, (500, 3)).astype(np.float32)
+    points, numbers = rng.uniform(-1.0, 1.0, (500, 3)), rng.integers(1, 28, 500)
     label = rng.integers(-1, 3, 500).astype(np.int32)
     frames = np.array([[*np.roll(np.eye(3), k, axis=0), [0.1, 0.0, -0.2]] for k in range(2)])
     view, pitch = np.array([0.0, 0.5, 3.0]), 0.25
     corners, sizes = np.array([[-1.25, -1.0], [-0.5, -1.25]]), np.array([[9, 9], [5, 10]])
     first = np.array([0, 81])
     counts, weights = np.zeros(131, np.int64), np.zeros(131)
-    count_points(points, label, frames, view, (first, corners, sizes), pitch, counts, weights)
+    grids = first, corners, sizes
+    count_points(points, label, frames, view, grids, pitch, counts, weights, numbers)
 
     expected, sums = np.zeros(131, np.int64), np.zeros(131)
-    for point, k in zip(points.astype(float), label, strict=True):
+    for point, k, number in zip(points, label, numbers, strict=True):
         if k in (0, 1):
             local = frames[k, :2] @ (point - frames[k, 3])
             x, y = np.floor((local - corners[k]) / pitch).astype(int)
             if 0 <= x < sizes[k, 0] and 0 <= y < sizes[k, 1]:
-                expected[first[k] + x * sizes[k, 1] + y] += 1
-                sums[first[k] + x * sizes[k, 1] + y] += np.linalg.norm(point - view) ** 3
+                expected[first[k] + x * sizes[k, 1] + y] += number
+                sums[first[k] + x * sizes[k, 1] + y] += number * np.linalg.norm(point - view) ** 3
     assert (counts == expected).all()
-    assert counts.sum() < np.isin(label, (0, 1)).sum()  # some lie beyond the grids
+    assert counts.sum() < numbers[np.isin(label, (0, 1))].sum()  # some lie beyond the grids
     np.testing.assert_allclose(weights, sums)
 
 

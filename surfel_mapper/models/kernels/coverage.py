@@ -10,11 +10,11 @@ from surfel_mapper.kernels.compiling import kernel
 
 
 @kernel(error_model='numpy')
-def count_points(points, label, frames, view, grids, pitch, counts, weights, numbers=None):
+def count_points(points, label, frames, view, grids, pitch, counts, weights, numbers):
     """
     Count the points in each cell, and sum the cubes of their distances from the sensor.
 
-    points   (N, 3), each of which stands for numbers (N,) of points, or for one
+    points   (N, 3) float64, each of which stands for numbers (N,) int64 of points
     label    (N,) int32, patch of each point; others belong to none
     frames   (K, 4, 3) float64, x, y, z and origin of each patch
     view     (3,) float64, m, position of the sensor
@@ -37,9 +37,8 @@ def count_points(points, label, frames, view, grids, pitch, counts, weights, num
             column, row = np.int64(np.floor(x * per_m)), np.int64(np.floor(y * per_m))
             if 0 <= column < sizes[k, 0] and 0 <= row < sizes[k, 1]:
                 cell = first[k] + column * sizes[k, 1] + row
-                number = 1 if numbers is None else numbers[i]
-                counts[cell] += number
-                weights[cell] += number * range_sq * np.sqrt(range_sq)
+                counts[cell] += numbers[i]
+                weights[cell] += numbers[i] * range_sq * np.sqrt(range_sq)
 
 
 @kernel(error_model='numpy')
