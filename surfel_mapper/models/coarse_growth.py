@@ -20,14 +20,17 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
+from surfel_mapper.models.frames import plane_frames
 from surfel_mapper.models.growth import (
     add_facets,
     extend_planes,
     owner_table,
     pieces_of,
+    sorted_table,
     VoxelPoints,
 )
 from surfel_mapper.models.joining import join_patches, Pieces
+from surfel_mapper.models.kernels.growth import count_beside
 from surfel_mapper.models.thinning import thin
 
 Array = npt.NDArray[np.float64]
@@ -46,6 +49,16 @@ COARSE_STEEPEST_DEG = 50.0
 """
 Slope of a surface that is joined here, at most. A map has all sides of an object, and less steep
 surfaces continue each other better. Coarse voxels join the walls of a hall otherwise.
+"""
+
+MOST_BESIDE = 0.5
+"""Free points beside a facet by those on it, at most; see models/kernels/growth.py."""
+
+SCATTER_SHARE, SCATTER_SIGMAS, LEAST_SCATTER_VOXELS, SCATTER_WIDTH_VOXELS = 0.15, 3.0, 0.45, 0.75
+"""
+A plane is in scatter, as in a tree crown, if each side of it has more than this share of the
+points on it. These are as near as that number of sigmas, at least of voxels. Points are counted
+within the last distance of each mean of the plane, in voxels.
 """
 
 SPARSE_SHARE = 0.05
@@ -111,7 +124,7 @@ def grow_coarse(
         extend_planes(coarse, new_owner, curved, (size_m, rules.tolerance_m))
     if facets is not None:
         sizes = size_m, facet_tolerance(coarse, new_owner, size_m, rules)
-        facet_normals = add_facets(coarse, new_owner, len(normals), sizes, facets)
+        facet_normals = add_facets(coarse, new_owner, len(normals), sizes, facets, MOST_BESIDE)
         normals = np.concatenate([normals, facet_normals])
         curved = np.append(curved, np.zeros(len(facet_normals), np.bool_))
     owner[coarse.rows] = np.where(new_owner < 0, old_owner, new_owner)
@@ -160,6 +173,24 @@ def join_coarse(pieces: Pieces, owner: Owners, shape: Shape, rules: CoarseRules)
     curved = bent | (2.0 * np.bincount(index, number * curved, len(joined)) > total)
     owner[:] = np.where(patch < 0, owner, np.append(index, 0)[patch])
     return joined, curved
+
+
+def in_scatter(
+    voxels: VoxelPoints, owner: Owners, curved: npt.NDArray[np.bool_], size_m: float
+) -> npt.NDArray[np.bool_]:
+    """Return which patches (K,) are planes through scatter, such as leaves; voxels of size_m."""
+    number = len(curved)
+    table = owner_table(voxels, owner)
+    starts, _, points, weights = sorted_table(table, 0, number)
+    _, normals, values = plane_frames(points, weights, starts)
+    sigma = np.sqrt(np.maximum(values[:, 0], 0.0))
+    tolerance = np.maximum(SCATTER_SIGMAS * sigma, LEAST_SCATTER_VOXELS * size_m)
+    sides = np.zeros((number, 3), np.int64)
+    width_m = SCATTER_WIDTH_VOXELS * size_m
+    state = voxels.points, voxels.starts, voxels.adjacent, (table[0], table[1], table[3])
+    count_beside(*state, normals, tolerance, width_m, sides)
+    scattered: npt.NDArray[np.bool_] = sides[:, 1:].min(axis=1) > SCATTER_SHARE * sides[:, 0]
+    return scattered & ~curved
 
 
 def facet_tolerance(

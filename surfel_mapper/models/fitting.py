@@ -32,6 +32,7 @@ from surfel_mapper.models.coarse_growth import (
     CoarseRules,
     gap_pieces,
     grow_coarse,
+    in_scatter,
     join_coarse,
     SPARSE_SHARE,
 )
@@ -63,6 +64,7 @@ _log = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+Owners = npt.NDArray[np.int32]
 
 SIZES = (0.5, 2.0, 4.0, 8.0, 16.0, 64.0, 128.0)
 """
@@ -187,7 +189,7 @@ def fit_points(fine: Thinned, config: ModelsConfig, view: Array, laps: list[floa
     growth = grow(voxels, thinned.means, label, group, charts, config, view)
     joined = growth
     if config.noise_per_range_sq < LEAST_DISPARITY_NOISE:
-        joined = grow_sparse(thinned, voxels, growth, config, view)
+        joined = grow_sparse(thinned, voxels, growth, group, config, view)
     laps.append(clock())
     fitted = owner_patches(joined, config, view)
     lost = np.array([patch is None for patch in fitted], np.bool_)
@@ -202,9 +204,18 @@ def fit_points(fine: Thinned, config: ModelsConfig, view: Array, laps: list[floa
 
 
 def grow_sparse(
-    thinned: Thinned, voxels: VoxelPoints, growth: Grown, config: ModelsConfig, view: Array
+    thinned: Thinned,
+    voxels: VoxelPoints,
+    growth: Grown,
+    group: Owners,
+    config: ModelsConfig,
+    view: Array,
 ) -> Grown:
-    """Find facets in finer, then in coarser voxels while many points are on no patch; join all."""
+    """
+    Find facets in finer, then in coarser voxels while many points are on no patch; join all.
+
+    Planes in scatter are taken out: their points are those of groups, (V,) by voxel.
+    """
     noise = config.noise_m, config.noise_per_range_sq
     rules = CoarseRules(config.voxel_size_m, growth.tolerance_m, noise, view)
     shape, owner = (growth.normals, growth.curved), growth.owner.copy()
@@ -218,8 +229,15 @@ def grow_sparse(
             size_m = max(size_m, config.voxel_size_m)
             pieces = gap_pieces(voxels, owner, len(shape[0]), size_m)
             shape = join_coarse(pieces, owner, shape, rules)
-    if shape[0] is growth.normals:
+    keeps = ~in_scatter(voxels, owner, shape[1], config.voxel_size_m)
+    if shape[0] is growth.normals and keeps.all():
         return growth
+    index = np.where(keeps, np.cumsum(keeps) - 1, -1).astype(np.int32)
+    rows = np.flatnonzero(owner >= 0)
+    owner[rows] = index[owner[rows]]
+    freed = rows[owner[rows] < 0]
+    owner[freed] = -1 - np.repeat(group, np.diff(voxels.starts))[freed]
+    shape = shape[0][keeps], shape[1][keeps]
     return grown(owner, owner_table(voxels, owner), *shape, growth.tolerance_m)
 
 

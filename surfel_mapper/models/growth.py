@@ -326,11 +326,12 @@ def add_facets(
     number: int,
     sizes: tuple[float, float],
     config: ModelsConfig,
+    most_beside: float = math.inf,
 ) -> Array:
     """
     Grow facets from free points, write their owners, from number on, and return their normals.
 
-    sizes: edge of the voxels and tolerance, m
+    sizes: edge of the voxels and tolerance, m; most_beside: free points beside by those on a facet
     """
     size_m, tolerance_m = sizes
     free = free_surfels(voxels, owner, size_m, tolerance_m)
@@ -340,6 +341,7 @@ def add_facets(
         max(FACET_POINTS, config.min_surface_points),
         math.cos(math.radians(FACET_ANGLE_DEG)),
         FACET_WIDTH_VOXELS * size_m,
+        most_beside,
     )
     planes = np.empty((number + MOST_FACETS, 4))
     state = voxels.points, voxels.starts, voxels.adjacent

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ConfigError, ModelError
@@ -330,20 +331,27 @@ def test_faces_narrower_than_two_voxels_are_patches():
 
 
 @pytest.mark.parametrize(
-    ('name', 'share', 'residual_mm'),
+    ('name', 'flat', 'scatter', 'residual_mm'),
     [
-        ('velodyne_vls128_street', 0.87, 150.0),
-        ('ouster_os0_128', 0.86, 60.0),
-        ('pcl_room_scan2', 0.94, 35.0),
+        ('velodyne_vls128_street', 0.95, 0.33, 150.0),
+        ('ouster_os0_128', 0.94, 0.25, 60.0),
+        ('ouster_os2_128', 0.94, 0.25, 60.0),
+        ('pcl_room_scan2', 0.96, 0.4, 35.0),
     ],
 )
-def test_most_points_of_real_scans_are_on_patches(data_folder, name, share, residual_mm):
+def test_flat_points_of_real_scans_are_on_patches_and_leaves_are_not(
+    data_folder, name, flat, scatter, residual_mm
+):
     (file,) = (data_folder / 'data' / 'scans').glob(f'{name}.*')
     points = np.asarray(read_scan(file)[0], np.float32).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
     model = fit(points, ModelsConfig(voxel_size_m=0.3))
     patch = np.where(model.labels < len(model.patches), model.labels, -1)
-    assert (patch >= 0).mean() > share
+    near = points[cKDTree(points).query(points, 20)[1]].astype(np.float64)
+    near -= near.mean(axis=1, keepdims=True)
+    least, _, most = np.linalg.eigvalsh(np.einsum('nki,nkj->nij', near, near) / 20).T
+    assert (patch[least < 0.02 * most] >= 0).mean() > flat
+    assert (patch[(least > 0.1 * most) & (least > 0.1**2)] >= 0).mean() < scatter
     squares = 0.0
     for number in np.unique(patch[patch >= 0]):
         own = points[patch == number].astype(np.float64)

@@ -6,7 +6,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfel_mapper.models.coarse_growth import CoarseRules, gap_pieces, grow_coarse, join_coarse
+from surfel_mapper.models.coarse_growth import (
+    CoarseRules,
+    gap_pieces,
+    grow_coarse,
+    in_scatter,
+    join_coarse,
+)
 from surfel_mapper.models.growth import extend_planes
 from surfel_mapper.models.thinning import thin
 
@@ -54,6 +60,24 @@ def test_planes_grow_over_single_points_far_apart():
     np.testing.assert_array_equal(owner[: len(near)], near[:, 0] > 16.0)
     assert (owner[len(near) : -len(above)] >= 0).mean() > 0.9
     assert (owner[-len(above) :] == -1).all()
+
+
+def test_a_plane_is_in_scatter_if_points_of_any_patch_are_on_both_sides():
+    rng = np.random.default_rng(6)
+    parts = []
+    for place, heights in enumerate([(0.0,), (0.0, 0.4), (0.0, 0.4, -0.4), (0.0, 0.1, -0.1)]):
+        for height in heights:
+            xy = rng.uniform([10.0 * place, 0.0], [10.0 * place + 3.0, 3.0], (600, 2))
+            parts.append(np.column_stack([xy, height + 0.05 * rng.standard_normal(600)]))
+    voxels = thin(np.concatenate(parts), 0.5).by_voxel()
+    owner = np.repeat(np.arange(9, dtype=np.int32), 600)[voxels.rows]
+    curved = np.zeros(9, np.bool_)
+    # points of other patches count, those within three sigmas are on the plane
+    assert np.flatnonzero(in_scatter(voxels, owner, curved, 0.5)).tolist() == [3]
+    owner[owner > 3] = -1  # so do those of none
+    assert np.flatnonzero(in_scatter(voxels, owner, curved, 0.5)).tolist() == [3]
+    curved[3] = True
+    assert not in_scatter(voxels, owner, curved, 0.5).any()
 
 
 def test_wide_patches_of_one_plane_are_joined_across_a_gap():

@@ -37,10 +37,10 @@ FREE = -1
 ROUNDS = 3
 """A facet is grown this many times, each time from the plane of the previous result."""
 
-BESIDE, MOST_BESIDE = 3.0, 0.5
+BESIDE = 3.0
 """
-Free points of its voxels up to BESIDE tolerances beside a facet, by those on it, at most. In
-scatter they are twice as many.
+Points are beside a patch up to this number of tolerances. In scatter they are twice as many as the
+points on it.
 """
 
 LARGE_REGION = 100
@@ -208,13 +208,13 @@ def find_facets(points, starts, adjacent, free, order, rules, owner, planes, num
                 points of each voxel; count and flat are consumed
     order       (S,) int64, voxels in the order in which they are seeds
     rules       tolerance m; least voxels; least points; least cosine of the normals of a flat
-                voxel and the facet; least width, m
+                voxel and the facet; least width, m; free points beside by points on it, at most
     owner       (P,) int32, in place
     planes      (K, 4) float64, of patches and facets; facets are appended
     num_planes  planes that exist
     """
     count, flat, mean, normal = free
-    tolerance, least_voxels, least_points, _, least_width = rules
+    tolerance, least_voxels, least_points, _, least_width, most_beside = rules
     marks = np.zeros((3, len(count)), np.int64)
     visited, region, rejected = marks[0], marks[1], marks[2]
     plane, start, sums = np.empty(4), np.empty(3), np.empty(11)
@@ -247,7 +247,7 @@ def find_facets(points, starts, adjacent, free, order, rules, owner, planes, num
                 mark,
             )
             is_small = sums[0] < least_points or size < least_voxels
-            is_small |= sums[10] > MOST_BESIDE * sums[0]
+            is_small |= sums[10] > most_beside * sums[0]
             if not is_small:
                 plane_of(sums, sums[0], value, axes)
                 is_small = math.sqrt(12.0 * max(value[1], 0.0)) < least_width
@@ -302,7 +302,7 @@ def grow_facet(
     """
     first, rows = adjacent
     count, flat, mean, normal = free
-    tolerance, _, _, least_cosine, _ = rules
+    tolerance, _, _, least_cosine, _, _ = rules
     value, axes, centre = np.empty(3), np.empty((3, 3)), np.empty(3)
     sums[:] = 0.0
     region[0], visited[seed] = seed, mark
@@ -340,3 +340,38 @@ def grow_facet(
                 region[size] = v
                 size += 1
     return size
+
+
+@kernel(error_model='numpy')
+def count_beside(points, starts, adjacent, table, normals, tolerance, width, counts):
+    """
+    Count the points on each patch and on both sides of it, whichever patch owns them.
+
+    adjacent   of grow_patches
+    table      owners (M,) int32, means (M, 3) and first (V + 1,) of owner_means
+    normals    (K, 3) float64, of the patches
+    tolerance  (K,) float64, m
+    width      distance of points from a mean along the patch, at most, m
+    counts     (K, 3) int64, zeros; out: points on the patch, below, above
+    """
+    first, rows = adjacent
+    owners, means, begin = table
+    for v in range(len(starts) - 1):
+        for k in range(begin[v], begin[v + 1]):
+            patch = owners[k]
+            if patch < 0:
+                continue
+            for j in range(first[v] - 1, first[v + 1]):
+                u = v if j < first[v] else rows[j]
+                for i in range(starts[u], starts[u + 1]):
+                    x = points[i, 0] - means[k, 0]
+                    y = points[i, 1] - means[k, 1]
+                    z = points[i, 2] - means[k, 2]
+                    height = x * normals[patch, 0] + y * normals[patch, 1] + z * normals[patch, 2]
+                    away = abs(height)
+                    if x * x + y * y + z * z - away * away > width * width:
+                        continue
+                    if away <= tolerance[patch]:
+                        counts[patch, 0] += 1
+                    elif away <= BESIDE * tolerance[patch]:
+                        counts[patch, 1 + int(height > 0.0)] += 1
