@@ -236,6 +236,7 @@ def summed_moments(chunks: Sequence[ScanMoments]) -> ScanMoments:
         total=total if largest > FULL else total.astype(np.int32),
         product=summed('product'),
         view=view,
+        channels=None,
         left_out={
             cause: sum(chunk.left_out.get(cause, 0) for chunk in chunks) for cause in causes
         },

@@ -16,6 +16,7 @@ import pytest
 
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.mapping.moments import check_arrays
 from surfel_mapper.mapping.reducer import Reducer
 from test.reference import as_twin, scan_moments
 
@@ -217,6 +218,9 @@ def test_a_scan_with_a_full_voxel_is_summed_as_any_other():
     twin = scan_moments(points, 0.5, origin)
     assert max(row[0] for row in twin.values()) > 65536
     assert as_twin(moments) == twin
+    plain = Reducer(0.5).reduce(points[::-1], origin=origin)  # its last part has a voxel more
+    check_arrays(plain)  # raises unless every array has a row for each voxel
+    assert as_twin(plain) == twin
     assert list(map(tuple, moments.voxel_index.tolist())) == list(twin)
     assert moments.left_out == {'not_finite': 8}
     finite = np.isfinite(points).all(axis=1)
