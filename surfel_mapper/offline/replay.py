@@ -157,7 +157,7 @@ def replay(
         history, motion_clock = History(), MotionClock(mapper, recording)
         with listeners(directory, options, mapper) as listening:
             listen: dict[str, Sequence[Callable[[Update], object]]] = {
-                'clocks': [motion_clock.add] * motion_clock.is_used,
+                **({'clocks': [motion_clock.add]} if motion_clock.is_used else {}),
                 'record': [partial(history.add, mapper), *listening],
             }
             mapper.derives = bool(listening)  # the files hold the surfels of the end

@@ -116,6 +116,8 @@ def uncertain_text(summary: Mapping[str, Any]) -> str:
             'the map has no surfels: no voxel has map.min_points points. Are the points not in '
             'metres, or the voxels too small?'
         )
+    if num_errors := summary.get('messages_ignored', {}).get('internal_error'):
+        texts.append(f'{counted(num_errors, "internal error")}: report them with the log of -vv')
     clocks = [offset['text'] for offset in summary.get('clock_offsets', [])]
     return '\n'.join(filter(None, [*texts, *clocks]))
 
@@ -175,7 +177,7 @@ def apart_text(summary: Mapping[str, Any]) -> str:
     )
     return (
         f'{num_scans} of {summary["scans"]["received"]} scans have no certain place on the map; '
-        f'{tracking["parts_apart"]} maps of their own: {spans}'
+        f'{counted(tracking["parts_apart"], "separate map")}: {spans}'
     )
 
 

@@ -10,6 +10,7 @@ from plyfile import PlyData
 import pytest
 
 from surfel_mapper.cli.main import main
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.bags.recorded import (
     CLOUD,
     cut,
@@ -76,6 +77,15 @@ def test_json_prints_the_summary_alone(bag, tmp_path, capsys):
     assert main(['replay', str(bag), '--json', '--output', str(tmp_path)]) == 0
 
     assert json.loads(capsys.readouterr().out) == summary_of(tmp_path)
+
+
+def test_internal_errors_of_mapped_scans_are_no_success(bag, tmp_path, monkeypatch, capsys):
+    def broken(self, *args):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(SurfelMap, 'surfels_of', broken)
+    assert main(['replay', str(bag), '--output', str(tmp_path)]) == 4
+    assert f'{NUM_SCANS} internal errors' in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_the_default_output_is_named_after_the_bag(bag, tmp_path, monkeypatch, capsys):

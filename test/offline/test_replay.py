@@ -161,6 +161,9 @@ def test_the_stages_are_parts_of_the_wall_time(bag, tmp_path):
     assert 0.0 < sum(stages.values()) <= summary['replay_s']
     line = next(line for line in as_text(summary, []).splitlines() if line.startswith('read '))
     means, _, mapping = line.partition(' a scan   ')
+    without_clock = Config.from_mapping({'pose.source': 'registration'})
+    registered = replay(bag, output=tmp_path / 'registered', config=without_clock).summary
+    assert 'clocks' not in registered['stage_s']
     printed = re.findall(r'(\w+) (-?[\d.]+) ms', means)
     assert [name for name, _ in printed][-2:] == ['other', 'total']
     *parts, total = (float(milliseconds) for _, milliseconds in printed)
