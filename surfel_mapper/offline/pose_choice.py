@@ -106,7 +106,7 @@ def choose_for_bag(
         return choose_by_sample(reader, topics, wanted, asked, sample())
     if wanted is not None:
         return PoseChoice(asked)
-    if has_poses:
+    if has_poses or request.pose_topic:
         return choose_by_frames(reader, topics, request, config, sample)
     return registered(reader, topics, config, 'the recording has no poses')
 
@@ -182,6 +182,8 @@ def choose_by_frames(
         names = source_topics(reader.topics, source)
         if request.pose_topic is not None:
             names = [name for name in reader.topics.of_type(*types) if name == request.pose_topic]
+            if not names:
+                continue
         missing = '' if names else 'no topic'
         if names and source == 'tf' and config.input.kind == 'cloud':
             missing = missing_transforms(sample(), topics, request, config)

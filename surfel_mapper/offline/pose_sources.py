@@ -203,6 +203,10 @@ def pose_topics(
         if config.frames.base_to_sensor:
             return PoseTopics({})
         return PoseTopics({}, static_topics(topics, names, static))
+    if source == AUTO and name is not None:  # no source has it
+        raise BagError(
+            f'{topics.path}: no poses on {name}; the bag offers {offered_sources(topics)}'
+        )
     if source == AUTO:
         source = next((kind for kind in TYPES if source_topics(topics, kind)), 'tf')
     usual, *further = TYPES[source]

@@ -114,7 +114,7 @@ def test_topics_can_be_named(tmp_path, capsys):
     assert 'PointCloud2 topics: /other, /points' in capsys.readouterr().err
     assert main(['replay', path, '--topic', '/points', '--pose-topic', '/tf', *output]) == 0
     assert main(['replay', path, '--topic', '/points', '--pose-topic', '/t', *output]) == 1
-    assert 'no topic /t; TFMessage topics: /tf, /tf_static' in capsys.readouterr().err
+    assert 'no poses on /t; the bag offers tf (/tf, /tf_static), ' in capsys.readouterr().err
 
 
 def test_a_replay_that_maps_nothing_is_refused_with_the_causes(bag, tmp_path, capsys):

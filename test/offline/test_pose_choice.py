@@ -159,7 +159,9 @@ def test_the_topic_of_the_poses_decides_their_source(tmp_path):
     bag = bag_of(tmp_path, CLOUD, TF, ODOMETRY)
     settings, reason = chosen(bag, pose_topic='/odom')
     assert settings == {'pose.source': 'odometry'}
-    assert reason == '/odom has them; not from tf: no topic'
+    assert reason == '/odom has them'  # not that there is no /tf
+    with pytest.raises(BagError, match='no poses on /odom; the bag offers no poses at all'):
+        chosen(bag_of(tmp_path / 'clouds', CLOUD), pose_topic='/odom')
 
 
 def test_contradicting_sources_are_refused(tmp_path):
