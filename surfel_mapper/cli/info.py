@@ -143,7 +143,7 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
         lines += ['', escaped(with_a_pose)]
         for offer in made:
             lines += offered(offer, is_choice) if offer.clouds == clouds else []
-    if not made:
+    if not made and 'refused' not in content['replay']:
         lines += ['', 'no poses; if the clouds are in a fixed frame, use --poses-from identity']
     return '\n'.join([*lines, '', replay_line(content['replay'], Path(content['bag']))])
 

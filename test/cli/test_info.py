@@ -76,6 +76,14 @@ def test_json_holds_the_same(tmp_path, capsys):
     ]
 
 
+def test_a_bag_without_clouds_gets_no_advice_on_their_frame(tmp_path, capsys):
+    path = write_rosbag2(tmp_path / 'a', [row for row in drive() if row[1] != CLOUD])
+    assert main(['info', str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert 'a replay without options is refused: ' in printed
+    assert 'identity' not in printed
+
+
 def test_a_bag_that_is_cut_off_is_shown_as_far_as_it_goes(tmp_path, capsys, caplog):
     path = write_mcap(tmp_path / 'a.mcap', drive())
     cut(path, 0.5)
