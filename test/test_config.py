@@ -280,6 +280,7 @@ def test_parameters_of_rclpy_in_a_file_are_ignored(tmp_path):
     [
         ('- 1\n', 'a list, expected a mapping'),
         ('map: [', 'not YAML'),
+        ('map:\n\tmin_points: 3\n', r'not YAML: .* \(a tab\? indent with spaces\) in line 2'),
         ('map:\n  voxel_size_m: -1.0\n', r'map\.voxel_size_m: -1'),
         ('map:\n  voxel_size_m: 0,5\n', r"map\.voxel_size_m: '0,5', expected a number"),
         ('/**:\n  ros__parameters: 7\n', 'expected a mapping'),

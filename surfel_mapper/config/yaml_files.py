@@ -66,6 +66,8 @@ def parse_yaml(text: str, *, as_text: bool = False) -> Any:
     except yaml.MarkedYAMLError as error:
         # without the line itself: a caller may pass a path whose content is not theirs to read
         problem = error.problem or error.context
+        if 'cannot start any token' in str(problem):
+            problem = f'{problem} (a tab? indent with spaces)'
         raise ValueError(f'{problem}{position(error.problem_mark)}') from error
     except yaml.YAMLError as error:
         raise ValueError('characters that YAML does not allow') from error

@@ -102,8 +102,8 @@ def test_intensities_of_pts_may_be_negative(tmp_path):
 @pytest.mark.parametrize(
     ('name', 'text', 'says'),
     [
-        ('a.txt', 'no points\n', 'no row of numbers, expected a header with x, y, z'),
-        ('a.txt', '', 'no row of numbers'),
+        ('a.txt', 'no points\n', 'no row of three numbers, expected a header with x, y, z'),
+        ('a.txt', '', 'no row of three numbers'),
         ('a.txt', '0 1 2 3 0 0 0 1\n', '8 columns'),
         ('a.csv', 't,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n', '8 columns t, x, y, z, qx'),
         ('a.csv', 'time,a,b\n0,1,2\n', '3 columns time, a, b'),
@@ -145,7 +145,7 @@ def test_tables_of_a_folder_with_one_ending_are_scans_that_state_their_fault(tmp
         (tmp_path / name).write_text('x;y;z\n1,5;2,5;3,5\n')
     assert [file.name for file in scan_files(tmp_path)] == ['1.csv', '2.csv']
     with pytest.raises(
-        FileFormatError, match=r'1\.csv: no row of numbers, expected a header with'
+        FileFormatError, match=r'1\.csv: no row of three numbers, expected a header with'
     ):
         read_scan(tmp_path / '1.csv')
     (tmp_path / 'a.jpg').write_bytes(b'')
