@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.mapping.moments import unpack_keys
-from surfel_mapper.models.bspline import fit_cells, HeightField
+from surfel_mapper.models.bspline import HeightField
 from surfel_mapper.models.frames import (
     eigen,
     mean_normals,
@@ -30,11 +30,13 @@ from surfel_mapper.models.frames import (
 from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.multi_model import Plane, Surface
 from surfel_mapper.models.patches import (
+    aligned,
     cells_of,
     described,
     MARGIN_VOXELS,
     PatchPoints,
     rms_across,
+    splines_of,
 )
 from surfel_mapper.models.surfel_graph import SurfelGraph
 
@@ -185,11 +187,11 @@ class PatchFitter:
         placed = origins, frames, pitches
         cells, _ = cells_of(samples, placed, MARGIN_VOXELS * 0.5 * self._size_m, snapped=True)
         ends = np.array([len(extra) for extra in beyond])
-        fields = fields_of(cells, np.flatnonzero(curved & (ends == 0)))
+        fields = splines_of(cells, np.flatnonzero(curved & (ends == 0)), DEGREE, SMOOTHING)
         seams = np.flatnonzero(curved & (ends > 0))
         if len(seams):
             wider = self._wider_cells(seams, samples, beyond, (origins, frames, pitches))
-            refitted = fields_of(wider, np.arange(len(seams)))
+            refitted = splines_of(wider, np.arange(len(seams)), DEGREE, SMOOTHING)
             fields.update((int(seams[k]), field) for k, field in refitted.items())
         shifts = np.einsum('kij,kj->ki', frames, means - origins)
         cells.origins[:] -= shifts[:, :2]  # published grids are relative to the mean
@@ -268,7 +270,7 @@ class PatchFitter:
         still = (turn < STILL_RAD) & near
         frames[rows[still]], origins[rows[still]] = was[still], anchors[still]
         turns = ~still & (turn < MOST_TURN_RAD)
-        frames[rows[turns]] = turned(was[turns, 0], normals[turns])
+        frames[rows[turns]] = aligned(was[turns], normals[turns])
         height = np.einsum('ij,ij->i', anchors - means[rows], normals)
         origins[rows[turns]] = (anchors - height[:, None] * normals)[turns]
         return origins
@@ -280,18 +282,6 @@ class PatchFitter:
         away = local[:, 2] - field.heights(local[:, :2])
         squares = away**2 + graph.eigenvalues[rows, 0]
         return float(np.sqrt(np.average(squares, weights=graph.count[rows])))
-
-
-def fields_of(cells: Cells, chosen: Indices) -> dict[int, HeightField]:
-    """Return the fields of chosen patches."""
-    return {k: fit_cells(cells, k, DEGREE, SMOOTHING) for k in chosen.tolist()}
-
-
-def turned(x: Array, normals: Array) -> Array:
-    """Return the frames (K, 3, 3) of normals with x nearest to given axes."""
-    along = x - np.einsum('ij,ij->i', x, normals)[:, None] * normals
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    return np.stack([along, np.cross(normals, along), normals], axis=1)
 
 
 def moved(field: HeightField, shift: Array) -> HeightField:

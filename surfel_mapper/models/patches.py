@@ -85,7 +85,8 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     pitches = np.where(curved, SURFACE_PITCH_VOXELS, plane_pitch) * a
     placed = means, frames, pitches
     cells, local = cells_of(groups, placed, MARGIN_VOXELS * a, snapped=not by_paper)
-    splines = splines_of(cells, np.flatnonzero(curved), config)
+    smoothing = None if by_paper else config.smoothing
+    splines = splines_of(cells, np.flatnonzero(curved), config.degree, smoothing)
     numbers, grids = np.diff(groups.starts), cells.grids()
     rms_m = rms_across(covariances, frames[:, 2], numbers)
     patches: list[Plane | None] = []
@@ -214,10 +215,11 @@ def cells_of(
     return Cells.around(local, patch, pitches, margin_m, snapped=snapped), local
 
 
-def splines_of(cells: Cells, curved: Indices, config: ModelsConfig) -> dict[int, HeightField]:
-    """Return the splines of the curved patches."""
-    smoothing = None if is_paper(config) else config.smoothing
-    return {k: fit_cells(cells, k, config.degree, smoothing) for k in curved.tolist()}
+def splines_of(
+    cells: Cells, chosen: Indices, degree: int, smoothing: float | None
+) -> dict[int, HeightField]:
+    """Return the splines of chosen patches; see fit_cells."""
+    return {k: fit_cells(cells, k, degree, smoothing) for k in chosen.tolist()}
 
 
 def surface_of(plane: Plane, spline: HeightField, points: Array, far_m: float) -> Surface | None:

@@ -93,7 +93,7 @@ def with_smooth_seams(
     pitches = np.full(len(chosen), PITCH_VOXELS * config.voxel_size_m)
     placed = means, frames, pitches
     cells, _ = cells_of(groups, placed, None, snapped=True)
-    splines = splines_of(cells, np.arange(len(chosen)), config)
+    splines = splines_of(cells, np.arange(len(chosen)), config.degree, config.smoothing)
     smooth = list(surfaces)
     for k, number in enumerate(chosen):
         local = surfaces[number].to_local(points[number])
