@@ -107,8 +107,8 @@ def read_points(path: str | Path) -> Columns:
             names = '' if layout is None else ', '.join(layout.names)
             actual = layout and f'{layout.width} columns {names}'.strip()
             raise FileFormatError(
-                f'{path}: {actual or "no row of three numbers"}, expected a header with x, y, z, or '
-                'rows x y z, x y z intensity, x y z r g b, or x y z intensity r g b'
+                f'{path}: {actual or "no row of three numbers"}, expected a header with x, y, z, '
+                'or rows x y z, x y z intensity, x y z r g b, or x y z intensity r g b'
             )
         with open_regular(path) as file:
             table = np.loadtxt(

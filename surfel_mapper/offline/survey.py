@@ -307,7 +307,7 @@ def tried(
         mount = mounting(static, base, frame)
         settings |= {'frames.base': base, 'frames.base_to_sensor': mount}
         if not mount:
-            missing = f'the place of {frame} in {base} is not in the bag: measure frames.base_to_sensor'
+            missing = f'no place of {frame} in {base} in the bag: measure frames.base_to_sensor'
             if frame == fixed:
                 missing = f'poses and clouds are in {fixed}; --poses-from identity maps them'
             frame = base
