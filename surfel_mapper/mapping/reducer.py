@@ -236,7 +236,7 @@ def summed_moments(chunks: Sequence[ScanMoments]) -> ScanMoments:
         total=total if largest > FULL else total.astype(np.int32),
         product=summed('product'),
         view=view,
-        channels=None,
+        channels=np.empty((len(key), 0), np.int64),
         left_out={
             cause: sum(chunk.left_out.get(cause, 0) for chunk in chunks) for cause in causes
         },
