@@ -243,12 +243,18 @@ def view_axes(cloud: Array, viewpoint: Array) -> Array:
     """
     Return the axes (3, 3) of a picture as rows: to the right, up, towards the viewer.
 
-    Up is z, as of a map; for a camera that looks along z it is -y.
+    Up is z, as of a map; for a camera that looks along z it is -y. Clouds around the sensor or
+    below it are seen obliquely from above.
     """
-    ahead = cloud.mean(axis=0) - viewpoint if len(cloud) else np.zeros(3)
+    ahead, width = np.zeros(3), 1e-9
+    if len(cloud):
+        ahead = cloud.mean(axis=0) - viewpoint
+        width = max(width, float(np.linalg.norm(cloud.std(axis=0))))
     length = float(np.linalg.norm(ahead))
-    ahead = ahead / length if length > 1e-9 else np.array([0.0, 0.6, -0.8])
-    up = np.array([0.0, -1.0, 0.0]) if abs(ahead[2]) > 0.8 else np.array([0.0, 0.0, 1.0])
+    if length <= width or ahead[2] < -0.8 * length:
+        ahead, length = np.array([0.0, 0.6, -0.8]), 1.0
+    ahead /= length
+    up = np.array([0.0, -1.0, 0.0]) if ahead[2] > 0.8 else np.array([0.0, 0.0, 1.0])
     right = np.cross(ahead, up)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(right, ahead), -ahead])

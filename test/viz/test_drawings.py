@@ -120,6 +120,23 @@ def test_pictures_of_rooms_are_mostly_filled(seen, tmp_path):
     assert empty.mean() < 0.35
 
 
+@pytest.mark.parametrize(
+    ('viewpoint', 'ahead', 'up'),
+    [
+        ((0.0, 0.0, 1.0), (0.0, 0.6, -0.8), (0.0, 0.8, 0.6)),  # a lidar amid its scan
+        ((0.0, 0.0, 90.0), (0.0, 0.6, -0.8), (0.0, 0.8, 0.6)),  # above a map
+        ((0.0, 0.0, -90.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),  # a camera
+        ((-90.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),  # a lidar on a side
+    ],
+)
+def test_clouds_are_seen_from_the_sensor_or_from_above(viewpoint, ahead, up):
+    x, y = np.mgrid[-10:11, -10:11]
+    floor = np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3).astype(np.float64)
+    right = np.cross(ahead, up)
+    expected = np.array([right, up, np.negative(ahead)])
+    np.testing.assert_allclose(viz_drawings.view_axes(floor, np.array(viewpoint)), expected)
+
+
 def test_far_points_are_left_out_of_the_frame():
     near = np.stack(np.meshgrid(*[np.linspace(0.0, 2.0, 100)] * 2), axis=-1).reshape(-1, 2)
     far = np.random.default_rng(0).uniform(0.0, 50.0, (300, 2))
