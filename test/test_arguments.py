@@ -77,7 +77,6 @@ KINDS = {
     'a': lambda v: Config.from_mapping(v),
     'config': lambda v: DistanceField(v),
     'blocks': lambda v: DistanceField(blocks=v),
-    'sensor': lambda v: DistanceField().add(POINTS, np.eye(4), sensor=v),
     'camera': lambda v: DistanceField().add_depth(np.ones((4, 4)), v, np.eye(4)),
     'path': lambda v: field().save(v),
     'path ': lambda v: DistanceField.load(v, TsdfConfig()),

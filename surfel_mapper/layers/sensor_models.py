@@ -18,7 +18,7 @@ from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.channels import missing_columns, quantised
 from surfel_mapper.poses.buffer import TransformBuffer
 from surfel_mapper.scan import Scan
-from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
+from surfel_mapper.tsdf.range_image import from_depth, RangeImage
 from surfel_mapper.tsdf.sensors import CameraModel
 
 MAX_CAMERAS = 8
@@ -134,9 +134,9 @@ def seen_from(T_scan_sensor: Transform, scan: Scan) -> Scan:
 
 def range_image(
     scan: Scan, sensor: CameraModel, *, has_color: bool, has_label: bool
-) -> RangeImage:
+) -> RangeImage | None:
     """
-    Return the range image of a scan: of its depth image if it has one, else of points and rays.
+    Return the range image of a scan; None if its depth image lacks what its points have.
 
     Parameters
     ----------
@@ -159,10 +159,7 @@ def range_image(
         or (has_color and depth.color is None and not missing_columns(columns, ('rgb',)))
         or (has_label and depth.label is None and 'label' in columns)
     ):
-        points, channels = measured_channels(
-            scan, sensor.max_range_m, has_color=has_color, has_label=has_label
-        )
-        return from_points(sensor, points, **channels)
+        return None
     return from_depth(sensor, depth.depth).with_images(
         color=depth.color if has_color else None, label=depth.label if has_label else None
     )

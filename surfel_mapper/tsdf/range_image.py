@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-RangeImage: the measurements of a depth image, or of the points of a depth camera, by pixel.
-
-See tsdf/kernels/range_image.py for the values of a pixel.
-"""
+"""RangeImage: the measurements of a depth image by pixel."""
 
 from __future__ import annotations
 
@@ -16,7 +12,6 @@ import numpy.typing as npt
 
 from surfel_mapper.arguments import Record
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.tsdf.kernels import range_image as kernels
 from surfel_mapper.tsdf.measurements import checked_labels
 from surfel_mapper.tsdf.sensors import CameraModel
 
@@ -147,78 +142,16 @@ def from_depth(
         scale = 1e-3 if native_type == np.uint16 else 1.0
     if not 0.0 < scale < np.inf:
         raise CloudFormatError(f'scale: {scale}, expected a positive number of metres')
-    image = np.empty((sensor.rows, sensor.columns), np.float32)
-    native = np.ascontiguousarray(depth, native_type)
-    absent = NO_DEPTH_MM if native_type == np.uint16 else np.nan
-    absent = absent if unknown is None else float(unknown)
-    largest = kernels.from_depth(
-        native, np.float32(scale), absent, sensor.ray_length, limits(sensor), image
-    )
-    return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest))
+    if unknown is None:
+        unknown = NO_DEPTH_MM if native_type == np.uint16 else np.nan
+    range_m = depth.astype(np.float32) * np.float32(scale) * sensor.ray_length
+    range_m[depth == unknown] = np.nan
+    return from_ranges(sensor, range_m)
 
 
-def from_points(
-    sensor: CameraModel,
-    points: npt.NDArray[Any],
-    *,
-    colors: npt.NDArray[np.uint8] | None = None,
-    labels: npt.NDArray[Any] | None = None,
-) -> RangeImage:
-    """
-    Return the range image of points in any order; each pixel takes its nearest point.
-
-    Parameters
-    ----------
-    sensor : CameraModel
-        Model of the sensor.
-    points : (N, 3) float32 or float64
-        In the frame of the sensor, m; points not finite or out of view are left out.
-    colors : (N, 3 or 4) uint8, optional
-        Red, green, blue of each point; a fourth channel of 0 means unknown.
-    labels : (N,) int, optional
-        Label of each point, -1 for unknown.
-
-    Raises
-    ------
-    CloudFormatError
-        If a shape or type is not as above.
-
-    """
-    if points.ndim != 2 or points.shape[1] != 3 or points.dtype not in (np.float32, np.float64):
-        raise CloudFormatError(f'points: {points.dtype} {points.shape}, expected (N, 3) float')
-    image = np.zeros((sensor.rows, sensor.columns), np.float32)
-    source = np.full((sensor.rows, sensor.columns), -1, np.int32)
-    largest = kernels.from_points(
-        np.ascontiguousarray(points), sensor.projection, limits(sensor), image, source
-    )
-    range_image = RangeImage(sensor=sensor, range_m=image, largest_m=float(largest))
-    more: dict[str, npt.NDArray[Any]] = {}
-    if colors is not None:
-        channels = 4 if colors.shape[-1:] == (4,) else 3
-        more['color'] = image_of('colors', colors, (len(points), channels), source, 0)
-    if labels is not None:
-        more['label'] = image_of('labels', labels, (len(points),), source, -1)
-    return range_image.with_images(**more) if more else range_image
-
-
-def limits(sensor: CameraModel) -> Float32:
-    """Return the smallest and largest range, and the value of a clearing pixel, m, (3,)."""
-    farthest = sensor.max_range_m
-    return np.array([sensor.min_range_m, farthest, farthest + CLEARING_M], np.float32)
-
-
-def image_of(
-    name: str,
-    values: npt.NDArray[Any],
-    shape: tuple[int, ...],
-    source: npt.NDArray[np.int32],
-    missing: int,
-) -> npt.NDArray[Any]:
-    """Return an image of point values: of the point that each pixel took its range from."""
-    if values.shape != shape:
-        raise CloudFormatError(f'{name}: {values.shape}, expected {shape} one for each point')
-    if not len(values):
-        return np.full(source.shape + shape[1:], missing, values.dtype)
-    image = values[source]
-    image[source < 0] = missing
-    return image
+def from_ranges(sensor: CameraModel, range_m: Float32) -> RangeImage:
+    """Return the range image of measured ranges (rows, columns); nan means unknown."""
+    nearest, farthest = np.float32(sensor.min_range_m), np.float32(sensor.max_range_m)
+    image = np.where(range_m > farthest, np.float32(farthest + CLEARING_M), range_m)
+    image[~(range_m >= nearest)] = 0.0
+    return RangeImage(sensor=sensor, range_m=image, largest_m=float(min(image.max(), farthest)))

@@ -65,7 +65,6 @@ REFERENCES = {
     'tsdf/kernels/point_cells.py': 'tsdf/test_point_integrator.py',
     'tsdf/kernels/point_fusion.py': 'tsdf/test_point_integrator.py',
     'tsdf/kernels/queries.py': 'tsdf/test_queries.py',
-    'tsdf/kernels/range_image.py': 'tsdf/test_range_image.py',
     'viz/kernels/painting.py': 'viz/kernels/test_painting.py',
 }
 """Module of kernels, under surfel_mapper/: the test with its twin or reference, under test/."""

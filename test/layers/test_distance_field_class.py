@@ -73,11 +73,6 @@ def test_depth_image_is_fused_with_its_colours():
     assert (mesh.colors == 77).all()
 
 
-def test_a_sensor_that_is_no_camera_is_refused():
-    with pytest.raises(TypeError, match='sensor: a str, expected a CameraModel'):
-        DistanceField(CONFIG).add(SPHERE, np.eye(4), sensor='VLP-16')
-
-
 CAMERA = CameraModel(columns=80, rows=60, fx=70.0, fy=70.0, cx=40.0, cy=30.0)
 
 

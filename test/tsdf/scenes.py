@@ -8,8 +8,7 @@ from surfel_mapper.config import TsdfConfig
 from surfel_mapper.config.layers import LEAST_WEIGHT
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
-from surfel_mapper.tsdf.kernels import range_image as kernels
-from surfel_mapper.tsdf.range_image import limits, RangeImage
+from surfel_mapper.tsdf.range_image import from_ranges
 from surfel_mapper.tsdf.sensors import CameraModel
 
 VGA = CameraModel(columns=640, rows=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
@@ -105,8 +104,4 @@ def zero_crossings(blocks):
 
 def image_of(sensor, range_m):
     """Return the range image of ranges in the pixels of a sensor; nan: unknown, inf: free."""
-    image = np.empty((sensor.rows, sensor.columns), np.float32)
-    ranges = np.ascontiguousarray(range_m, np.float32)
-    one = np.float32(1.0), np.nan, np.ones_like(ranges), limits(sensor)
-    largest = kernels.from_depth(ranges, *one, image)
-    return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest))
+    return from_ranges(sensor, np.asarray(range_m, np.float32))

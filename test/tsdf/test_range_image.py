@@ -10,7 +10,7 @@ import pytest
 
 from surfel_mapper.errors import CloudFormatError, ConfigError
 from surfel_mapper.tsdf.kernels.projection import OUTSIDE, project
-from surfel_mapper.tsdf.range_image import from_depth, from_points
+from surfel_mapper.tsdf.range_image import from_depth
 from surfel_mapper.tsdf.sensors import CameraModel
 from test.tsdf import twin
 from test.tsdf.scenes import SMALL
@@ -49,31 +49,6 @@ def test_points_fall_where_the_equations_say():
     np.testing.assert_allclose(v[both], expected_v[both], atol=2e-3)
 
 
-def test_the_nearest_return_wins_whatever_the_order():
-    ray = SMALL.directions[3, 20].astype(float)
-    points = np.outer([7.0, 5.0, 6.0, 0.05, 50.0], ray)
-    colors = np.arange(15, dtype=np.uint8).reshape(5, 3)
-    for order in ([0, 1, 2, 3, 4], [4, 3, 2, 1, 0]):
-        image = from_points(
-            SMALL, points[order], colors=colors[order], labels=np.array([4, 5, 6, 7, 8])[order]
-        )
-        assert image.range_m[3, 20] == pytest.approx(5.0, abs=1e-5)
-        assert image.color[3, 20].tolist() == [3, 4, 5]
-        assert image.label[3, 20] == 5
-        assert (image.label >= 0).sum() == 1
-
-
-def test_points_not_finite_or_out_of_view_are_left_out():
-    points = np.array(
-        [[np.nan, 0, 0], [np.inf, 0, 0], [0, -np.inf, np.nan], [0, 9, 5], [0, 0, 0], [1, 0, -9]]
-    )
-    image = from_points(SMALL, points)
-    assert (image.largest_m, image.range_m.any()) == (0.0, False)
-    assert not from_points(SMALL, np.empty((0, 3))).range_m.any()
-    beside = from_points(SMALL, np.array([[0.0, 0.0, -2.0], [9.0, 0.0, 1.0]]))
-    assert not beside.range_m.any()
-
-
 def test_depths_become_ranges_and_say_what_they_know():
     depth = np.full((60, 80), 2.0, np.float32)
     depth[0, :7] = [np.nan, np.inf, -np.inf, 0.0, -1.0, 0.05, 9.0]
@@ -99,8 +74,6 @@ def test_65535_mm_is_no_depth_and_no_free_space():
     [
         (lambda: from_depth(SMALL, np.zeros((80, 60), np.float32)), r'\(80, 60\), expected'),
         (lambda: from_depth(SMALL, np.zeros((60, 80), np.int32)), 'int32, expected float32'),
-        (lambda: from_points(SMALL, np.zeros((5, 2))), r'expected \(N, 3\)'),
-        (lambda: from_points(SMALL, np.zeros((5, 3)), labels=np.zeros(4, int)), 'labels: '),
         (lambda: blank().with_images(color=np.zeros((60, 81, 3), np.uint8)), 'color: '),
         (lambda: blank().with_images(color=np.zeros((60, 80, 3))), 'float64, expected uint8'),
         (lambda: blank().with_images(label=np.full((60, 80), 1 << 24)), 'label: '),

@@ -25,7 +25,7 @@ from surfel_mapper.tsdf.measurements import checked_column, checked_points, Inte
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
 from surfel_mapper.tsdf.queries import labels_at, sample, states
-from surfel_mapper.tsdf.range_image import from_depth, from_points
+from surfel_mapper.tsdf.range_image import from_depth
 from surfel_mapper.tsdf.sensors import CameraModel
 
 
@@ -40,7 +40,7 @@ class DistanceField:
     blocks : BlockMap
         The voxels.
     point_integrator, image_integrator : PointIntegrator, Integrator
-        Fuse the points of lidars, and images.
+        Fuse points, and images.
     mesher : Mesher
         Keeps the mesh.
 
@@ -89,7 +89,6 @@ class DistanceField:
         points: npt.NDArray[Any],
         T_map_sensor: npt.NDArray[np.float64],
         *,
-        sensor: CameraModel | None = None,
         stamp_ns: int = 0,
         colors: npt.NDArray[np.uint8] | None = None,
         labels: npt.NDArray[Any] | None = None,
@@ -103,8 +102,6 @@ class DistanceField:
             In the frame of the sensor, m; non-finite points are skipped.
         T_map_sensor : (4, 4) float64
             Pose of the sensor in the map frame.
-        sensor : CameraModel, optional
-            Camera by which the points become a depth image; clouds of lidars need no model.
         stamp_ns : int
             Stamp of the scan, ns.
         colors : (N, 3 or 4) uint8, optional
@@ -123,14 +120,9 @@ class DistanceField:
         num = len(points)
         colors = checked_column('colors', colors, np.uint8, ((num, 3), (num, 4)))
         labels = checked_column('labels', labels, np.integer, ((num,),))
-        if sensor is None:
-            stamp_ns = as_whole('stamp_ns', stamp_ns)
-            return self.point_integrator.integrate(
-                points, T_map_sensor, stamp_ns, colors=colors, labels=labels
-            )
-        check_kind('sensor', sensor, CameraModel, hint='nothing for the points of a lidar')
-        image = from_points(sensor, points, colors=colors, labels=labels)
-        return self.image_integrator.integrate(image, T_map_sensor, as_whole('stamp_ns', stamp_ns))
+        return self.point_integrator.integrate(
+            points, T_map_sensor, as_whole('stamp_ns', stamp_ns), colors=colors, labels=labels
+        )
 
     def add_depth(
         self,

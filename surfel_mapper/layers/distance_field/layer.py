@@ -38,6 +38,7 @@ from surfel_mapper.layers.layer import (
     Surroundings,
 )
 from surfel_mapper.layers.sensor_models import (
+    camera_model,
     measured_channels,
     range_image,
     SensorModels,
@@ -159,13 +160,13 @@ class TsdfLayer(Layer):
         sensor = self.around.sensors.camera_of(scan)
         config = self.config.tsdf
         wanted = {'has_color': config.color, 'has_label': config.semantics != 'none'}
-        if sensor is None:
+        image = None if sensor is None else range_image(scan, sensor, **wanted)
+        if image is None:
             points, channels = measured_channels(scan, config.max_range_m, **wanted)
             done = self.field.point_integrator.integrate(
                 points, T_map_sensor, scan.stamp_ns, **channels
             )
         else:
-            image = range_image(scan, sensor, **wanted)
             done = self.field.image_integrator.integrate(image, T_map_sensor, scan.stamp_ns)
         self._position = T_map_sensor[:3, 3].copy()
         self.blocks.evict(self._position)
@@ -221,15 +222,14 @@ class TsdfLayer(Layer):
         self.blocks.clear_region(contains)
 
     def warm_up(self) -> None:
-        """Compile the kernels, for points of either type."""
+        """Compile the kernels, for points of either type and images."""
         tsdf = replace(self.config.tsdf, sensor_frame='')
         around = replace(self.around, sensors=SensorModels(tsdf))
         layer = TsdfLayer(replace(self.config, tsdf=tsdf), around)
         for dtype in (np.float32, np.float64):
-            for camera in ((), (64.0, 48.0, 60.0, 60.0, 32.0, 24.0)):
-                points = two_beams(dtype)
-                scan = Scan(points=points, stamp_ns=0, frame_id='', camera=camera)
-                layer.insert(scan, np.eye(4))
+            layer.insert(Scan(points=two_beams(dtype), stamp_ns=0, frame_id=''), np.eye(4))
+        camera = camera_model((64.0, 48.0, 60.0, 60.0, 32.0, 24.0), 0.5, 5.0)
+        layer.field.add_depth(np.full((48, 64), 2.0, np.float32), camera, np.eye(4))
         layer.mesh()
         list(layer._whole_mesh.messages(Moment()))
         if self.config.esdf.rate_hz:
