@@ -98,9 +98,13 @@ def q_xyzw(T_a_b: Transform) -> npt.NDArray[np.float64]:
 
 
 def quaternions(T_a_b: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the rotations of transforms (S, 4, 4) as q_xyzw returns each, (S, 4), bit for bit."""
-    rows = np.ascontiguousarray(T_a_b.transpose(1, 2, 0))
-    (r00, r01, r02, _), (r10, r11, r12, _), (r20, r21, r22, _), _ = rows
+    """
+    Return the rotations of transforms (S, 4, 4), or (S, 3, 3), as quaternions (S, 4).
+
+    They are those of q_xyzw, bit for bit.
+    """
+    rows = np.ascontiguousarray(T_a_b[:, :3, :3].transpose(1, 2, 0))
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rows
     candidates = np.array(_candidates(r00, r01, r02, r10, r11, r12, r20, r21, r22))
     is_taken = (r00 + r11 + r22 > 0.0, (r00 >= r11) & (r00 >= r22), r11 >= r22)
     first = np.argmax([*is_taken, np.ones(len(r00), bool)], axis=0)

@@ -21,8 +21,8 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
+from surfel_mapper.geometry import quaternions
 from surfel_mapper.messages.markers import (
     ADD,
     DELETE_ALL,
@@ -236,14 +236,6 @@ def gaussian_rows(gaussians: Gaussians) -> npt.NDArray[np.float64]:
     rows[:, 7:11] = quaternions(R_map_axes)
     rows[:, 11:14] = 2.0 * half
     return rows
-
-
-def quaternions(R: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return rotations (K, 3, 3) as quaternions xyzw (K, 4)."""
-    if not len(R):  # older versions of scipy refuse empty arrays
-        return np.empty((0, 4))
-    q_xyzw: npt.NDArray[np.float64] = Rotation.from_matrix(R).as_quat()
-    return q_xyzw
 
 
 def surfel_primitive_columns(surfels: Surfels, model: MultiModel) -> Columns:

@@ -12,7 +12,7 @@ stands still.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 import os
 from pathlib import Path
@@ -29,7 +29,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import Header
 
 from surfel_mapper.compilation import PROGRESS
-from surfel_mapper.config import Config
+from surfel_mapper.config import Config, flatten
 from surfel_mapper.errors import one_line
 from surfel_mapper.pipeline.scan_poses import standing_sensor
 from surfel_mapper.ros.base_node import CountedPublisher, Ticker
@@ -313,16 +313,7 @@ def diagnostics(
         hardware_id=name,
         values=[
             KeyValue(key=one_line(key), value=one_line(str(value)))
-            for key, value in leaves(values)
+            for key, value in flatten(values)
         ],
     )
     return DiagnosticArray(header=Header(stamp=time_message(stamp_ns)), status=[status])
-
-
-def leaves(values: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested mappings with dotted names."""
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from leaves(value, f'{prefix}{key}.')
-        else:
-            yield f'{prefix}{key}', value

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 import logging
 from typing import Any
 
@@ -17,6 +16,7 @@ from surfel_mapper.arguments import as_array, as_numbers
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.config.layers import LEAST_WEIGHT, MAX_LABEL, MAX_WEIGHT
 from surfel_mapper.errors import CloudFormatError, PoseError
+from surfel_mapper.geometry import check_rigid
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.kernels import lookup as kernels
 from surfel_mapper.tsdf.kernels.blocks import STAMP
@@ -26,13 +26,6 @@ logger = logging.getLogger(__name__)
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
-
-EXACT, MAX_SKEW = 1e-6, 2e-3
-"""
-Largest entries of R R^T - I: of rotations taken as they are, and of those taken at all.
-
-Rotations in text files of public datasets have determinants down to 0.9995.
-"""
 
 
 def warn_of_short_truncation(config: TsdfConfig) -> None:
@@ -169,41 +162,11 @@ def checked_labels(name: str, labels: npt.NDArray[Any]) -> npt.NDArray[np.int32]
     return labels.astype(np.int32, copy=False)
 
 
-@cache
-def warn_of_skew() -> None:
-    """Warn, once, of a rotation that is not orthonormal."""
-    logger.warning(
-        'poses of the sensor: a rotation is not orthonormal (by up to %g, as in files of few '
-        'digits); such rotations are replaced by the nearest orthonormal one',
-        MAX_SKEW,
-    )
-
-
 def checked_pose(T_map_sensor: Float64) -> Float64:
-    """
-    Return a pose as float64, its rotation made orthonormal if it is off by up to MAX_SKEW.
-
-    Raises
-    ------
-    PoseError
-        If it is not finite or not rigid.
-
-    """
+    """Return a pose as float64; raise PoseError if it is not finite or not rigid."""
     try:
         T = as_numbers('pose of the sensor', T_map_sensor)
+        check_rigid('pose of the sensor', T)
     except ValueError as error:
         raise PoseError(str(error)) from None
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise PoseError(f'pose of the sensor: {T.tolist()}, expected finite (4, 4)')
-    R = T[:3, :3]
-    skew = np.abs(R @ R.T - np.eye(3)).max()
-    if skew > MAX_SKEW or np.linalg.det(R) < 0.0:
-        raise PoseError(f'pose of the sensor: {R.tolist()} is not a rotation')
-    if skew > EXACT:
-        warn_of_skew()
-        u, _, vt = np.linalg.svd(R)
-        T = T.copy()
-        T[:3, :3] = u @ vt
-    if np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
-        raise PoseError(f'pose of the sensor: last row {T[3].tolist()}, expected 0 0 0 1')
     return T

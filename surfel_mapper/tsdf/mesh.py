@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, KeysView, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -340,17 +341,23 @@ class Mesher:
 
 
 def concatenated(meshes: Sequence[Mesh]) -> Mesh:
-    """Return the triangles of some meshes."""
+    """Return some meshes as one; it has colours, and labels, only if all of them have."""
     if not meshes:
         return EMPTY
-    firsts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
-    triangles = np.concatenate([mesh.triangles for mesh in meshes])
-    triangles += np.repeat(firsts, [len(mesh) for mesh in meshes]).astype(np.int32)[:, None]
+    numbers = [len(mesh.vertices) for mesh in meshes]
+    firsts = np.repeat(np.cumsum([0, *numbers[:-1]]), [len(mesh) for mesh in meshes])
+    triangles = np.concatenate([mesh.triangles for mesh in meshes]) + firsts[:, None]
+
+    def joined(name: str) -> npt.NDArray[Any]:
+        arrays = [getattr(mesh, name) for mesh in meshes]
+        is_whole = [len(array) for array in arrays] == numbers
+        return np.concatenate(arrays) if is_whole else getattr(EMPTY, name)
+
     return Mesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
-        triangles=triangles,
-        colors=np.concatenate([mesh.colors for mesh in meshes]),
-        labels=np.concatenate([mesh.labels for mesh in meshes]),
+        triangles=triangles.astype(np.int32),
+        colors=joined('colors'),
+        labels=joined('labels'),
     )
 
 

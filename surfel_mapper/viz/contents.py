@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from surfel_mapper.files import map_state, parquet, ply
 from surfel_mapper.files.arrays import is_cloud
 from surfel_mapper.files.latest_map import DRAWABLE, map_in
 from surfel_mapper.files.parquet_tiles import read_tiles
+from surfel_mapper.files.point_columns import NORMAL_NAMES, normals_in, with_one_colour
 from surfel_mapper.files.scan_files import looks_like_points, read_scan
 from surfel_mapper.files.scan_files import SUFFIXES as CLOUDS
 from surfel_mapper.files.text_points import SUFFIXES as TABLES
@@ -42,9 +44,7 @@ EXACT = ('.npz', '.parquet')
 BESIDE = ('mesh.ply', 'models.obj', 'models.glb', 'trajectory.tum')
 """Further files of a replay that are shown."""
 
-NORMALS = (('nx', 'ny', 'nz'), ('normal_x', 'normal_y', 'normal_z'))
-
-COORDINATES = {*'xyz', *(name for names in NORMALS for name in names)}
+COORDINATES = {*'xyz', *itertools.chain(*NORMAL_NAMES)}
 
 NEIGHBOURS = 20_000
 """Number of points whose nearest neighbours decide the size of discs without one."""
@@ -163,14 +163,9 @@ def cloud(path: Path, name: str) -> Content:
     """Return the surfels or points of a file, in the fixed frame."""
     points, columns = read_scan(path)
     position = points.astype(np.float64)
-    if normal_names(columns) is None:
+    if normals_in(columns) is None:
         return Content(name, position[np.isfinite(position).all(axis=1)])
     return Content(name, discs_of(position, columns))
-
-
-def normal_names(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[str, ...] | None:
-    """Return the names of the columns of normals, if there are any."""
-    return next((names for names in NORMALS if set(names) <= set(columns)), None)
 
 
 def discs_of(position: Array, columns: Mapping[str, npt.NDArray[Any]]) -> DrawnDiscs:
@@ -185,9 +180,8 @@ def discs_of(position: Array, columns: Mapping[str, npt.NDArray[Any]]) -> DrawnD
         With normals; rows without one are left out. The others become values.
 
     """
-    names = normal_names(columns)
-    assert names is not None, 'the caller has found normals'
-    normal = np.stack([columns[name].astype(np.float64) for name in names], axis=1)
+    normal = normals_in(columns)
+    assert normal is not None, 'the caller has found normals'
     length = np.sqrt((normal * normal).sum(axis=1))
     is_known = np.isfinite(position).all(axis=1) & (length > 0.0)
     normal = normal[is_known] / length[is_known, None]
@@ -196,22 +190,11 @@ def discs_of(position: Array, columns: Mapping[str, npt.NDArray[Any]]) -> DrawnD
         radius_m = SPREAD * columns['radius'][is_known].astype(np.float64)
     else:
         radius_m = np.full(len(position), 0.75 * spacing_m(position))
-    values = {name: column for name, column in columns.items() if name not in COORDINATES}
-    shown = {name: value[is_known] for name, value in unpacked(values).items()}
+    values = {k: v for k, v in with_one_colour(columns).items() if k not in COORDINATES}
+    if 'rgb' in values:
+        values |= zip(RGB, values.pop('rgb').T, strict=True)
+    shown = {name: value[is_known] for name, value in values.items() if value.ndim == 1}
     return DrawnDiscs(position, normal, radius_m, shown)
-
-
-def unpacked(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-    """Return the columns of numbers, and a colour as red, green and blue."""
-    numbers = {name: values for name, values in columns.items() if values.ndim == 1}
-    colour = columns.get('rgb')
-    if colour is not None and colour.ndim == 1:
-        del numbers['rgb']
-        bits = colour.view(np.uint32) if colour.dtype == np.float32 else colour.astype(np.uint32)
-        colour = np.stack([bits >> shift & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
-    if colour is not None:
-        numbers.update(zip(RGB, colour.T, strict=True))
-    return numbers
 
 
 def spacing_m(position: Array) -> float:

@@ -28,7 +28,7 @@ from surfel_mapper.layers.drawings import (
     Section,
 )
 from surfel_mapper.models.shapes import CORNERS, FACES
-from surfel_mapper.tsdf.mesh import EMPTY, Mesh
+from surfel_mapper.tsdf.mesh import concatenated, EMPTY, Mesh
 from surfel_mapper.viz.discs import as_bytes, DrawnDiscs
 from surfel_mapper.viz.framing import mass_box
 from surfel_mapper.viz.markup import as_html, html_figures, html_table
@@ -206,7 +206,7 @@ def page_mesh(drawings: Sequence[Drawing], max_triangles: int) -> Mesh:
             mesh = ellipsoids_mesh(drawing, room // len(FACES))
             room -= len(mesh)
             meshes += [mesh] if len(mesh) else []
-    return joined_mesh(meshes)
+    return concatenated(meshes)
 
 
 def ellipsoids_mesh(drawing: EllipsoidsDrawing, most: int) -> Mesh:
@@ -222,20 +222,6 @@ def ellipsoids_mesh(drawing: EllipsoidsDrawing, most: int) -> Mesh:
         vertices=corners.reshape(-1, 3),
         triangles=(FACES + begins[:, None, None]).reshape(-1, 3).astype(np.int32),
         colors=np.tile(color, (corners.size // 3, 1)),
-    )
-
-
-def joined_mesh(meshes: Sequence[Mesh]) -> Mesh:
-    """Return some meshes as one; it has colours only if all of them have."""
-    if len(meshes) < 2:
-        return meshes[0] if meshes else EMPTY
-    begins = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])[:-1]
-    moved = [mesh.triangles + begin for mesh, begin in zip(meshes, begins, strict=True)]
-    has_colors = all(len(mesh.colors) for mesh in meshes)
-    return Mesh(
-        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
-        triangles=np.concatenate(moved).astype(np.int32),
-        colors=np.concatenate([m.colors for m in meshes]) if has_colors else EMPTY.colors,
     )
 
 

@@ -16,9 +16,9 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.geometry import quaternions
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing, RingsDrawing
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.messages.model_messages import quaternions
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
 from surfel_mapper.viz.framing import levelled
 from surfel_mapper.viz.scene import (

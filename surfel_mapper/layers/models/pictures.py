@@ -27,7 +27,7 @@ from surfel_mapper.layers.drawings import (
 from surfel_mapper.messages.model_messages import GREY, primitive_colors
 from surfel_mapper.models.multi_model import Gaussians, MultiModel
 from surfel_mapper.models.shapes import ellipsoid_frames, PatchShape, shape_of
-from surfel_mapper.tsdf.mesh import EMPTY, Mesh
+from surfel_mapper.tsdf.mesh import concatenated, Mesh
 
 PICTURE = 'models.png'
 
@@ -65,17 +65,13 @@ def drawings_of(shapes: Sequence[PatchShape], gaussians: Gaussians) -> list[Draw
 
 def patches_mesh(shapes: Sequence[PatchShape]) -> Mesh:
     """Return planes and surfaces as one mesh in their colours."""
-    if not shapes:
-        return EMPTY
-    begins = np.cumsum([0, *(len(shape.vertices) for shape in shapes)])[:-1]
-    moved = [shape.faces + begin for shape, begin in zip(shapes, begins, strict=True)]
-    colors = primitive_colors([shape.patch.id for shape in shapes])
-    painted = np.repeat(colors, [len(shape.vertices) for shape in shapes], axis=0)
-    return Mesh(
-        vertices=np.concatenate([shape.vertices for shape in shapes]),
-        triangles=np.concatenate(moved).astype(np.int32),
-        colors=np.rint(255.0 * painted).astype(np.uint8),
-    )
+    colors = np.rint(255.0 * primitive_colors([shape.patch.id for shape in shapes]))
+    meshes = []
+    for shape, color in zip(shapes, colors.astype(np.uint8), strict=True):
+        painted = np.tile(color, (len(shape.vertices), 1))
+        faces = shape.faces.astype(np.int32)
+        meshes.append(Mesh(vertices=shape.vertices, triangles=faces, colors=painted))
+    return concatenated(meshes)
 
 
 def picture_of(
