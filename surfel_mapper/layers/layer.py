@@ -248,9 +248,6 @@ class Layer:
         """
         return None
 
-    def finish(self) -> None:
-        """Process scans that still wait, at the end of a recording."""
-
     def clear(self) -> None:
         """Forget all scans."""
 
