@@ -232,7 +232,8 @@ def view_axes(cloud: Array, viewpoint: Array) -> Array:
     Up is z, as of a map; for a camera that looks along z it is -y. Clouds around the sensor or
     below it are seen obliquely from above.
     """
-    ahead, width = np.zeros(3), 1e-9
+    ahead: Array = np.zeros(3)
+    width = 1e-9
     if len(cloud):
         ahead = cloud.mean(axis=0) - viewpoint
         width = max(width, float(np.linalg.norm(cloud.std(axis=0))))
