@@ -20,6 +20,7 @@ from surfel_mapper.models.growth import VoxelPoints
 from surfel_mapper.models.kernels.voxel_means import (
     average_voxels,
     finite_ends,
+    sort_keys,
     spread_labels,
     voxel_keys,
 )
@@ -91,38 +92,19 @@ def thin(points: npt.NDArray[Any], voxel_size_m: float, divisions: int = 1) -> T
     points, ends = np.require(points, None, ['C', 'W']), np.empty((2, 3))
     number = finite_ends(points, ends)
     if not number:
-        none = np.empty(0, np.int64)
-        rows, bits = none.astype(np.int32), np.zeros(3, np.int64)
-        return Thinned(np.empty((0, 3)), points, rows, np.zeros(1, np.int64), none, bits)
+        none, bits = np.empty(0, np.int64), np.zeros(3, np.int64)
+        return Thinned(
+            np.empty((0, 3)), points, none.astype(np.int32), np.zeros(1, np.int64), none, bits
+        )
     grid = ScanVoxels.between(ends[0], ends[1], np.full(3, voxel_size_m), 'origin')
     if int(grid.bits.sum()) + (divisions**3 - 1).bit_length() > KEY_BITS:
         divisions = 1
-    ordered, to_key, long_keys = sorted_keys(points, (grid, divisions), number)
-    rows, starts = np.empty(number, np.int32), np.empty(number + 1, np.int64)
-    keys, means = np.empty(number, np.int64), np.empty((number, 3))
-    num = average_voxels(points, ordered, to_key, rows, starts, keys, means)
-    keys = keys[:num].copy() if long_keys is None else long_keys[keys[:num]]
-    starts = starts[: num + 1].copy()
-    return Thinned(means[:num].copy(), points, rows, starts, keys, grid.bits, divisions)
-
-
-def sorted_keys(
-    points: npt.NDArray[Any], voxels: tuple[ScanVoxels, int], number: int
-) -> tuple[Indices, int, Indices | None]:
-    """
-    Return key and row of each finite point as one number, sorted, and the bits of a row.
-
-    Keys that leave no room for rows are replaced by their ranks; they are returned too, ascending.
-    """
-    (grid, divisions), to_key = voxels, len(points).bit_length()
-    keys: Indices = np.empty(number, np.int64)
-    is_long = int(grid.bits.sum()) + (divisions**3 - 1).bit_length() + to_key > 63
+    num_bits = int(grid.bits.sum()) + (divisions**3 - 1).bit_length()
+    keys, rows = np.empty((2, number), np.int64), np.empty((2, number), np.int32)
     axes = grid.size, grid.shift, grid.base
-    voxel_keys(points, (axes, grid.bits), divisions, 0 if is_long else to_key, keys)
-    long_keys: Indices | None = None
-    if is_long:
-        rows = np.flatnonzero(np.isfinite(points).all(axis=1))
-        long_keys, ranks = np.unique(keys, return_inverse=True)
-        keys = ranks << to_key | rows
-    keys.sort()
-    return keys, to_key, long_keys
+    voxel_keys(points, (axes, grid.bits), divisions, keys[0], rows[0])
+    last = sort_keys(keys, rows, num_bits)
+    starts, means = np.empty(number + 1, np.int64), np.empty((number, 3))
+    num = average_voxels(points, rows[last], keys[last], starts, means)
+    starts, of_voxels = starts[: num + 1].copy(), keys[last, :num].copy()
+    return Thinned(means[:num].copy(), points, rows[last], starts, of_voxels, grid.bits, divisions)

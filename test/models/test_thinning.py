@@ -32,7 +32,7 @@ def rows_by_voxel(points):
 @pytest.mark.parametrize('dtype', [np.float32, np.float64])
 @pytest.mark.parametrize(('number', 'spread_m'), [(1, 0.0), (129, 0.0), (700, 0.0), (700, 4e5)])
 def test_means_and_rows_are_those_of_a_dictionary(number, dtype, spread_m):
-    """The last case has keys that leave no room for the rows of points."""
+    """Keys of the last case have six digits."""
     points = cloud(number, dtype, spread_m)
     expected = rows_by_voxel(points)
 
