@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.filters.grids import KEY_BITS, ScanVoxels
-from surfel_mapper.models.frames import means_and_scatters
 from surfel_mapper.models.growth import VoxelPoints
 from surfel_mapper.models.kernels.voxel_means import (
+    average_parts,
     average_voxels,
     finite_ends,
     sort_keys,
@@ -73,12 +73,13 @@ class Thinned:
 
     def whole_voxels(self) -> Thinned:
         """Return the means of parts as a cloud by voxel."""
-        keys = self.keys // self.divisions**3
-        first = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
-        starts, counts = np.append(first, len(keys)), np.diff(self.starts).astype(np.float64)
-        means = means_and_scatters(self.means, counts, starts)[1]
-        rows = np.arange(len(keys), dtype=np.int32)
-        return Thinned(means, self.means, rows, starts, keys[first], self.bits)
+        number = len(self.keys)
+        starts, keys = np.empty(number + 1, np.int64), np.empty(number, np.int64)
+        parts, room = (self.keys, self.means, self.starts), np.empty((number, 3))
+        num = average_parts(parts, self.divisions**3, starts, keys, room)
+        rows, means = np.arange(number, dtype=np.int32), room[:num].copy()
+        ends, own_keys = starts[: num + 1].copy(), keys[:num].copy()
+        return Thinned(means, self.means, rows, ends, own_keys, self.bits)
 
     def point_labels(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """Return labels of all points from those of the means; -1 if not finite."""
