@@ -232,10 +232,15 @@ def fit_pspline(
     which no sample depends have the height of the nearest other one.
 
     """
+    return fit_samples(start, samples_of(start, xy, z, weight / weight.mean()), rules)
+
+
+def fit_samples(
+    start: HeightField, samples: FieldSamples, rules: tuple[float, float]
+) -> HeightField:
+    """Return the field of fit_pspline; the weights of the samples have the mean 1."""
     if start.control.shape[1] > start.control.shape[0]:  # the bandwidth is the short side
-        turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, rules)
-        return transposed(turned)
-    samples = samples_of(start, xy, z, weight / weight.mean())
+        return transposed(fit_samples(transposed(start), samples.transposed(), rules))
     if is_direct(start.control.shape, max(*start.degrees, 2)):
         num_x, num_y = start.control.shape
         penalties = penalty(num_x - 2, start.degrees[0]), penalty(num_y - 2, start.degrees[1])
@@ -261,9 +266,13 @@ def continued(control: Array, fitted: npt.NDArray[np.bool_]) -> Array:
     return nearest
 
 
-def fit_cells(cells: Cells, patch: int, degree: int, smoothing: float | None) -> HeightField:
+def fit_cells(
+    cells: Cells, patch: int, degree: int, smoothing: float | None
+) -> tuple[HeightField, Array]:
     """
-    Return the field that fits the mean heights of the cells of a patch.
+    Return the field of a patch, and the heights of its points above it, m.
+
+    Without smoothing the field is fitted to the mean heights of the cells.
 
     Parameters
     ----------
@@ -285,11 +294,14 @@ def fit_cells(cells: Cells, patch: int, degree: int, smoothing: float | None) ->
     filled = used.reshape(num_x, num_y)
     origin = cells.origins[patch].copy()
     start = initial_field(float(cells.pitches[patch]), origin, heights, filled, degree)
-    if smoothing is None:
-        return fit_nearest(start, means[used, :2], means[used, 2])
     points, first = cells.points
     own = points[first[patch] : first[patch + 1]]
-    return fit_pspline(start, own[:, :2], own[:, 2], np.ones(len(own)), (smoothing, RIDGE))
+    if smoothing is None:
+        field = fit_nearest(start, means[used, :2], means[used, 2])
+        return field, own[:, 2] - field.heights(own[:, :2])
+    samples = samples_of(start, own[:, :2], own[:, 2], np.ones(len(own)))
+    field = fit_samples(start, samples, (smoothing, RIDGE))
+    return field, samples.z - samples.heights(field.control)
 
 
 def transposed(field: HeightField) -> HeightField:

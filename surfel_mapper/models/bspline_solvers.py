@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.splines import sum_equations
+from surfel_mapper.models.kernels.splines import sum_equations, tensor_heights
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -52,6 +52,16 @@ class FieldSamples:
     bases: tuple[Indices, Array, Indices, Array]
     z: Array
     share: Array
+
+    def transposed(self) -> FieldSamples:
+        """Return the samples with x and y exchanged."""
+        return FieldSamples((*self.bases[2:], *self.bases[:2]), self.z, self.share)
+
+    def heights(self, control: Array) -> Array:
+        """Return the heights (M,) of the field of control points (Nx, Ny) at the samples, m."""
+        result = np.empty(len(self.z))
+        tensor_heights(*self.bases, control, result)
+        return result
 
     def design(self, num_y: int) -> tuple[Indices, Array]:
         """

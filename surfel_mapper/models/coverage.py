@@ -27,6 +27,7 @@ from surfel_mapper.models.primitives import Surface
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
+CoarseCells = tuple[Array, Array, Indices, Indices, Mask]
 
 LEAST_POINTS = 6
 """Points in the cells of a dense patch, at least; each cell counts by its points."""
@@ -65,12 +66,13 @@ def covered(
     if not patches:
         return model
     frames = np.array([[*patch.R_patch_map, patch.mean] for patch in patches])
-    grids = cells_over([patch.grid for patch in patches], pitch_m)
+    coarse = coarse_cells([patch.grid for patch in patches])
+    grids = cells_over(coarse, pitch_m)
     total = grids[0][-1] + grids[2][-1].prod()
     counts, weights, filled = np.zeros(total, np.int64), np.zeros(total), np.zeros(total, np.uint8)
     points = np.ascontiguousarray(points, np.float64)  # one kernel for both types
     count_points(points, model.labels, frames, view, grids, pitch_m, counts, weights, numbers)
-    gaps, coarse = np.empty(len(patches)), inner_cells([patch.grid for patch in patches])
+    gaps = np.empty(len(patches))
     cover_cells(counts, weights, grids, pitch_m, coarse, RULES, filled, gaps)
     for k, grid in trimmed(filled, grids, np.flatnonzero(gaps <= MOST_GAPS), pitch_m):
         patches[k] = replace(patches[k], grid=grid)
@@ -81,25 +83,25 @@ def covered(
     )
 
 
-def cells_over(grids: list[Grid], pitch_m: float) -> tuple[Indices, Array, Indices]:
-    """Return first index (K,), lowest corner (K, 2), m, and size (K, 2) of cells over grids."""
-    low = np.array([grid.origin for grid in grids])
-    high = low + np.array([np.multiply(grid.filled.shape, grid.pitch_m) for grid in grids])
-    corners: Array = (np.floor(low / pitch_m) - 2.0) * pitch_m
-    sizes = np.ceil((high - corners) / pitch_m).astype(np.int64) + 2
-    return np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1), corners, sizes
-
-
-def inner_cells(grids: list[Grid]) -> tuple[Array, Array, Indices, Indices, Mask]:
-    """Return pitches, origins, first indices, sizes, and which cells of grids are not cut."""
+def coarse_cells(grids: list[Grid]) -> CoarseCells:
+    """Return pitches (K,), origins (K, 2), first indices (K,), sizes (K, 2), and filled cells."""
     sizes = np.array([grid.filled.shape for grid in grids])
     return (
         np.array([grid.pitch_m for grid in grids]),
         np.array([grid.origin for grid in grids]),
         np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1),
         sizes,
-        np.concatenate([(grid.filled & ~grid.rim).ravel() for grid in grids]),
+        np.concatenate([grid.filled.ravel() for grid in grids]),
     )
+
+
+def cells_over(coarse: CoarseCells, pitch_m: float) -> tuple[Indices, Array, Indices]:
+    """Return first index (K,), lowest corner (K, 2), m, and size (K, 2) of cells over grids."""
+    pitches, low, _, shapes, _ = coarse
+    high = low + shapes * pitches[:, None]
+    corners: Array = (np.floor(low / pitch_m) - 2.0) * pitch_m
+    sizes = np.ceil((high - corners) / pitch_m).astype(np.int64) + 2
+    return np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1), corners, sizes
 
 
 def trimmed(
@@ -111,8 +113,8 @@ def trimmed(
     low, high = np.empty((2, len(sizes), 2))
     xy = np.stack(np.divmod(cells - first[patch[cells]], sizes[patch[cells], 1]), axis=1)
     box_patches(xy.astype(np.float64), patch[cells], low, high)
-    for k in chosen.tolist():
-        (x, y), (end_x, end_y) = low[k].astype(np.int64), high[k].astype(np.int64) + 1
+    ends = np.stack([low, high + 1.0], axis=1)[chosen].astype(np.int64).tolist()
+    for k, ((x, y), (end_x, end_y)) in zip(chosen.tolist(), ends, strict=True):
         own = filled[first[k] : first[k] + sizes[k].prod()].reshape(sizes[k])
         kept = own[x:end_x, y:end_y].astype(np.bool_)
         corner, cuts = np.zeros(kept.shape, np.uint8), np.zeros((*kept.shape, 3), np.uint8)

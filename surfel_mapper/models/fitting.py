@@ -53,7 +53,6 @@ from surfel_mapper.models.seams import with_smooth_seams
 from surfel_mapper.models.segmentation import (
     Clusters,
     is_paper,
-    mean_normal,
     merge_clusters,
     segment_cloud,
     thickness,
@@ -384,15 +383,16 @@ def chart_points(
     least = 1 if is_paper(config) else config.min_surface_points
     counts = clusters.num_points
     kept = [members for members in surfaces if counts[members].sum() >= least]
-    starts = np.cumsum([0, *(counts[members].sum() for members in kept)])
-    ranges = clusters.rows[np.concatenate([np.empty(0, np.int64), *kept])]
-    points = [clusters.points[start:stop] for start, stop in ranges]
-    means = np.array([counts[m] @ clusters.mean[m] / counts[m].sum() for m in kept])
+    rows, first = np.concatenate([np.empty(0, np.int64), *kept]), np.cumsum([0, *map(len, kept)])
+    columns = np.column_stack([np.ones(len(rows)), clusters.mean[rows], clusters.frames[rows, 2]])
+    sums = np.add.reduceat(counts[rows, None] * columns, first[:-1])
+    lengths = np.linalg.norm(sums[:, 4:], axis=1)
+    points = [clusters.points[start:stop] for start, stop in clusters.rows[rows].tolist()]
     groups = PatchPoints(
         points=np.concatenate([np.empty((0, 3)), *points]),
-        starts=starts,
-        normals=np.array([mean_normal(clusters, members) for members in kept]).reshape(-1, 3),
-        thickness=thickness(means.reshape(-1, 3), config, viewpoint),
+        starts=np.append(0, np.cumsum(counts[rows]))[first],
+        normals=sums[:, 4:] / np.where(lengths > 0.0, lengths, 1.0)[:, None],
+        thickness=thickness(sums[:, 1:4] / sums[:, :1], config, viewpoint),
     )
     return kept, groups
 

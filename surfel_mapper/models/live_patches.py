@@ -185,7 +185,7 @@ class PatchFitter:
         origins = self._steadied(previous, groups)
         pitches = np.where(curved, self._surface_pitch_m, PLANE_PITCH_VOXELS * self._size_m)
         placed = origins, frames, pitches
-        cells, _ = cells_of(samples, placed, MARGIN_VOXELS * 0.5 * self._size_m, snapped=True)
+        cells = cells_of(samples, placed, MARGIN_VOXELS * 0.5 * self._size_m, snapped=True)
         ends = np.array([len(extra) for extra in beyond])
         fields = splines_of(cells, np.flatnonzero(curved & (ends == 0)), DEGREE, SMOOTHING)
         seams = np.flatnonzero(curved & (ends > 0))
@@ -198,10 +198,11 @@ class PatchFitter:
         rms_m = rms_across(groups.covariances, frames[:, 2], groups.total)
         patches = []
         for k, grid in enumerate(cells.grids()):
-            field, rows = fields.get(k), groups.rows[k]
+            rows = groups.rows[k]
             common = ids[k], int(groups.total[k]), means[k], groups.covariances[k], frames[k]
             patch = Plane(*common, float(rms_m[k]), grid)
-            if field is not None:
+            if k in fields:
+                field, _ = fields[k]
                 error_m = self._rms_m(field, frames[k], origins[k], rows)
                 patch = Surface(*common, error_m, grid, moved(field, shifts[k]))
             anchor = samples.normals[k], groups.boxes[k], origins[k]
@@ -228,7 +229,7 @@ class PatchFitter:
         starts = np.concatenate([[0], ends])
         groups = PatchPoints(points, starts, samples.normals[chosen], samples.thickness[chosen])
         origins, axes, pitches = (array[chosen] for array in frames)
-        return cells_of(groups, (origins, axes, pitches), None, snapped=True)[0]
+        return cells_of(groups, (origins, axes, pitches), None, snapped=True)
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
         """Return number, mean and covariance of all points of groups of voxels."""

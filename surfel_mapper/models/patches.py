@@ -84,7 +84,7 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     plane_pitch = PAPER_PLANE_PITCH_VOXELS if by_paper else config.plane_pitch_voxels
     pitches = np.where(curved, SURFACE_PITCH_VOXELS, plane_pitch) * a
     placed = means, frames, pitches
-    cells, local = cells_of(groups, placed, MARGIN_VOXELS * a, snapped=not by_paper)
+    cells = cells_of(groups, placed, MARGIN_VOXELS * a, snapped=not by_paper)
     smoothing = None if by_paper else config.smoothing
     splines = splines_of(cells, np.flatnonzero(curved), config.degree, smoothing)
     numbers, grids = np.diff(groups.starts), cells.grids()
@@ -102,8 +102,7 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
             grid=grids[k],
         )
         far_m = max(FAR_VOXELS * a, FAR_THICKNESS * float(groups.thickness[k]))
-        points = local[groups.starts[k] : groups.starts[k + 1]]
-        patches.append(surface_of(plane, splines[k], points, far_m) if kind else plane)
+        patches.append(surface_of(plane, *splines[k], far_m) if kind else plane)
         next_ids[kind] += patches[-1] is not None
     return patches
 
@@ -192,9 +191,9 @@ def cells_of(
     margin_m: float | None,
     *,
     snapped: bool,
-) -> tuple[Cells, Array]:
+) -> Cells:
     """
-    Return the cells of all patches, and the points (N, 3) in their frames.
+    Return the cells of all patches.
 
     Parameters
     ----------
@@ -212,19 +211,18 @@ def cells_of(
     patch = np.repeat(np.arange(len(origins)), np.diff(groups.starts))
     local = np.empty((len(patch), 3))
     place_points(groups.points, groups.starts, origins, axes, local)
-    return Cells.around(local, patch, pitches, margin_m, snapped=snapped), local
+    return Cells.around(local, patch, pitches, margin_m, snapped=snapped)
 
 
 def splines_of(
     cells: Cells, chosen: Indices, degree: int, smoothing: float | None
-) -> dict[int, HeightField]:
-    """Return the splines of chosen patches; see fit_cells."""
+) -> dict[int, tuple[HeightField, Array]]:
+    """Return the splines of chosen patches, and the heights of their points above these."""
     return {k: fit_cells(cells, k, degree, smoothing) for k in chosen.tolist()}
 
 
-def surface_of(plane: Plane, spline: HeightField, points: Array, far_m: float) -> Surface | None:
-    """Return the surface of (n, 3) points in a frame; None if it is multi-valued."""
-    error = points[:, 2] - spline.heights(points[:, :2])
+def surface_of(plane: Plane, spline: HeightField, error: Array, far_m: float) -> Surface | None:
+    """Return the surface of points with errors (n,), m; None if it is multi-valued."""
     if np.mean(np.abs(error) > far_m) > FAR_SHARE:
         return None
     return plane.bent(spline, float(np.sqrt(np.mean(error**2))))

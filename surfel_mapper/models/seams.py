@@ -92,14 +92,13 @@ def with_smooth_seams(
     frames = np.array([surfaces[number].R_patch_map for number in chosen])
     pitches = np.full(len(chosen), PITCH_VOXELS * config.voxel_size_m)
     placed = means, frames, pitches
-    cells, _ = cells_of(groups, placed, None, snapped=True)
+    cells = cells_of(groups, placed, None, snapped=True)
     splines = splines_of(cells, np.arange(len(chosen)), config.degree, config.smoothing)
     smooth = list(surfaces)
     for k, number in enumerate(chosen):
-        local = surfaces[number].to_local(points[number])
-        error = local[:, 2] - splines[k].heights(local[:, :2])
-        rms_m = float(np.sqrt(np.mean(error**2)))
-        smooth[number] = replace(surfaces[number], spline=splines[k], rms_m=rms_m)
+        spline, error = splines[k]
+        rms_m = float(np.sqrt(np.mean(error[: len(points[number])] ** 2)))
+        smooth[number] = replace(surfaces[number], spline=spline, rms_m=rms_m)
     return smooth
 
 

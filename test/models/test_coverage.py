@@ -53,13 +53,16 @@ def test_cells_are_covered_by_their_points_or_by_their_neighbours():
     rng = np.random.default_rng(1)
     counts, near = rng.integers(0, 12, (9, 12)), rng.uniform(0.5, 1.5, (9, 12))
     counts[3:5, 4:9] = 0
-    weights, inner = counts * near, rng.random((4, 5)) < 0.8
+    weights, held = counts * near, np.ones((4, 5), np.bool_)
+    held[0, 1] = held[3, 3] = False
+    inner = held.copy()
+    inner[[0, -1]] = inner[:, [0, -1]] = inner[1, 1] = inner[2, 3] = False
     grids = np.array([0]), np.array([[0.0, 0.0]]), np.array([[9, 12]])
-    coarse = np.array([0.2]), np.array([[0.1, 0.1]]), np.array([0]), np.array([[4, 5]]), inner
+    coarse = np.array([0.2]), np.array([[0.1, 0.1]]), np.array([0]), np.array([[4, 5]]), held
     filled, gaps = np.zeros(108, np.uint8), np.empty(1)
     cover_cells(
         *(counts.ravel(), weights.ravel(), grids, 0.1),
-        *((*coarse[:4], inner.ravel()), (6.0, 0.25, 5), filled, gaps),
+        *((*coarse[:4], held.ravel()), (6.0, 0.25, 5), filled, gaps),
     )
 
     counts[[0, -1]] = counts[:, [0, -1]] = 0

@@ -50,14 +50,15 @@ def cover_cells(counts, weights, grids, pitch, coarse, rules, filled, gaps):
     grids    first (K,) int64, corners (K, 2) float64, m, and sizes (K, 2) int64; y within x
     pitch    edge of a cell, m
     coarse   the grids of the patches: pitches (K,) float64, m, origins (K, 2) float64, m,
-             first (K,) int64, sizes (K, 2) int64, and inner (D,) bool, cells that nothing cuts
+             first (K,) int64, sizes (K, 2) int64, and filled (D,) bool
     rules    least number of points of the usual cell, least share of its weight, least number
              of covered cells around one that is closed
     filled   (C,) uint8, zeros, changed in place: 1 for covered cells
-    gaps     (K,) float64, out: share of the inner cells that are not covered; 2 if not dense
+    gaps     (K,) float64, out: share of the cells over filled ones with four filled neighbours
+             that are not covered; 2 if not dense
     """
     first, corners, sizes = grids
-    pitches, origins, starts, shapes, inner = coarse
+    pitches, origins, starts, shapes, held = coarse
     for k in range(len(first)):
         rows, columns = sizes[k, 0], sizes[k, 1]
         total, square, weighted = 0.0, 0.0, 0.0
@@ -89,10 +90,12 @@ def cover_cells(counts, weights, grids, pitch, coarse, rules, filled, gaps):
                     filled[cell] = 2
                 y = corners[k, 1] + pitch * (j + 0.5) - origins[k, 1]
                 column = np.int64(np.floor(y / pitches[k]))
-                is_over = 0 <= row < shapes[k, 0] and 0 <= column < shapes[k, 1]
-                if is_over and inner[starts[k] + row * shapes[k, 1] + column]:
-                    number += 1
-                    empty += filled[cell] == 0
+                width, over = shapes[k, 1], starts[k] + row * shapes[k, 1] + column
+                if 0 < row < shapes[k, 0] - 1 and 0 < column < width - 1:
+                    inner = held[over] & held[over - 1] & held[over + 1]
+                    inner &= held[over - width] & held[over + width]
+                    number += inner
+                    empty += inner & (filled[cell] == 0)
         gaps[k] = empty / max(number, 1)
 
 
