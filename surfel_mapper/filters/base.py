@@ -28,7 +28,6 @@ from surfel_mapper.arguments import as_array, as_numbers
 from surfel_mapper.config import setting, Settings
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.columns import LazyColumns
-from surfel_mapper.filters.kernels.selection import compact
 from surfel_mapper.scan import Scan
 
 Mask = npt.NDArray[np.bool_]
@@ -112,11 +111,7 @@ class Filter(Settings):
         """Check conditions on several parameters; raise ConfigError."""
 
     def keep(self, scan: Scan) -> Mask:
-        """
-        Return which points stay, (N,) bool; not called for filters that implement ``apply``.
-
-        The array must not be changed later: columns are selected by it when they are read.
-        """
+        """Return which points stay, (N,) bool; not called for filters that have ``apply``."""
         # not abstract, because filters with apply have no keep; register refuses one with neither
         raise NotImplementedError(f'{type(self).__name__}: implement keep or apply')
 
@@ -191,15 +186,10 @@ def select(scan: Scan, rows: Array) -> Scan:
     if rows.dtype == np.bool_:
         if rows.shape != (len(scan),):
             raise FilterError(f'mask of shape {rows.shape}, expected ({len(scan)},)')
-        number = int(np.count_nonzero(rows))
-        if number == len(scan):
+        if rows.all():
             return scan
-        points = np.empty((number, 3), scan.points.dtype, order='F')
-        compact(scan.points.T, rows, points.T)
-    else:
-        points = np.empty((len(rows), 3), scan.points.dtype, order='F')
-        for axis in range(3):
-            np.take(scan.points[:, axis], rows, out=points[:, axis], mode='raise')
+        rows = np.flatnonzero(rows)
+    points = scan.points.T.take(rows, axis=1).T
     columns = LazyColumns(scan.columns, rows, len(points)) if scan.columns else {}
     times = scan.times and replace(scan.times, offsets=scan.times.offsets[rows])
     return replace(scan, points=points, columns=columns, times=times, msg=None)

@@ -68,8 +68,8 @@ class LazyColumns(Mapping[str, Array]):
     ----------
     base : mapping of str to array
         Columns to take rows from; must not change while this is in use.
-    rows : (K,) int or (N,) bool, optional
-        Rows to take, or a mask over all; None: all.
+    rows : (K,) int, optional
+        Rows to take; None: all.
     num_rows : int
         Number of rows.
     own : mapping of str to (K, ...) array
@@ -116,17 +116,11 @@ class LazyColumns(Mapping[str, Array]):
         if name in self._own:
             return self._own[name], None
         if not isinstance(self._base, LazyColumns):
-            return self._base[name], self._indices()
+            return self._base[name], self._rows
         column, rows = self._base._origin(name)
         if self._rows is None or rows is None:
-            return column, rows if self._rows is None else self._indices()
+            return column, self._rows if rows is None else rows
         return column, rows[self._rows]
-
-    def _indices(self) -> npt.NDArray[Any] | None:
-        """Return the rows as indices; not before a column is read, as most never are."""
-        if self._rows is not None and self._rows.dtype == np.bool_:
-            self._rows = np.flatnonzero(self._rows)
-        return self._rows
 
 
 def as_fields(

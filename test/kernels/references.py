@@ -17,7 +17,6 @@ REFERENCES = {
     'filters/kernels/nearest.py': 'filters/test_neighbours.py',
     'filters/kernels/sampling.py': 'filters/test_sampling.py',
     'filters/kernels/search_tree.py': 'filters/test_neighbours.py',
-    'filters/kernels/selection.py': 'filters/kernels/test_selection.py',
     'filters/kernels/shapes.py': 'filters/test_neighbours.py',
     'filters/kernels/smallest.py': 'filters/test_neighbours.py',
     'filters/kernels/tensor_voting.py': 'filters/test_tensor_voting.py',
