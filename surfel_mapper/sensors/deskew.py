@@ -5,7 +5,7 @@ Deskewing: a pose of its own for every point of a sweep.
 
 A lidar at 10 Hz on a car at 10 m/s sees the last point of a turn from 1 m ahead of the first.
 Drivers write the time of each point in a field; ``point_times`` finds it and its unit,
-``deskewing`` takes the points to the sensor frame at the stamp of the scan, as if all had been
+``deskewed`` takes the points to the sensor frame at the stamp of the scan, as if all had been
 measured then. All later stages (filters, map, window) see rigid scans only.
 
 Poses are looked up at the stamps of the pose source, and between them at steps of at most
@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 import math
 import re
@@ -28,15 +27,12 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.geometry import compose, inverse, q_xyzw, Transform
-from surfel_mapper.scan import LazyPoints, PointTimes, Scan
-from surfel_mapper.sensors.kernels.deskew import count_from_stamp, fill_times, move_points
+from surfel_mapper.scan import PointTimes, Scan
+from surfel_mapper.sensors.kernels.deskew import move_points
 from surfel_mapper.sensors.time_fields import FIELDS, times_field
 
 NAMED_UNIT = re.compile(r'_([mun]?s)(?:ecs?)?$', re.IGNORECASE)
 """Unit at the end of the name of a field: time_offset_ns."""
-
-READ_IN_PLACE = (np.float32, np.float64, np.uint32)
-"""Types of the times of these drivers, read in the message itself; others are copied first."""
 
 UNITS_NS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
@@ -113,18 +109,23 @@ def point_times(
         raise CloudFormatError(f'field {name}: {column.dtype}, expected numbers')
     if column.ndim != 1:
         raise CloudFormatError(f'field {name}: {column.shape[1]} values a point, expected a time')
-    values: npt.NDArray[Any] = np.empty(
-        len(scan), np.float64 if column.dtype.kind == 'f' else np.int64
-    )
-    is_any_timed, num_untimed, lowest, highest = fill_times(scan.xyz, readable(column), values)
-    if num_untimed and not is_any_timed:
+    if column.dtype == np.uint64:  # beyond int64 there is no time, and it must not wrap around
+        column = np.minimum(column, np.uint64(np.iinfo(np.int64).max))
+    x, y, z = scan.xyz
+    with np.errstate(over='ignore', invalid='ignore'):
+        reach = (abs(x) + abs(y)) + abs(z)
+    is_valid, is_finite = (reach > 0.0) & (reach < np.inf), np.isfinite(column)
+    is_timed, num_untimed = is_valid & is_finite, np.count_nonzero(is_valid & ~is_finite)
+    if num_untimed and not is_timed.any():
         raise CloudFormatError(f'field {name}: no finite time of {num_untimed} valid points')
-    if not is_any_timed:
+    if not is_timed.any():
         return PointTimes(np.zeros(len(scan), np.int64), scan.stamp_ns, scan.stamp_ns)
-    if column.dtype == np.uint32 and highest >= WRAPS_AT:
+    number = np.float64 if column.dtype.kind == 'f' else np.int64
+    values: npt.NDArray[Any] = np.where(is_timed, column, column[np.argmax(is_timed)])
+    values = values.astype(number)
+    if column.dtype == np.uint32 and values.max() >= WRAPS_AT:
         values[values >= WRAPS_AT] -= 2**32
-        lowest, highest = values.min(), values.max()
-    ends = np.array([lowest, highest], values.dtype)
+    ends = np.array([values.min(), values.max()])
     low, high = ends if values.dtype == np.int64 else ends.astype(column.dtype)
     reading = _likely_reading(ends, column.dtype, unit, reference, scan.stamp_ns)
     if reading is None:
@@ -143,7 +144,7 @@ def point_times(
         )
     offsets = _offsets(values, *reading, scan.stamp_ns)
     if num_untimed:
-        offsets[~np.isfinite(column)] = UNTIMED
+        offsets[~is_finite] = UNTIMED
     return PointTimes(offsets, scan.stamp_ns + first, scan.stamp_ns + last)
 
 
@@ -198,27 +199,12 @@ def deskewed(
 
 
 def warm_up() -> None:
-    """Compile the kernels, for points and times in the bytes of a message."""
-    message = np.ones((2, 4), np.float32)  # a view of a single point would be contiguous
-    message.flags.writeable = False  # as of bytes: a writable array is another type
-    x, y, z, _ = message.T
-    lazy: Any = LazyPoints(2, partial(np.ones, (2, 3)), (x, y, z))
-    for number in READ_IN_PLACE:
-        t = message.view(number)[:, -1]
-        scan = Scan(points=lazy, stamp_ns=0, frame_id='', columns={'t': t})
-        times = point_times(scan, unit='ns', reference='epoch')
+    """Compile the kernel, for points of either type."""
+    times = PointTimes(np.zeros(2, np.int64), 0, 0)
     for dtype in (np.float32, np.float64):
-        points = scan.points.astype(dtype, order='F')
-        deskewed(replace(scan, points=points, times=times), lambda _: np.eye(4))
-
-
-def readable(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return times as they are if the kernel reads them so, else a copy, float64 or int64."""
-    if column.dtype in READ_IN_PLACE:
-        return column
-    if column.dtype == np.uint64:  # beyond int64 there is no time, and it must not wrap around
-        column = np.minimum(column, np.uint64(np.iinfo(np.int64).max))
-    return column.astype(np.float64 if column.dtype.kind == 'f' else np.int64)
+        points = np.ones((2, 3), dtype, order='F')
+        scan = Scan(points=points, stamp_ns=0, frame_id='', times=times)
+        deskewed(scan, lambda _: np.eye(4))
 
 
 def _likely_reading(
@@ -258,9 +244,8 @@ def _offsets(
     limit = 4 * MAX_SWEEP_NS // unit_ns  # larger ones are refused, and must not overflow
     number = values.dtype.type
     shift_ns = int(number(origin)) * unit_ns - stamp_ns if kind == 'epoch' else 0
-    offsets = np.empty(len(values), np.int64)
-    count_from_stamp(values, number(origin), number(limit), number(unit_ns), shift_ns, offsets)
-    return offsets
+    ticks = np.clip(values - number(origin), -number(limit), number(limit)) * number(unit_ns)
+    return np.asarray(np.rint(ticks).astype(np.int64) + shift_ns)
 
 
 def _track(

@@ -20,7 +20,7 @@ from surfel_mapper.sensors.deskew import (
     point_times,
     UNTIMED,
 )
-from surfel_mapper.sensors.kernels.deskew import count_from_stamp, fill_times, move_points
+from surfel_mapper.sensors.kernels.deskew import move_points
 from surfel_mapper.sensors.time_fields import times_field
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.kernels.modes import both
@@ -171,39 +171,27 @@ def test_implausible_times_are_refused(scan, settings, message):
         point_times(scan, **settings)
 
 
-@both
 @pytest.mark.parametrize('dtype', [np.int64, np.float64])
-def test_times_of_points_without_one_are_those_of_the_first_that_has_one(call, dtype):
+def test_times_of_points_without_one_are_those_of_the_first_that_has_one(dtype):
     rng = np.random.default_rng(6)
-    xyz = rng.normal(size=(3, 40)).astype(np.float32)
-    times = rng.integers(-(10**9), 10**9, 40).astype(dtype)
+    points = rng.normal(size=(40, 3)).astype(np.float32)
+    times = rng.integers(0, 10**8, 40).astype(dtype)
     invalid = np.zeros(40, np.bool_)
     invalid[[0, 1, 7, 30]] = True
-    xyz[0, 0], xyz[1, 1], xyz[:, 7] = np.nan, np.inf, 0.0
-    xyz[2, 30] = -np.inf
+    points[0, 0], points[1, 1], points[7], points[30, 2] = np.nan, np.inf, 0.0, -np.inf
+    expected = np.where(invalid, times[2], times)
     if dtype == np.float64:
-        invalid[[2, 9]] = True
-        times[2], times[9] = np.nan, -np.inf
-    filled = np.empty_like(times)
-    found = call(fill_times, tuple(xyz), times, filled)
-    expected = np.where(invalid, times[np.flatnonzero(~invalid)[0]], times)
-    np.testing.assert_array_equal(filled, expected)
-    untimed = 2 if dtype == np.float64 else 0
-    assert found == (True, untimed, expected.min(), expected.max())
-    assert call(fill_times, tuple(xyz[:, :2]), times[:2], filled[:2])[:2] == (False, 0)
+        times[[5, 9]] = np.nan, -np.inf
+        expected[[5, 9]] = UNTIMED
+    found = point_times(sweep(times, points=points), unit='ns', reference='stamp')
+    assert found.offsets.tolist() == expected.tolist()
+    timed = expected[expected != UNTIMED]
+    assert (found.first_ns - START_NS, found.last_ns - START_NS) == (timed.min(), timed.max())
 
 
-@both
-@pytest.mark.parametrize('dtype', [np.int64, np.float64])
-def test_times_count_from_the_stamp_in_whole_nanoseconds(call, dtype):
-    values = np.array([5_000_000, 5_000_001, 4_999_000, 9 * 10**15, -(9 * 10**15)], dtype)
-    if dtype == np.float64:
-        values[1:3] = 5_000_000.125, 4_999_999.625  # a half goes to the even number
-    found = np.empty(5, np.int64)
-    base, limit, unit_ns = dtype(5_000_000), dtype(6000), dtype(4)
-    call(count_from_stamp, values, base, limit, unit_ns, 7, found)
-    near = [4, -4000] if dtype == np.int64 else [0, -2]
-    assert found.tolist() == [7, *(each + 7 for each in near), 24_007, -23_993]
+def test_times_are_rounded_to_nanoseconds_a_half_to_the_even_one():
+    found = point_times(sweep(np.array([0.0, 0.0005, 0.0015, 0.0025, 1e5])), unit='us')
+    assert found.offsets.tolist() == [0, 0, 2, 2, 10**8]
 
 
 def test_points_without_a_time_are_left_out():

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Deskewing: the times of points, and points moved from the pose at their time to that at the stamp.
+Deskewing: points moved from the pose at their time to that at the stamp.
 
 Between two poses the position is linear and the rotation a slerp, of + - * / and sqrt alone, so
 that node and replay get the same bits on any machine. The power series of the slerp is cut after
@@ -18,71 +18,6 @@ from surfel_mapper.kernels.grouping import CHUNK
 
 NEVER = np.iinfo(np.int64).max
 """A time later than all."""
-
-
-@kernel()
-def fill_times(xyz, values, filled):
-    """
-    Copy the times of points; others get the time of the first point that has one.
-
-    xyz     x, y and z (N,) float32 or float64, m, views into a message or not; invalid in the
-            origin, and if not finite
-    values  (N,) of any type, times
-    filled  (N,) int64 or float64, out
-
-    Returns whether a valid point has a finite time, the number of valid points that have none, and
-    the smallest and the largest time; if no point has one, nothing is written.
-    """
-    x, y, z = xyz
-    num, first, num_untimed = len(values), 0, 0
-    while first < num:
-        is_there = is_valid(x[first], y[first], z[first])
-        if is_there and is_finite(values[first]):
-            break
-        num_untimed += is_there
-        first += 1
-    if first == num:
-        return False, num_untimed, first, first
-    filled[first] = values[first]
-    valid = low = high = filled[first]
-    num_untimed = 0
-    for i in range(np.uint64(num)):
-        is_there, is_timed = is_valid(x[i], y[i], z[i]), is_finite(values[i])
-        num_untimed += is_there & (not is_timed)
-        filled[i] = values[i]
-        filled[i] = filled[i] if is_there & is_timed else valid
-        low, high = min(low, filled[i]), max(high, filled[i])
-    return True, num_untimed, low, high
-
-
-@inlined()
-def is_valid(x, y, z):
-    """Return whether a point is finite and not in the origin."""
-    reach = (abs(x) + abs(y)) + abs(z)
-    return (reach > 0.0) & (reach < math.inf)
-
-
-@inlined()
-def is_finite(value):
-    """Return whether a number is finite."""
-    return abs(value) < math.inf
-
-
-@kernel()
-def count_from_stamp(values, base, limit, unit_ns, shift_ns, offsets):
-    """
-    Convert times to nanoseconds after the stamp: (values - base) unit_ns + shift_ns.
-
-    values         (N,) int64 or float64
-    base, limit    of the same type: what values count from, and the largest difference from it,
-                   so that a larger one does not overflow
-    unit_ns        of the same type, nanoseconds
-    shift_ns       int64, from the stamp to the base
-    offsets        (N,) int64, out
-    """
-    for i in range(np.uint64(len(values))):
-        ticks = min(max(values[i] - base, -limit), limit) * unit_ns
-        offsets[i] = np.int64(np.rint(ticks)) + shift_ns
 
 
 @kernel()
