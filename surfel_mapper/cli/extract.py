@@ -203,6 +203,8 @@ def cloud_of(args: argparse.Namespace) -> npt.NDArray[Any]:
             f'{args.cloud}: surfels of a map, not points of a cloud; expected its map.npz or '
             'the output directory of the replay'
         )
+    if not np.isfinite(points).all(axis=1).any():
+        raise FileFormatError(f'{args.cloud}: none of its {len(points)} points is finite')
     return np.ascontiguousarray(points)
 
 

@@ -158,6 +158,13 @@ def test_depth_images_are_mapped_in_voxels_for_a_room(tmp_path, capsys, caplog):
     assert plane.mean[2] == pytest.approx(3.0, abs=0.002)  # the wall of the images
 
 
+@pytest.mark.parametrize('number', [0, 7])
+def test_a_cloud_without_finite_points_is_refused(tmp_path, capsys, number):
+    np.save(tmp_path / 'a.npy', np.full((number, 3), np.nan, np.float32))
+    assert main(['extract', str(tmp_path / 'a.npy'), '-o', str(tmp_path / 'out')]) == 1
+    assert f'none of its {number} points is finite' in capsys.readouterr().err
+
+
 def test_a_directory_of_neither_map_nor_scans_is_refused(tmp_path, capsys):
     (tmp_path / 'in').mkdir()
     (tmp_path / 'in' / 'notes.md').write_text('nothing')
