@@ -248,13 +248,17 @@ def is_unstamped(reader: BagReader, topic: str) -> bool:
 
 
 def check_mounts(request: Request, topics: list[str], config: Config) -> None:
-    """Refuse mounts that leave a sensor out, and one mount for several sensors."""
+    """Refuse mounts and offsets of other topics, and one mount for several sensors."""
     missing = [topic for topic in topics if topic not in request.mounts]
     unknown = [topic for topic in request.mounts if topic not in topics]
     if request.mounts and (missing or unknown):
         raise BagError(
             f'{request.path}: mounts of {", ".join(request.mounts)}, expected one '
             f'for each of {", ".join(topics)}'
+        )
+    if others := request.time_offsets.keys() - {*topics}:
+        raise BagError(
+            f'{request.path}: time offset of {min(others)}, expected of {", ".join(topics)}'
         )
     frames = config.frames
     if len(topics) > 1 and not (request.mounts or frames.sensors) and frames.base_to_sensor:

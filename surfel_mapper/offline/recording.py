@@ -42,7 +42,7 @@ def open_recording(request: Request, config: Config) -> Iterator[Recording]:
     """
     poses = None if request.poses is None else PosePath(request.poses, request.poses_format)
     if is_scans(request.path):
-        named = [*request.topics, *request.mounts, *request.static_topics]
+        named = [*request.topics, *request.mounts, *request.static_topics, *request.time_offsets]
         named += filter(None, [request.pose_topic])
         if named:
             raise BagError(f'{request.path}: files of scans have no topic {named[0]}')

@@ -289,7 +289,8 @@ class ScanPipeline:
         self.counters.points_left_out.update(left_out)
         if not len(windowed.moments):
             cause = 'map_limit' if 'beyond_map' in left_out else 'no_valid_points'
-            raise ScanRefusedError(cause, f'left out: {left_out}')
+            counts = (f'{name.replace("_", " ")} {number}' for name, number in left_out.items())
+            raise ScanRefusedError(cause, f'points left out: {", ".join(counts)}')
         if self._checks_units:
             self._checks_units = False  # all later scans have the unit of the first
             if looks_like_other_unit(windowed.moments):

@@ -149,6 +149,11 @@ def test_several_topics_are_mapped_each_from_its_place_in_the_tree(tmp_path):
         ({}, {'topics': ('/points',), 'mounts': {'/rear': (*MOUNT_M, *NO_TURN)}}, 'for each of'),
         (MOUNTED, {'topics': BOTH}, 'is the pose of one sensor, not of 2'),
         ({}, {'topics': ('/points', '/front')}, 'no topic /front'),
+        (
+            {},
+            {'topics': BOTH, 'time_offsets': {'/front': 1.0}},
+            'time offset of /front, expected of /points, /rear',
+        ),
     ],
 )
 def test_places_that_leave_a_sensor_out_are_refused(tmp_path, settings, request_, says):
@@ -318,6 +323,7 @@ def test_a_scan_that_does_not_read_is_counted(tmp_path):
         (4, 'kitti', {'every': 2}, 'kitti: 4 poses, none for scan 5'),
         (5, 'tum', {}, '5 poses for 6 scans in .*scans, expected as many, or times of the scans'),
         (6, 'tum', {'topics': ('/points',)}, 'files of scans have no topic /points'),
+        (6, 'tum', {'time_offsets': {'/points': 1.0}}, 'files of scans have no topic /points'),
     ],
 )
 def test_scans_whose_poses_are_not_known_are_refused(tmp_path, number, format_, request_, says):
