@@ -88,10 +88,10 @@ def test_internal_errors_of_mapped_scans_are_no_success(bag, tmp_path, monkeypat
     assert f'{NUM_SCANS} internal errors' in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_points_left_out_are_counted_by_cause_in_words(tmp_path, capsys):
+def test_points_left_out_are_counted_by_cause_in_words(tmp_path, caplog):
     np.save(tmp_path / 'a.npy', [[np.nan] * 3] * 7)
     assert main(['replay', str(tmp_path / 'a.npy'), '--output', str(tmp_path / 'out')]) == 1
-    assert 'dropped: points left out: not finite 7 (' in capsys.readouterr().err
+    assert 'dropped: points left out: not finite 7 (' in caplog.text
 
 
 def test_the_default_output_is_named_after_the_bag(bag, tmp_path, monkeypatch, capsys):
