@@ -113,6 +113,11 @@ class TsdfConfig(Stage):
     dynamic_labels: tuple[float, ...] = setting(
         (), 'Labels of moving objects: they free space and leave no surface.'
     )
+    max_weight_by_label: tuple[float, ...] = setting(
+        (),
+        'Label, weight, label, weight, ...: voxels of these labels keep at most that weight, 1e-4 '
+        'to 1e5, and fade the sooner. A measurement has 1 / distance^2: 1 at 1 m, 0.01 at 10 m.',
+    )
     mesh_rate_hz: float = setting(
         1.0,
         'Rate of ~/mesh and ~/mesh_tiles, Hz, while each has subscribers; 0: never.',
@@ -136,7 +141,7 @@ class TsdfConfig(Stage):
 
     def check(self, stage: str) -> None:
         """Check conditions on several settings."""
-        side = self.voxels_per_side
+        side, caps = self.voxels_per_side, self.max_weight_by_label
         checks = (
             ('voxels_per_side', side & (side - 1) == 0, 'a power of two'),
             (
@@ -152,17 +157,27 @@ class TsdfConfig(Stage):
             ('color', self.color or not self.color_topic, 'true where color_topic is given'),
             (
                 'semantics',
-                self.semantics != 'none' or not self.label_topic,
-                'another where label_topic is given',
+                self.semantics != 'none' or not (self.label_topic or caps),
+                'another where label_topic or max_weight_by_label is given',
+            ),
+            (
+                'max_weight_by_label',
+                2 * len(self.label_caps) == len(caps)
+                and all(LEAST_WEIGHT <= weight <= MAX_WEIGHT for weight in caps[1::2])
+                and not set(caps[::2]) & set(self.dynamic_labels),
+                f'pairs of a label, once and not in dynamic_labels, and a weight from '
+                f'{LEAST_WEIGHT} to {MAX_WEIGHT}',
             ),
         )
         for name, holds, expected in checks:
             if not holds:
                 raise ConfigError(f'{stage}.{name}: {getattr(self, name)}, expected {expected}')
-        for label in self.dynamic_labels:
+        labels = [('dynamic_labels', label) for label in self.dynamic_labels]
+        for name, label in labels + [('max_weight_by_label', label) for label in caps[::2]]:
             if not (label.is_integer() and 0 <= label <= MAX_LABEL):
-                whole = f'expected whole numbers from 0 to {MAX_LABEL}'
-                raise ConfigError(f'{stage}.dynamic_labels: {label}, {whole}')
+                raise ConfigError(
+                    f'{stage}.{name}: {label}, expected whole numbers from 0 to {MAX_LABEL}'
+                )
 
     @property
     def image_topics(self) -> dict[str, str]:
@@ -175,6 +190,12 @@ class TsdfConfig(Stage):
         """Measurements by which a label has to be ahead of all others, at least."""
         odds = self.label_confidence / max(1.0 - self.label_confidence, 1e-9)
         return math.ceil(math.log(LABEL_ODDS) / math.log(odds) - 1e-9)
+
+    @property
+    def label_caps(self) -> dict[float, float]:
+        """Largest weight of the voxels of some labels."""
+        pairs = self.max_weight_by_label
+        return dict(zip(pairs[::2], pairs[1::2], strict=False))
 
     @property
     def block_size_m(self) -> float:

@@ -401,7 +401,7 @@ class BlockMap(BlockArrays):
 
     def touch_fused(self, rows: Int64, stamp_ns: int, figures: Int64) -> None:
         """
-        Mark blocks as changed by a measurement; increments the version.
+        Mark blocks as changed by a measurement and cap weights by label; increments the version.
 
         Parameters
         ----------
@@ -421,6 +421,9 @@ class BlockMap(BlockArrays):
         head[rows[visible], SURFACE] = self.version
         head[rows, FREE_VISITS] = np.where(figures[:, SOLID], 0, head[rows, FREE_VISITS] + 1)
         head[rows, INSIDE] = figures[:, BEHIND]
+        for label, weight in self.config.label_caps.items():
+            row, voxel = np.nonzero(self.votes[rows, 0] == label + 1)
+            self.weight[rows[row], voxel] = np.minimum(self.weight[rows[row], voxel], weight)
 
     def _mark(self, rows: Int64, stamp_ns: int) -> None:
         self.version += 1

@@ -51,6 +51,31 @@ def test_without_forgetting_a_wall_stays_as_long_as_it_was_seen():
     assert seen_through(one, 300, 60) == 60
 
 
+@pytest.mark.parametrize('by_points', [False, True])
+def test_voxels_of_a_label_keep_at_most_its_weight_and_fade_in_one_scan(by_points):
+    caps = dict(semantics='single', max_weight_by_label=(7.0, 0.01, 8.0, 0.02))
+    one = integrator(**SIZES, forget_s=0.0, **caps)
+    points = SMALL.directions.reshape(-1, 3)
+    points = points * (2.0 / points[:, 2:])
+    sides = np.where(np.arange(80) < 40, 7, 0) * np.ones((60, 1), int)
+    for _ in range(20):
+        if by_points:
+            PointIntegrator(one.blocks).integrate(points, np.eye(4), labels=sides.ravel())
+        else:
+            one.integrate(wall_at(2.0).with_images(label=sides), np.eye(4))
+    rows = one.blocks.rows()
+    weights, named = one.blocks.weight[rows], one.blocks.votes[rows, 0] - 1.0
+    assert (named == 7).sum() > 500
+    assert weights[named == 7].max() == np.float32(0.01)
+    assert weights[named == 0].max() > 4.0  # 20 scans at 2 m: 20 / 2^2, less the fall beside
+    if by_points:
+        PointIntegrator(one.blocks).integrate(2.0 * points, np.eye(4))
+    else:
+        one.integrate(wall_at(4.0), np.eye(4))
+    places = [[-0.45, 0.02, 2.02], [0.45, 0.02, 2.02]]
+    assert states(one.blocks, places).tolist() == [FREE, OCCUPIED]
+
+
 def test_a_wall_that_is_gone_becomes_free_point_by_point():
     blocks = BlockMap(TsdfConfig(**SIZES, forget_s=2.0))
     one, rays = PointIntegrator(blocks), SMALL.directions.reshape(-1, 3)

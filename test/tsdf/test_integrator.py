@@ -3,6 +3,7 @@
 """T5 to T8, T12, T13, T17: one and several integrations; refused input."""
 
 from dataclasses import replace
+import math
 
 import numpy as np
 import pytest
@@ -93,6 +94,10 @@ def test_a_short_truncation_is_warned_of(caplog):
     assert 'less than two voxels' in caplog.text
 
 
+def caps(*pairs):
+    return {'semantics': 'single', 'max_weight_by_label': pairs}
+
+
 @pytest.mark.parametrize(
     ('settings', 'message'),
     [
@@ -101,7 +106,17 @@ def test_a_short_truncation_is_warned_of(caplog):
         ({'dynamic_labels': [1.5]}, 'dynamic_labels: 1.5, expected whole'),
         ({'dynamic_labels': [-1.0]}, 'dynamic_labels: -1.0, expected whole'),
         ({'label_confidence': 0.5}, 'label_confidence: 0.5, expected'),
-        ({'label_topic': 'labels'}, 'semantics: none, expected another where'),
+        ({'max_weight_by_label': (7.0, 0.1)}, 'semantics: none, expected another where'),
+        (caps(7.0), r'max_weight_by_label: \(7.0,\), expected pairs'),
+        (caps(7.0, 0.1, 7.0, 0.2), 'max_weight_by_label: .*, expected pairs of a label, once'),
+        (caps(7.0, 0.0), 'max_weight_by_label: .* and a weight from 0.0001 to 100000'),
+        (caps(7.0, math.nan), 'max_weight_by_label: nan, expected a finite number'),
+        (caps(7.5, 0.1), 'max_weight_by_label: 7.5, expected whole numbers from 0 to 16777215'),
+        (caps(-1.0, 0.1), 'max_weight_by_label: -1.0, expected whole'),
+        (
+            caps(7.0, 0.1) | {'dynamic_labels': (7.0,)},
+            'max_weight_by_label: .* not in dynamic_labels',
+        ),
     ],
 )
 def test_settings_that_do_not_go_together_are_refused(settings, message):
