@@ -12,6 +12,9 @@ import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel
 
+RUN = 32
+"""Voxels that share a box in the search for those in a cube."""
+
 
 @kernel(error_model='numpy')
 def neighbour_table(keys, to_y, to_z, starts, rows):
@@ -114,30 +117,40 @@ def sort_owners(table, least, starts, voxel, means, counts):
     return starts[-1]
 
 
-@kernel()
-def sample_cubes(means, starts, cubes, voxels, rows):
+@kernel(error_model='numpy')
+def sample_cubes(means, starts, seeds, halves, rows):
     """
     Take points evenly from the voxels with means in a cube.
 
     means   (V, 3) float64
     starts  (V + 1,) int64, first point of each voxel
-    cubes   voxels in the middle (B,) int64, half edges (B,) float64, and the first voxel (B,) that
-            may be in it and the one after the last, int64
-    voxels  int64, spare, for those of one cube
+    seeds   (B,) int64, voxels in the middle of the cubes
+    halves  (B,) float64, half edges
     rows    (B, n) int64, changed in place: the points
+
+    Voxels that follow each other are close, so the boxes of RUN of them show most that are far.
     """
-    seeds, halves, first, last = cubes
+    boxes = np.empty((-(-len(means) // RUN), 6))
+    for k in range(len(boxes)):
+        for j in range(3):
+            run = means[k * RUN : (k + 1) * RUN, j]
+            boxes[k, j], boxes[k, 3 + j] = run.min(), run.max()
+    voxels = np.empty(len(means) + 1, np.int64)
     for b in range(len(seeds)):
-        centre, half = means[seeds[b]], halves[b]
+        half = halves[b]
+        x, y, z = means[seeds[b], 0], means[seeds[b], 1], means[seeds[b], 2]
         number, total = 0, 0
-        for v in range(first[b], last[b]):
-            inside = True
-            for j in range(3):
-                inside &= abs(means[v, j] - centre[j]) <= half
-            if inside:
+        for k in range(len(boxes)):
+            is_far = (boxes[k, 0] - x > half) | (x - boxes[k, 3] > half)
+            is_far |= (boxes[k, 1] - y > half) | (y - boxes[k, 4] > half)
+            if is_far | (boxes[k, 2] - z > half) | (z - boxes[k, 5] > half):
+                continue
+            for v in range(k * RUN, min((k + 1) * RUN, len(means))):
+                inside = (abs(means[v, 0] - x) <= half) & (abs(means[v, 1] - y) <= half)
+                inside &= abs(means[v, 2] - z) <= half
                 voxels[number] = v
-                number += 1
-                total += starts[v + 1] - starts[v]
+                number += inside
+                total += inside * (starts[v + 1] - starts[v])
         count, at, passed = min(total, rows.shape[1]), 0, 0
         for i in range(count):
             sample = i * total // count
