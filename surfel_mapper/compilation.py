@@ -20,6 +20,9 @@ from typing import NamedTuple
 
 ONCE = 'compiling kernels, once on this machine'
 
+AGAIN_S = 10.0
+"""Time after which a stage that still compiles is announced again, s."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -49,6 +52,7 @@ class Progress:
         self.num_kernels = 0
         self.stage = ''
         self._announced: str | None = None
+        self._due_s = 0.0
         self.ended_s = 0.0
         self._start = 0.0
         self._depth = 0
@@ -72,9 +76,12 @@ class Progress:
             self.num_kernels += 1
             is_first, is_new = self._announced is None, self._announced != self.stage
             self._announced = self.stage
-        if is_new and (self.stage or is_first):
+            is_due = self._start >= self._due_s and not is_new
+        if is_due or (is_new and (self.stage or is_first)):
+            self._due_s = self._start + AGAIN_S
             is_shown = _log.isEnabledFor(logging.INFO) or not is_first
-            _log.log(logging.INFO if is_shown else logging.WARNING, self.text)
+            so_far = f', {self.num_kernels} kernels so far' if is_due else ''
+            _log.log(logging.INFO if is_shown else logging.WARNING, f'{self.text}{so_far}')
 
     def end(self) -> None:
         """Note the end of what ``begin`` reported."""

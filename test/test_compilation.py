@@ -95,6 +95,15 @@ def test_each_stage_that_compiles_is_announced_once(progress, caplog):
 
 
 @needs_compiler
+def test_a_long_stage_is_announced_again_with_its_kernels(progress, monkeypatch, caplog):
+    caplog.set_level(logging.INFO, logger='surfel_mapper.compilation')
+    monkeypatch.setattr(compilation, 'AGAIN_S', 0.0)
+    run_stages([CompileStage('fitting', lambda: (compile_another(), compile_another()))])
+    line = 'compiling kernels, once on this machine: 1 of 1 (fitting)'
+    assert [record.message for record in caplog.records][:2] == [line, f'{line}, 2 kernels so far']
+
+
+@needs_compiler
 def test_kernels_beyond_the_stages_are_announced_once_as_a_warning(progress, caplog):
     caplog.set_level(logging.WARNING, logger='surfel_mapper.compilation')
     compile_another()
