@@ -61,6 +61,9 @@ points on it. These are as near as that number of sigmas, at least of voxels. Po
 within the last distance of each mean of the plane, in voxels.
 """
 
+SCATTER_SIGMA_VOXELS = 0.04
+"""Least sigma of the points on a plane in scatter, in voxels: walls with shelves are thinner."""
+
 SPARSE_SHARE = 0.05
 """Share of points on no patch from which voxels of other sizes help."""
 
@@ -190,7 +193,7 @@ def in_scatter(
     state = voxels.points, voxels.starts, voxels.adjacent, (table[0], table[1], table[3])
     count_beside(*state, normals, tolerance, width_m, sides)
     scattered: npt.NDArray[np.bool_] = sides[:, 1:].min(axis=1) > SCATTER_SHARE * sides[:, 0]
-    return scattered & ~curved
+    return scattered & ~curved & (sigma > SCATTER_SIGMA_VOXELS * size_m)
 
 
 def facet_tolerance(

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from surfel_mapper.models.coarse_growth import (
@@ -76,6 +78,10 @@ def test_a_plane_is_in_scatter_if_points_of_any_patch_are_on_both_sides():
     assert np.flatnonzero(in_scatter(voxels, owner, curved, 0.5)).tolist() == [3]
     owner[owner > 3] = -1  # so do those of none
     assert np.flatnonzero(in_scatter(voxels, owner, curved, 0.5)).tolist() == [3]
+    flat = voxels.points.copy()
+    flat[owner == 3, 2] *= 0.2  # a thin plane is a surface
+    thin_voxels = replace(voxels, points=flat)
+    assert not in_scatter(thin_voxels, owner, curved, 0.5).any()
     curved[3] = True
     assert not in_scatter(voxels, owner, curved, 0.5).any()
 
