@@ -193,7 +193,8 @@ def in_scatter(
     state = voxels.points, voxels.starts, voxels.adjacent, (table[0], table[1], table[3])
     count_beside(*state, normals, tolerance, width_m, sides)
     scattered: npt.NDArray[np.bool_] = sides[:, 1:].min(axis=1) > SCATTER_SHARE * sides[:, 0]
-    return scattered & ~curved & (sigma > SCATTER_SIGMA_VOXELS * size_m)
+    scattered &= ~curved & (sigma > SCATTER_SIGMA_VOXELS * size_m)
+    return scattered
 
 
 def facet_tolerance(
