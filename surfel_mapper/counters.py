@@ -121,10 +121,6 @@ class Counters:
         """Add the time of a with-block to a stage, in milliseconds."""
         return _Timed(self, stage)
 
-    def add_seconds(self, stage: str, seconds: float) -> None:
-        """Add time to the sum of a stage that is no time of a scan of its own."""
-        self.stage_s[stage] = self.stage_s.get(stage, 0.0) + seconds
-
     def drop(self, cause: str, frame_id: str, number: int = 1) -> None:
         """Count scans as dropped for a cause."""
         self.dropped[cause] += number

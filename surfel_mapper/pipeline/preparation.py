@@ -139,9 +139,6 @@ class Preparation:
         if is_gated and registered is None:
             self._check_motion(scan, pose, gate)
         prepared = self._filtered(scan, pose, laps)
-        if self.chain.filters:
-            laps.end('filter')
-            self._count_steps(prepared)
         if self._around.surfel_map.columns:
             self._check_columns(prepared.filtered)
         if registered is None:
@@ -153,7 +150,7 @@ class Preparation:
         return confirmed
 
     def _filtered(self, scan: Scan, pose: Transform, laps: Laps) -> Prepared:
-        """Return a scan deskewed, joined with images, and filtered; raise FilterError."""
+        """Return a scan deskewed, joined with images, and filtered, if points are left."""
         if self._needs_free_rays and scan.free is None:  # first: deskewing makes nan of inf
             scan = replace(scan, free=free_directions(scan, self._deskewed))
         if scan.times is not None:
@@ -167,20 +164,18 @@ class Preparation:
             return Prepared(scan, scan, pose)
         seen = replace(scan, T_base_sensor=self._poses.of_base(scan), T_map_sensor=pose)
         filtered, steps = self.chain.run(seen)
-        return Prepared(scan, filtered, pose, steps)
+        laps.end('filter')
+        counters = self._drops.counters
+        for step in steps:
+            counters.add_filter(step)
+        counters.points_left_out['filtered'] += len(scan) - len(filtered)
+        if not len(filtered):
+            raise ScanRefusedError('filtered_out', 'the filters left none of its points')
+        return Prepared(scan, filtered, pose)
 
     def _deskewed(self, scan: Scan) -> Scan:
         """Return a scan with all points in the sensor frame at its stamp."""
         return scan if scan.times is None else self._poses.deskewed(scan, scan.times)
-
-    def _count_steps(self, prepared: Prepared) -> None:
-        """Count what the filters did; raise if they left no points."""
-        counters, num_points = self._drops.counters, len(prepared.filtered)
-        for step in prepared.steps:
-            counters.add_filter(step)
-        counters.points_left_out['filtered'] += len(prepared.scan) - num_points
-        if not num_points:
-            raise ScanRefusedError('filtered_out', 'the filters left none of its points')
 
     def _check_columns(self, scan: Scan) -> None:
         """Raise unless a scan has the columns that the map sums."""

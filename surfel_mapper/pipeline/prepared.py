@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from surfel_mapper.alignment.registration import RegistrationResult
-from surfel_mapper.filters.chain import Step
 from surfel_mapper.geometry import Transform
 from surfel_mapper.scan import Scan
 
@@ -25,8 +24,6 @@ class Prepared:
         After the filters; the same if there are none.
     T_map_sensor : (4, 4) float64
         Its pose; before registration the predicted one.
-    steps : tuple of Step
-        What each filter did.
     registration : RegistrationResult, optional
         If poses come from registration to the map.
     T_fixed_body : (4, 4) float64, optional
@@ -37,6 +34,5 @@ class Prepared:
     scan: Scan
     filtered: Scan
     T_map_sensor: Transform
-    steps: tuple[Step, ...] = ()
     registration: RegistrationResult | None = None
     T_fixed_body: Transform | None = None
