@@ -242,7 +242,7 @@ def map_recording(
             *(path, mapper.counters.mapped, mapper.map.voxel_size_m, figures['poses_from']),
         )
         if uncertain := uncertain_text(figures):
-            _log.warning('%s: %s', path, uncertain)
+            _log.warning('%s: %s', path, uncertain.replace('\n', '; '))
         return mapper.map
 
 

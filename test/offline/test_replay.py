@@ -22,7 +22,7 @@ from surfel_mapper.files import parquet
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.offline.outputs import ScanTrajectory
-from surfel_mapper.offline.replay import ReplayOptions
+from surfel_mapper.offline.replay import map_recording, ReplayOptions
 from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import as_text
 from test import extras
@@ -170,6 +170,12 @@ def test_the_stages_are_parts_of_the_wall_time(bag, tmp_path):
     assert abs(sum(parts) - total) <= 0.05 * len(printed)  # of rounding
     times = summary['milliseconds']['total']
     assert mapping.startswith(f'mapping {times["median"]:.1f} ms, p99 {times["p99"]:.1f}   ')
+
+
+def test_doubts_of_a_recording_in_place_of_a_map_are_one_line(bag, monkeypatch, caplog):
+    monkeypatch.setattr('surfel_mapper.offline.replay.uncertain_text', lambda figures: 'one\ntwo')
+    map_recording(bag)
+    assert caplog.records[-1].message == f'{bag}: one; two'
 
 
 @pytest.mark.drawn
