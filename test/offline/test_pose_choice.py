@@ -76,7 +76,7 @@ def bag_of(tmp_path, *kept, entries=None):
         ),
         ((CLOUD,), {'pose.source': 'registration'}, 'the recording has no poses'),
         ((CLOUD, '/tf_static'), {'pose.source': 'registration'}, 'no topic gives the poses'),
-        ((CLOUD, ODOMETRY), {'pose.source': 'registration'}, 'the place of lidar in base_link'),
+        ((CLOUD, ODOMETRY), {'pose.source': 'registration'}, 'no place of lidar in base_link'),
     ],
 )
 def test_the_first_source_that_covers_the_clouds_is_taken(tmp_path, kept, expected, says):
