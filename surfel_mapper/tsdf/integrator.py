@@ -73,6 +73,8 @@ class Integrator:
         image: RangeImage,
         T_map_sensor: Float64,
         stamp_ns: int = 0,
+        *,
+        allocate_blocks: bool = True,
     ) -> Integrated:
         """
         Fuse a range image into the map.
@@ -85,6 +87,8 @@ class Integrator:
             Pose of the sensor in the map frame.
         stamp_ns : int
             Stamp of the measurement, ns.
+        allocate_blocks : bool
+            False: only blocks of the map are updated.
 
         Returns
         -------
@@ -105,7 +109,10 @@ class Integrator:
         blocks, side = self.blocks, 2 * half_side(self.blocks.config, image) + 1
         blocks.charge(side**3 // 4, f'an image of ranges up to {image.largest_m:g} m')
         selected = self._selection.blocks(image, T)
-        fit = blocks.admit(selected.index, T[:3, 3])
+        if allocate_blocks:
+            fit = blocks.admit(selected.index, T[:3, 3])
+        else:
+            fit = blocks.find(selected.index) >= 0
         index = selected.index[fit]
 
         def fuse(chosen: Int64, rows: Int64) -> Int64:

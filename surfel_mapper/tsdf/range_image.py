@@ -102,7 +102,13 @@ class RangeImage(Record):
         return np.ascontiguousarray(image)
 
 
-def from_depth(sensor: CameraModel, depth: npt.NDArray[Any]) -> RangeImage:
+def from_depth(
+    sensor: CameraModel,
+    depth: npt.NDArray[Any],
+    *,
+    scale: float | None = None,
+    unknown: float | None = None,
+) -> RangeImage:
     """
     Return the range image of a depth image.
 
@@ -113,6 +119,10 @@ def from_depth(sensor: CameraModel, depth: npt.NDArray[Any]) -> RangeImage:
     depth : (rows, columns) float32, float64 or uint16
         Depth along z. Floats are in m; 0, negative and nan mean unknown, inf free up to
         max_range_m. uint16 is in mm; 0 and 65535, which Kinects write, mean unknown.
+    scale : float, optional
+        Metres of one unit; 1 for floats and 0.001 for uint16 by default.
+    unknown : float, optional
+        A depth, in the units of the image, that means unknown; 65535 for uint16 by default.
 
     Raises
     ------
@@ -128,10 +138,14 @@ def from_depth(sensor: CameraModel, depth: npt.NDArray[Any]) -> RangeImage:
     native_type = depth.dtype.newbyteorder('=')
     if native_type not in (np.float32, np.float64, np.uint16):
         raise CloudFormatError(f'depth: {depth.dtype}, expected float32, float64 or uint16')
-    unit_m = np.float32(1e-3 if native_type == np.uint16 else 1.0)
-    range_m = depth.astype(np.float32) * unit_m * sensor.ray_length
-    if native_type == np.uint16:
-        range_m[depth == NO_DEPTH_MM] = np.nan
+    if scale is None:
+        scale = 1e-3 if native_type == np.uint16 else 1.0
+    if not 0.0 < scale < np.inf:
+        raise CloudFormatError(f'scale: {scale}, expected a positive number of metres')
+    if unknown is None:
+        unknown = NO_DEPTH_MM if native_type == np.uint16 else np.nan
+    range_m = depth.astype(np.float32) * np.float32(scale) * sensor.ray_length
+    range_m[depth == unknown] = np.nan
     return from_ranges(sensor, range_m)
 
 

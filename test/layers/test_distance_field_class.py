@@ -76,11 +76,22 @@ def test_depth_image_is_fused_with_its_colours():
 CAMERA = CameraModel(columns=80, rows=60, fx=70.0, fy=70.0, cx=40.0, cy=30.0)
 
 
-def test_the_depth_that_means_unknown_frees_nothing():
+def test_depth_in_other_units_is_scaled():
     field = DistanceField(CONFIG)
+    depth = np.full((60, 80), 3100, np.uint16)
+    field.add_depth(depth, CAMERA, np.eye(4), scale=0.0005)
+    assert np.abs(field.mesh().vertices[:, 2] - 1.55).max() < 1e-3
+    with pytest.raises(CloudFormatError, match='scale: 0'):
+        field.add_depth(depth, CAMERA, np.eye(4), scale=0.0)
+
+
+def test_a_depth_that_means_unknown_frees_nothing():
+    field = DistanceField(CONFIG)
+    depth = np.full((60, 80), 9.0, np.float32)
+    field.add_depth(depth, CAMERA, np.eye(4), unknown=9.0)
     field.add_depth(np.full((60, 80), 65535, np.uint16), CAMERA, np.eye(4))
     assert len(field) == 0
-    field.add_depth(np.full((60, 80), 9000, np.uint16), CAMERA, np.eye(4))
+    field.add_depth(depth, CAMERA, np.eye(4))
     assert set(field.states([(0.0, 0.0, 2.0)])) == {FREE}
 
 
@@ -90,3 +101,14 @@ def test_masked_pixels_free_space_and_leave_no_surface():
     field.add_depth(depth, CAMERA, np.eye(4), mask=np.ones((60, 80), bool))
     assert len(field.mesh()) == 0
     assert set(field.states([(0.0, 0.0, 1.0)])) == {FREE}
+
+
+def test_without_allocation_only_blocks_of_the_field_are_updated():
+    field = DistanceField(CONFIG)
+    depth = np.full((60, 80), 1.55, np.float32)
+    assert field.add_depth(depth, CAMERA, np.eye(4), allocate_blocks=False).num_updated == 0
+    field.add_depth(depth, CAMERA, np.eye(4))
+    count, version = len(field), field.blocks.version
+    field.add_depth(depth + 1.0, CAMERA, np.eye(4), allocate_blocks=False)
+    assert len(field) == count
+    assert field.blocks.version > version

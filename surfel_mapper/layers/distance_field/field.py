@@ -134,6 +134,9 @@ class DistanceField:
         color: npt.ArrayLike | None = None,
         label: npt.ArrayLike | None = None,
         mask: npt.ArrayLike | None = None,
+        scale: float | None = None,
+        unknown: float | None = None,
+        allocate_blocks: bool = True,
     ) -> Integrated:
         """
         Fuse a depth image.
@@ -154,6 +157,12 @@ class DistanceField:
             Label of each pixel, -1 for unknown.
         mask : (rows, columns) bool or int, optional
             Non-zero pixels only free space and leave no surface.
+        scale : float, optional
+            Metres of one unit of depth; 1 for floats and 0.001 for uint16 by default.
+        unknown : float, optional
+            A depth that means unknown, in units of the image; 65535 for uint16 by default.
+        allocate_blocks : bool
+            False: only blocks that the field already has are updated.
 
         Raises
         ------
@@ -162,8 +171,14 @@ class DistanceField:
 
         """
         check_kind('camera', camera, CameraModel)
-        image = from_depth(camera, depth).with_images(color=color, label=label, mask=mask)
-        return self.image_integrator.integrate(image, T_map_camera, as_whole('stamp_ns', stamp_ns))
+        image = from_depth(camera, depth, scale=scale, unknown=unknown)
+        image = image.with_images(color=color, label=label, mask=mask)
+        return self.image_integrator.integrate(
+            image,
+            T_map_camera,
+            as_whole('stamp_ns', stamp_ns),
+            allocate_blocks=allocate_blocks,
+        )
 
     def sample(self, points: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """Return the signed distances at (P, 3) points, map frame, (P,) m; nan if unknown."""
