@@ -47,6 +47,10 @@ class TsdfConfig(Stage):
     STAGE: ClassVar[str] = 'layers.tsdf'
 
     enabled: bool = setting(False, 'Fuse the scans into a signed distance field too.')
+    when_final: bool = setting(
+        False,
+        'Fuse a scan when it leaves the window, after alignments have moved it, not at once.',
+    )
     sensor_frame: str = setting(
         '',
         'Frame of the optical centre of the lidar, for clouds that are given in another, such as '

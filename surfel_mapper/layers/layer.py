@@ -248,6 +248,9 @@ class Layer:
         """
         return None
 
+    def finish(self) -> None:
+        """Process scans that still wait, at the end of a recording."""
+
     def clear(self) -> None:
         """Forget all scans."""
 

@@ -171,6 +171,7 @@ def replay(
             trajectory.follow_alignment(mapper)
             history.move(trajectory.positions)
             write_maps(directory, options.formats, mapper, trajectory, window=options.window)
+            mapper.finish_layers()
         figures = {
             **recording.describe(),
             'clock_offsets': motion_clock.offsets(),

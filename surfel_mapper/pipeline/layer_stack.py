@@ -127,6 +127,12 @@ class LayerStack:
             with self._drops.guarded(f'clearing a region of layer {layer.name}'):
                 layer.clear_region(contains)
 
+    def finish(self) -> None:
+        """Finish all layers, at the end of a recording."""
+        for layer in self.active:
+            with self._drops.guarded(f'finishing layer {layer.name}'):
+                layer.finish()
+
     def warm_up_stages(self) -> list[CompileStage]:
         """Return the stages that compile the kernels of all layers."""
         return [CompileStage(f'layer {layer.name}', layer.warm_up) for layer in self.active]

@@ -347,6 +347,10 @@ class Mapper:
         self._pipeline.drops.message('initial_pose', f'initial pose ignored: {reason}')
         return False
 
+    def finish_layers(self) -> None:
+        """Finish the layers at the end of a recording; see Layer.finish."""
+        self._pipeline.layers.finish()
+
     def finish(self) -> None:
         """End the input: scans that still wait for a certain pose are dropped and counted."""
         self._pipeline.finish()

@@ -65,8 +65,65 @@ def test_the_mesh_is_what_the_scan_saw_where_it_was_taken():
     assert np.abs(radii(mesh, (10.0, -3.0, 2.0)) - RADIUS_M).max() <= 0.05
     assert update.milliseconds['tsdf'] > 0.0
     summary = mapper.summary()['tsdf']
-    assert summary['scans'] == 1
+    assert (summary['scans'], summary['waiting']) == (1, 0)
     assert summary['blocks'] == mapper.tsdf.blocks.num_blocks > 0
+
+
+def test_with_when_final_scans_are_fused_as_they_leave_the_window():
+    mapper = mapper_with(**{'layers.tsdf.when_final': True, 'window.max_scans': 2})
+    for number in range(1, 4):
+        insert(mapper, number, (20.0 * number, 0.0, 0.0))
+    assert (mapper.tsdf.summary()['scans'], mapper.tsdf.summary()['waiting']) == (1, 2)
+    assert np.abs(radii(mapper.tsdf.mesh(), (20.0, 0.0, 0.0)) - RADIUS_M).max() <= 0.05
+    mapper.finish_layers()
+    assert (mapper.tsdf.summary()['scans'], mapper.tsdf.summary()['waiting']) == (3, 0)
+    assert mapper.tsdf.mesh().vertices[:, 0].max() > 64.0
+
+
+def test_with_when_final_and_no_window_scans_are_fused_at_once():
+    mapper = mapper_with(**{'layers.tsdf.when_final': True, 'window.max_scans': 0})
+    for number in range(1, 4):
+        insert(mapper, number, (20.0 * number, 0.0, 0.0))
+        assert mapper.tsdf.summary()['scans'] == number
+        assert mapper.tsdf.summary()['waiting'] == 0
+    assert mapper.tsdf.mesh().vertices[:, 0].max() > 64.0
+
+
+def test_with_when_final_scans_of_two_lidars_at_one_time_keep_their_poses():
+    mapper = mapper_with(**{'layers.tsdf.when_final': True, 'window.max_scans': 2})
+    mapper.add_pose('lidar', 'rear', 0, (-40.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), static=True)
+    for number in (1, 2):
+        mapper.add_pose('odom', 'lidar', number * S, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        for frame_id, height_m in (('lidar', 0.0), ('rear', 2.0)):
+            shift = np.float32([0.0, 0.0, height_m])
+            points = sphere().points + shift
+            scan = Scan(points=points, stamp_ns=number * S, frame_id=frame_id)
+            mapper.add_scan(replace(scan, columns={'ring': RING}))
+        assert len(list(mapper.insert_ready())) == 2
+    mapper.finish_layers()
+    assert (mapper.tsdf.summary()['scans'], mapper.tsdf.summary()['waiting']) == (4, 0)
+    mesh = mapper.tsdf.mesh()
+    from_front, from_rear = radii(mesh), radii(mesh, (-40.0, 0.0, 2.0))
+    assert np.abs(np.minimum(from_front, from_rear) - RADIUS_M).max() <= 0.1
+    assert (from_front < 6.0).any()
+    assert (from_rear < 6.0).any()
+
+
+@pytest.mark.parametrize('ends', [False, True], ids=['evicted', 'at the end'])
+def test_a_scan_that_cannot_be_fused_does_not_keep_back_the_others(ends, caplog):
+    settings = {'layers.tsdf.when_final': True, 'layers.tsdf.semantics': 'single'}
+    mapper = mapper_with(**settings, **{'window.max_age_s': 10.0, 'window.max_scans': 0})
+    for number, label in ((1, 1 << 25), (2, 7), (3, 7)):
+        column = np.full(len(RING), label, np.int32)
+        insert(mapper, number, (20.0 * number, 0.0, 0.0), label=column)
+    if ends:
+        mapper.finish_layers()
+    else:
+        insert(mapper, 100)
+    assert 'label' in caplog.text
+    assert mapper.tsdf.summary()['scans'] == 2
+    assert mapper.tsdf.summary()['waiting'] == (0 if ends else 1)
+    assert len(mapper.tsdf.mesh()) > 2000
 
 
 def test_clearing_the_map_clears_the_field():

@@ -166,15 +166,17 @@ def switched_off(fragile, mapper):
     assert 'fragile' in mapper.counters.layers_off
 
 
-def test_a_layer_that_fails_at_the_end_does_not_cost_the_map(fragile, monkeypatch):
+@pytest.mark.parametrize('name', ['finish', 'summary'])
+def test_a_layer_that_fails_at_the_end_does_not_cost_the_map(fragile, monkeypatch, name):
     """A replay ended there, before it wrote the map."""
 
     def broken(self):
         raise MemoryError
 
-    monkeypatch.setattr(fragile, 'summary', broken)
+    monkeypatch.setattr(fragile, name, broken)
     mapper = mapper_with()
     drive(mapper, 1.0)
+    mapper.finish_layers()
     assert 'fragile' not in mapper.summary()
     assert mapper.counters.messages_ignored == {'internal_error': 1}
 

@@ -3,7 +3,9 @@
 """
 The truncated signed distance field as a layer: fused from the scans, published as mesh and slice.
 
-Fusion cannot be undone. The scan of a depth camera is fused as an image, any other as points.
+A scan is fused at once or, with ``layers.tsdf.when_final``, when it leaves the window and its pose
+is final: fusion cannot be undone. The scan of a depth
+camera is fused as an image, any other as points.
 """
 
 from __future__ import annotations
@@ -43,6 +45,7 @@ from surfel_mapper.layers.sensor_models import (
     two_beams,
 )
 from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.memory import machine_bytes
 from surfel_mapper.messages.grids import occupancy_grid
 from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
@@ -111,11 +114,12 @@ class TsdfLayer(Layer):
         esdf = self.config.esdf
         self._esdf = EuclideanField(self.blocks, max_m=esdf.max_m, radius_m=esdf.radius_m)
         self._position: npt.NDArray[np.float64] = np.zeros(3)
+        self._waiting: dict[tuple[str, int], Scan] = {}
         self._num_scans = 0
 
-    def follow(self, inserted: InsertedScan) -> Integrated:
+    def follow(self, inserted: InsertedScan) -> list[Integrated]:
         """
-        Fuse the scan that was inserted.
+        Fuse the scan that was inserted, or those that have left the window.
 
         Raises
         ------
@@ -129,7 +133,17 @@ class TsdfLayer(Layer):
         """
         if len(inserted.cleared):
             self._clear_voxels(inserted.cleared)
-        return self.insert(inserted.scan, inserted.T_map_sensor)
+        if not (self.config.tsdf.when_final and self.around.window.keeps_scans):
+            return [self.insert(inserted.scan, inserted.T_map_sensor)]
+        self._waiting[inserted.scan.frame_id, inserted.scan.stamp_ns] = inserted.scan
+        return self._settle(eviction.scan for eviction in inserted.evictions)
+
+    def finish(self) -> None:
+        """Fuse the scans that still wait, at the poses that they have in the window."""
+        try:
+            self._settle(self.around.window)
+        finally:
+            self._waiting.clear()
 
     def insert(self, scan: Scan, T_map_sensor: npt.NDArray[np.float64]) -> Integrated:
         """
@@ -225,6 +239,7 @@ class TsdfLayer(Layer):
         """Return the figures of the field."""
         return {
             'scans': self._num_scans,
+            'waiting': len(self._waiting),
             'blocks': self.blocks.num_blocks,
             'bytes': self.blocks.nbytes,
             'blocks_evicted': self.blocks.num_evicted,
@@ -316,3 +331,22 @@ class TsdfLayer(Layer):
         heights_m, area = (config.slice_min_m, config.slice_max_m), self._position[:2]
         grid = clearance_slice(self.blocks, heights_m, config.max_m, area, config.radius_m)
         return [occupancy_grid(grid.resolution_m, grid.origin, grid.cost, **moment.header)]
+
+    def _settle(self, scans: Iterable[WindowedScan]) -> list[Integrated]:
+        """
+        Fuse the scans of the window that wait, at their final poses.
+
+        If one cannot be fused, the others are; the first error is raised after them.
+        """
+        results, errors = [], []
+        for windowed in scans:
+            scan = self._waiting.pop((windowed.frame_id, windowed.stamp_ns), None)
+            if scan is None:
+                continue
+            try:
+                results.append(self.insert(scan, windowed.T_map_sensor))
+            except Exception as error:  # MemoryError too
+                errors.append(error)
+        if errors:
+            raise errors[0]
+        return results
