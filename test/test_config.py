@@ -62,11 +62,19 @@ def written(tmp_path, text):
     return path
 
 
-def test_adaptive_surfels_have_no_moments():
-    with pytest.raises(
-        ConfigError, match=r'publish\.adaptive: .* expected publish\.moments false'
-    ):
-        Config.from_mapping({'publish.adaptive': True, 'publish.moments': True})
+@pytest.mark.parametrize(
+    ('settings', 'message'),
+    [
+        ({'publish.moments': True}, r'publish\.adaptive: .* expected publish\.moments false'),
+        (
+            {'publish.marker_color': 'age'},
+            r'publish\.marker_color: age .* expected another colour',
+        ),
+    ],
+)
+def test_adaptive_surfels_have_neither_moments_nor_ages(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        Config.from_mapping({'publish.adaptive': True, **settings})
 
 
 def test_nothing_given_gives_the_defaults():

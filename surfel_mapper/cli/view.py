@@ -34,7 +34,7 @@ EXAMPLE = 'surfel-mapper view street_surfels/ --color height'
 
 COLOURS = (
     *('normal', 'height', 'planarity', 'curvature', 'num_points', 'thickness', 'normal_sigma'),
-    *('radius', 'num_scans', 'size', 'intensity', 'rgb'),
+    *('radius', 'num_scans', 'size', 'intensity', 'rgb', 'age'),
 )
 
 LAST_PORT = 65_534

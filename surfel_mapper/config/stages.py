@@ -26,7 +26,7 @@ AUTO = 'auto'
 MAX_ORIGIN_M = 1e9
 """Limit of a coordinate of map.origin, m: float64 resolves 0.1 micrometres there."""
 
-MARKER_COLORS = ('planarity', 'normal')
+MARKER_COLORS = ('planarity', 'normal', 'age')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -338,7 +338,10 @@ class PublishConfig(Stage):
         high=8,
     )
     marker_color: str = setting(
-        'planarity', 'Colour of the discs of ~/markers.', choices=MARKER_COLORS, live=True
+        'planarity',
+        'Colour of the discs of ~/markers; age: of the newest scan that saw the voxel.',
+        choices=MARKER_COLORS,
+        live=True,
     )
     moments: bool = setting(
         False,
@@ -370,6 +373,11 @@ class PublishConfig(Stage):
             raise ConfigError(
                 f'{stage}.adaptive: the moments are those of voxels, expected {stage}.moments '
                 'false; a client that mirrors the map has mirror.map.adaptive()'
+            )
+        if self.adaptive and self.marker_color == 'age':
+            raise ConfigError(
+                f'{stage}.marker_color: age is known of voxels, expected another colour with '
+                f'{stage}.adaptive'
             )
 
 

@@ -11,6 +11,7 @@ picture before it, with surfels that have left the map.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import math
 from typing import TYPE_CHECKING
 
@@ -18,10 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.geometry import face_normals
+from surfel_mapper.mapping.ages import last_seen_ns
 from surfel_mapper.messages.markers import ADD, DELETE, LINE_LIST, Marker, TRIANGLE_LIST
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
+    from surfel_mapper.mapping.window import WindowedScan
     from surfel_mapper.tsdf.mesh import Mesh
 
 
@@ -170,9 +173,32 @@ def shades(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
     return np.asarray(TABLE[steps.astype(np.uint8)])
 
 
-def disc_colors(kind: str, surfels: Surfels) -> npt.NDArray[np.float32]:
-    """Return the colours of K surfels, (K, 4), of a kind: planarity or normal."""
-    return normal_colors(surfels.normal) if kind == 'normal' else shades(surfels.planarity)
+def disc_colors(
+    kind: str, surfels: Surfels, scans: Iterable[WindowedScan] = ()
+) -> npt.NDArray[np.float32]:
+    """
+    Return the colours of surfels, (K, 4).
+
+    Parameters
+    ----------
+    kind : str
+        planarity, normal or age. The age is that of the newest scan that saw the voxel, from dark
+        for the oldest scan of the window to bright for the newest.
+    surfels : Surfels
+        K of them.
+    scans : iterable of WindowedScan
+        The scans of the window.
+
+    """
+    if kind == 'normal':
+        return normal_colors(surfels.normal)
+    if kind == 'planarity':
+        return shades(surfels.planarity)
+    window = list(scans)
+    stamps = [scan.stamp_ns for scan in window] or [0]
+    span_ns = max(max(stamps) - min(stamps), 1)
+    last_ns = last_seen_ns(surfels.voxel_index, window)
+    return shades((last_ns - min(stamps)) / span_ns)
 
 
 def normal_colors(normal: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:

@@ -15,6 +15,7 @@ import numpy as np
 from surfel_mapper.compilation import CompileStage
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.images import warm_up as warm_up_depth
 from surfel_mapper.messages.map_cloud import moment_cloud
 from surfel_mapper.messages.scan_normals import scan_with_normals
@@ -38,9 +39,10 @@ def compile_messages(config: Config) -> None:
     """Compile the kernels of outgoing messages, and load their libraries by running them once."""
     surfel_map = SurfelMap(config.map.voxel_size_m)
     points = np.ones((1, 3), expected_type(config))
-    surfel_map.add(points)
+    moments = surfel_map.add(points)
     surfels = surfel_map.surfels()
     scan_with_normals(Scan(points=points, stamp_ns=0, frame_id=''), np.eye(4), surfel_map, 1)
-    colors = disc_colors('planarity', surfels)
+    windowed = WindowedScan(moments=moments, stamp_ns=0, T_map_sensor=np.eye(4))
+    colors = disc_colors('age', surfels, [windowed])
     surfel_markers(surfels, config.map.voxel_size_m, colors, stamp_ns=0, frame_id='')
     moment_cloud(surfels, surfel_map.moments(), np.empty((0, 3), np.int32))

@@ -283,7 +283,7 @@ class Outputs:
         markers = surfel_markers(
             surfels,
             surfel_map.voxel_size_m,
-            disc_colors(config.publish.marker_color, surfels),
+            disc_colors(config.publish.marker_color, surfels, self._mapper.window),
             stamp_ns=self._stamp_ns,
             frame_id=self._mapper.map_frame,
         )

@@ -33,6 +33,7 @@ from surfel_mapper.files.trajectory import SUFFIXES as TRAJECTORIES
 from surfel_mapper.files.triangles import read_triangles
 from surfel_mapper.files.triangles import SUFFIXES as TRIANGLES
 from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
+from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.discs import DrawnDiscs, RGB, SPREAD
 
@@ -62,12 +63,15 @@ class Content:
         Moments in the frame of their map, all others in the fixed frame.
     origin_m : (3,) float64, m
         Of a map.
+    scans : list of WindowedScan
+        Those of the window of a map, for ages.
 
     """
 
     name: str
     shape: ScanMoments | DrawnDiscs | Array | Mesh | Trajectory
     origin_m: Array = field(default_factory=lambda: np.zeros(3))
+    scans: list[WindowedScan] = field(default_factory=list)
 
     def positions(self) -> Array:
         """Return positions in the fixed frame, (N, 3) m; of a map up to some 100,000 voxels."""
@@ -119,8 +123,8 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
     if is_table or is_cloud(path) or (suffix == '.obj' and looks_like_points(path)):
         yield cloud(path, name)
     elif suffix == '.npz':
-        surfel_map, _ = map_state.load_map(path)
-        yield Content(name, surfel_map.moments(), surfel_map.origin_m)
+        surfel_map, scans = map_state.load_map(path)
+        yield Content(name, surfel_map.moments(), surfel_map.origin_m, scans)
     elif suffix == '.parquet':
         surfel_map = parquet.read_map(path)
         yield Content(name, surfel_map.moments(), surfel_map.origin_m)

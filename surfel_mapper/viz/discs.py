@@ -19,20 +19,23 @@ import numpy.typing as npt
 
 from surfel_mapper.arguments import Record
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.mapping.ages import ages_s, last_seen_ns
 from surfel_mapper.mapping.surfels import QUALITY, Surfels
+from surfel_mapper.mapping.window import WindowedScan
 
 Array = npt.NDArray[np.float64]
 
 COLUMNS = ('planarity', 'curvature', 'num_points', *QUALITY)
 """Columns of Surfels that discs have as values."""
 
-COLOURINGS = ('normal', 'height', *COLUMNS, 'intensity', 'rgb')
+COLOURINGS = ('normal', 'height', *COLUMNS, 'intensity', 'rgb', 'age')
 """Colours of discs: shaded by normal and light, or of a value."""
 
 RGB = ('red', 'green', 'blue')
 
 UNITS = {
     'height': 'm',
+    'age': 's',
     'thickness': 'm',
     'normal_sigma': 'rad',
     'radius': 'm',
@@ -93,10 +96,13 @@ class DrawnDiscs(Record):
     grid_m: Array = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
-    def of(cls, surfels: Surfels) -> DrawnDiscs:
-        """Return the discs of surfels that have a normal."""
+    def of(cls, surfels: Surfels, scans: Sequence[WindowedScan] = ()) -> DrawnDiscs:
+        """Return the discs of surfels that have a normal, with their ages in a window of scans."""
         is_known = np.isfinite(surfels.planarity)
         values = {name: getattr(surfels, name) for name in COLUMNS} | dict(surfels.channels)
+        if scans:
+            newest_ns = max(scan.stamp_ns for scan in scans)
+            values['age'] = ages_s(last_seen_ns(surfels.voxel_index, scans), newest_ns)
         return cls(
             surfels.position[is_known],
             surfels.normal[is_known],

@@ -81,7 +81,8 @@ def show_contents(
     origin_m = shared_origin(contents)
     scene.set_origin(origin_m)
     looked_at = np.asarray(place_of(contents) if target is None else target, np.float64) - origin_m
-    tiles, about = all_discs(contents, origin_m, looked_at, (most_discs, min_points))
+    with_ages = colouring == 'age'
+    tiles, about = all_discs(contents, origin_m, looked_at, (most_discs, min_points, with_ages))
     if any(map(len, tiles.values())):
         scene.colouring = Colouring.over(colouring, list(tiles.values()))
     positions = [discs.position for discs in tiles.values()]
@@ -112,7 +113,7 @@ def show_contents(
 
 
 def all_discs(
-    contents: Sequence[Content], origin_m: Array, target: Array, limits: tuple[int, int]
+    contents: Sequence[Content], origin_m: Array, target: Array, limits: tuple[int, int, bool]
 ) -> tuple[dict[str, DrawnDiscs], dict[str, str]]:
     """
     Return the discs of maps and surfels by path, and a sentence about each by name.
@@ -123,11 +124,12 @@ def all_discs(
         The maps and surfels; others are passed over.
     origin_m, target : (3,) float64, m
         Origin of the scene in the fixed frame, and the position looked at in the scene.
-    limits : (int, int)
-        Limit of the discs of all maps, and least points of a voxel.
+    limits : (int, int, bool)
+        Limit of the discs of all maps, least points of a voxel, and whether ages are shown, which
+        voxels have and adaptive surfels do not.
 
     """
-    most_discs, min_points = limits
+    most_discs, min_points, with_ages = limits
     num_maps = sum(isinstance(content.shape, ScanMoments) for content in contents)
     tiles: dict[str, DrawnDiscs] = {}
     about: dict[str, str] = {}
@@ -137,7 +139,7 @@ def all_discs(
             whole = DetailedMap(shape, min_points)
             level = whole.choose(target - shift_m, most_discs // num_maps)
             about[content.name] = map_text(whole, level, shape.voxel_size_m)
-            if level.any() or shape.level:
+            if level.any() or with_ages or shape.level:
                 tiles.update(map_tiles(content, whole, level, shift_m))
             else:
                 discs = adaptive_discs(shape, min_points)
@@ -154,7 +156,7 @@ def adaptive_discs(moments: ScanMoments, min_points: int) -> DrawnDiscs:
     has = [name for name, channels in CHANNELS.items() if channels[0] in moments.channel_names]
     surfel_map = SurfelMap(moments.voxel_size_m, columns=tuple(has))
     surfel_map.insert(moments)
-    return DrawnDiscs.of(surfel_map.adaptive(min_points))
+    return DrawnDiscs.of(surfel_map.adaptive(min_points), [])
 
 
 def moved(discs: DrawnDiscs, shift_m: Array) -> DrawnDiscs:
@@ -169,7 +171,7 @@ def map_tiles(
     tiles = {}
     for tile, surfels in enumerate(whole.all_surfels(level)):
         name = 'tile_{}_{}'.format(*whole.tiles[tile]).replace('-', 'm')
-        discs = DrawnDiscs.of(surfels)
+        discs = DrawnDiscs.of(surfels, [] if level[tile] else content.scans)
         values = {**discs.values, 'level': np.full(len(discs), level[tile])}
         tiles[f'map/{content.name}/{name}'] = moved(replace(discs, values=values), shift_m)
     return tiles

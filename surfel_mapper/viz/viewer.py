@@ -113,7 +113,7 @@ class Viewer:
         if not self._is_placed:
             self._is_placed = True
             scene.set_origin(self._mapper.map.origin_m)
-            level = levelled(DrawnDiscs.of(update.changed))
+            level = levelled(self._discs(update.changed))
             scene.look(position - AROUND_M, position + AROUND_M, position, level)
         scene.set_stamp(update.stamp_ns)
         pose = rerun.Transform3D(translation=position, mat3x3=update.T_map_sensor[:3, :3])
@@ -126,12 +126,12 @@ class Viewer:
         scene.log('map/window', poses)
         if whole:
             self._show_map()
-        scene.discs('map/changed', DrawnDiscs.of(update.changed))
+        scene.discs('map/changed', self._discs(update.changed))
 
     def _show_map(self) -> None:
         """Show all surfels, and the shapes of the layers."""
         self._shown_voxels, self._removed = self._mapper.map.num_voxels, 0
-        surfels = DrawnDiscs.of(self._surfels())
+        surfels = self._discs(self._surfels())
         self._scene.colouring = Colouring.over(self._colouring, [surfels])
         self._scene.discs('map/surfels', surfels)
         layers = self._mapper.layers.values()
@@ -166,9 +166,16 @@ class Viewer:
             self._scene.log(name, ellipsoids)
 
     def _surfels(self) -> Surfels:
-        """Return the adaptive surfels."""
+        """Return the adaptive surfels; those of voxels if ages are shown, which voxels have."""
+        if self._colouring == 'age':
+            return self._mapper.map.surfels(self._mapper.config.map.min_points)
         self._cut.refresh()
         return self._cut.surfels()
+
+    def _discs(self, surfels: Surfels) -> DrawnDiscs:
+        """Return surfels as discs; with their ages if these are shown."""
+        scans = list(self._mapper.window) if self._colouring == 'age' else []
+        return DrawnDiscs.of(surfels, scans)
 
 
 def picked(points: npt.NDArray[Any]) -> npt.NDArray[Any]:

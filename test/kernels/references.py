@@ -30,7 +30,7 @@ REFERENCES = {
     'kernels/quantisation.py': 'mapping/test_moments.py',
     'kernels/symmetric3.py': 'kernels/test_symmetric3.py',
     'mapping/kernels/adaptive.py': 'mapping/test_adaptive.py',
-    'mapping/kernels/queries.py': 'mapping/test_levels.py',
+    'mapping/kernels/queries.py': 'mapping/test_ages.py',
     'mapping/kernels/reduction.py': 'mapping/test_moments.py',
     'mapping/kernels/rows.py': 'mapping/kernels/test_rows.py',
     'mapping/kernels/surfels.py': 'mapping/kernels/test_surfels.py',

@@ -8,7 +8,9 @@ SHORT_MAPPING = """
 import hashlib
 import numpy as np
 from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.mapping.ages import last_seen_ns
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import WindowedScan
 
 rng = np.random.default_rng(1)
 surfel_map, live = SurfelMap(0.2), []
@@ -34,6 +36,10 @@ index = coarse.index(2)
 points = index.surfels.position + rng.normal(size=(len(index.surfels), 3))
 print(coarse.digest(), index.at(points).tolist(), index.nearest(points, 0.7)[0].tolist())
 print(len(surfel_map.surfels_changed(since=surfel_map.version - 3)))
+window = [WindowedScan(moments=each, stamp_ns=n, T_map_sensor=pose) for n, each in enumerate(live)]
+few = surfel_map.surfels(1, at_most=100).voxel_index
+for scans in (window, window[1:]):
+    print(np.bincount(last_seen_ns(few, scans) + 1))
 try:
     surfel_map.remove(live[0])
     surfel_map.remove(live[0])
@@ -45,4 +51,4 @@ except ValueError as error:
 def test_a_map_is_the_same_to_the_bit_without_the_compiler():
     text = printed_alike(SHORT_MAPPING)
     assert 'does not hold' in text
-    assert len(text.splitlines()) == 18
+    assert len(text.splitlines()) == 20

@@ -5,6 +5,8 @@
 import numpy as np
 import pytest
 
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
 from surfel_mapper.messages.markers import (
     ADD,
     DELETE,
@@ -89,6 +91,22 @@ def test_normals_have_the_colours_of_their_directions():
     surfels = make_surfels(3)
     np.testing.assert_array_equal(disc_colors('normal', surfels), normal_colors(surfels.normal))
     np.testing.assert_array_equal(disc_colors('planarity', surfels), shades(surfels.planarity))
+
+
+def test_the_age_of_a_disc_is_that_of_the_newest_scan_that_saw_its_voxel():
+    window = SlidingWindow(SurfelMap(1.0))
+    places = [[0.5, 1.5], [1.5, 2.5], [2.5]]  # along x, by scan
+    for number, along in enumerate(places):
+        points = np.array([[x + d, 0.1 * d, 0.3] for x in along for d in (0.0, 0.1, 0.2)])
+        moments = window._map.reduce(points)
+        window.insert(WindowedScan(moments=moments, stamp_ns=10 * number, T_map_sensor=np.eye(4)))
+    surfels = window._map.surfels()
+    found = disc_colors('age', surfels, window)
+    expected = {0: 0.0, 1: 0.5, 2: 1.0}
+    shares = np.array([expected[x] for x in surfels.voxel_index[:, 0].tolist()])
+    np.testing.assert_array_equal(found, shades(shares))
+    nothing = disc_colors('age', surfels, [])
+    np.testing.assert_array_equal(nothing, shades(np.zeros(3)))
 
 
 def test_discs_and_normals_of_all_surfels_are_drawn():

@@ -233,6 +233,8 @@ def test_markers_follow_colour_limit_and_clearing(start, peer):
 
     change('publish.marker_color', 'planarity')
     peer.spin_until(lambda: is_shown(shades(surfels.planarity)))
+    change('publish.marker_color', 'age')
+    peer.spin_until(lambda: 1 < len(np.unique(colors_of(markers[-1].markers[0]), axis=0)) <= 3)
     assert peer.call('clear').success
     peer.spin_until(lambda: {m.action for m in markers[-1].markers} == {Marker.DELETE})
 

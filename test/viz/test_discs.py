@@ -113,8 +113,8 @@ def many(**values):
 
 
 def test_unknown_values_are_grey():
-    shown = discs(thickness=np.array([0.0, np.nan, 1.0]))
-    colours = Colouring.over('thickness', [shown]).of(shown)
+    shown = discs(age=np.array([0.0, np.nan, 1.0]))
+    colours = Colouring.over('age', [shown]).of(shown)
     assert np.ptp(colours[1].astype(int)) == 0
     np.testing.assert_array_equal(colours[[0, 2]], VIRIDIS_ENDS)
 

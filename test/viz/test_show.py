@@ -12,9 +12,11 @@ from scipy.spatial import cKDTree
 
 from surfel_mapper import SurfelMap, Trajectory
 from surfel_mapper.cli.main import main
+from surfel_mapper.files.map_state import save_map
 from surfel_mapper.files.mesh_ply import write_mesh
 from surfel_mapper.files.parquet_tiles import write_tiles
 from surfel_mapper.files.ply import write_points
+from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.viz.discs import CORNERS, OUTER, SPREAD
 from test import extras
 from test.bags.recorded import drive, write_rosbag2
@@ -235,6 +237,22 @@ def test_models_of_obj_are_a_mesh(tmp_path):
     )
     found = shown(tmp_path, tmp_path / 'models.obj')['/map/models']
     assert found['Mesh3D:triangle_indices'] == [[0, 1, 2], [2, 3, 0], [4, 5, 6]]
+
+
+def test_ages_count_back_from_the_newest_scan(tmp_path):
+    surfel_map, scans = SurfelMap(0.5), []
+    for number, x in enumerate((0.0, 10.0, 20.0)):
+        moments = surfel_map.add(ground(4000, number) * [0.1, 0.1, 1.0] + [x, 0.0, 0.0])
+        pose = np.eye(4)
+        scans.append(
+            WindowedScan(moments=moments, stamp_ns=START_NS + number * 10**9, T_map_sensor=pose)
+        )
+    save_map(tmp_path / 'map.npz', surfel_map, scans)
+    found = shown(tmp_path, tmp_path / 'map.npz', '--color', 'age')
+
+    places = together(found, '/map/', 'Points3D:positions')
+    age = together(found, '/map/', 'age')
+    np.testing.assert_allclose(age, 2.0 - np.rint(places[:, 0] / 10.0))
 
 
 def test_several_maps_are_shown_by_the_names_of_their_directories(tmp_path):
