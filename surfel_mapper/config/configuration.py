@@ -91,6 +91,7 @@ class Config:
     filters: str = setting(
         '',
         'YAML file of the chain of filters applied to every scan before mapping; empty: none.',
+        live=True,
     )
     autostart: bool = setting(
         True, 'The node configures and activates itself; false: a lifecycle manager does.'

@@ -260,6 +260,11 @@ class InputConfig(Stage):
         'Topics of the clouds or images, one a sensor; empty: points, or depth/image.',
         items=str,
     )
+    filters_directory: str = setting(
+        '',
+        'Directory of the files that filters may name while the node runs; empty: that of the '
+        'parameter file.',
+    )
     min_range_m: float = setting(
         0.1, 'Points nearer to the origin of their frame are ignored, m.', low=0.0, high=1e6
     )

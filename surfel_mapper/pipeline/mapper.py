@@ -526,7 +526,8 @@ class Mapper:
         Raises
         ------
         ConfigError
-            If a setting differs that is not live. Nothing has changed then.
+            If a setting differs that is not live, or ``filters`` names a file
+            that holds no chain. Nothing has changed then.
 
         """
         check_kind('config', config, Config)
@@ -546,8 +547,8 @@ class Mapper:
         """
         Return the stages of ``warm_up``, for callers that have more to compile.
 
-        They change nothing of the mapper. Kernels that few inputs need, as voxels of 65536 points
-        of one scan do, are compiled when they are called first.
+        They change nothing of the mapper. Kernels that few inputs need are compiled when they are
+        called first: for voxels of 65536 points of one scan, or after ``~/clear_polygon``.
         """
         return self._pipeline.warm_up_stages()
 

@@ -80,6 +80,7 @@ class Preparation:
         drops: Drops,
     ) -> None:
         self.local_map: LocalMap | None = None
+        self._filters = config.filters
         self._poses = poses
         self._around = around
         self._aligner = aligner
@@ -87,6 +88,21 @@ class Preparation:
         self._needs_free_rays = needs_free_rays
         self._drops = drops
         self.chain = Chain.load(config.filters) if config.filters else Chain()
+
+    def load_filters(self, path: str) -> None:
+        """
+        Load the chain of filters of a file, if its path has changed.
+
+        Raises
+        ------
+        ConfigError
+            If the file holds no chain; nothing has changed then.
+
+        """
+        if path != self._filters:
+            chain = Chain.load(path) if path else Chain()
+            chain.warm_up()
+            self.chain, self._filters = chain, path
 
     def warm_up_stages(self, config: Config) -> list[CompileStage]:
         """Return the stages that compile the kernels of preparation, as far as it uses any."""

@@ -430,7 +430,8 @@ class ScanPipeline:
                 self.preparation.local_map = self._local_map
 
     def reconfigure(self, config: Config) -> None:
-        """Take new settings."""
+        """Take new settings; if preparation refuses them, nothing has changed."""
+        self.preparation.load_filters(config.filters)
         self.config = config
         self.layers.reconfigure(config)
         self._set_limits()

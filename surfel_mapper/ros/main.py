@@ -46,7 +46,7 @@ def run_node(ros_args: Sequence[str], signals: Signals) -> None:
     """
     keep_freed_memory()
     with context(ros_args):
-        node = create_node()
+        node = create_node(ros_args)
         try:
             for text in unread_files(ros_args, node.get_name()):
                 node.get_logger().warning(text)
@@ -56,7 +56,7 @@ def run_node(ros_args: Sequence[str], signals: Signals) -> None:
             node.destroy_node()
 
 
-def create_node() -> MapperNode:
+def create_node(ros_args: Sequence[str] = ()) -> MapperNode:
     """
     Create the node; the middleware starts its threads, and refuses here if it lacks security.
 
@@ -64,7 +64,7 @@ def create_node() -> MapperNode:
     """
     try:
         with real_time_threads():
-            return MapperNode()
+            return MapperNode(ros_args)
     except rclpy_implementation.RCLError as error:
         raise ConfigError(f'ROS cannot make the node: {explain(error)}') from error
 

@@ -15,7 +15,7 @@ diagnostics have a thread each, as a request may take long.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -34,11 +34,13 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
 from surfel_mapper.budget import stated_limit
+from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError, SurfelMapperError
 from surfel_mapper.pipeline.scan_poses import standing_sensor
 from surfel_mapper.ros.base_node import BaseNode, result_of
 from surfel_mapper.ros.bond import Bond
 from surfel_mapper.ros.diagnostics import Diagnostics
+from surfel_mapper.ros.filter_files import check_chain, FilterFiles
 from surfel_mapper.ros.main_thread import TaskQueue
 from surfel_mapper.ros.parameters import as_declared, declare_settings, refusal, settings_among
 from surfel_mapper.ros.session import Session
@@ -57,6 +59,11 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
     refusal : Exception or None
         The reason why the last transition was refused.
 
+    Parameters
+    ----------
+    ros_args : sequence of str
+        The command line; see FilterFiles.
+
     Raises
     ------
     ConfigError
@@ -64,7 +71,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ros_args: Sequence[str] = ()) -> None:
         """Declare the parameters and create the services of the life cycle."""
         try:
             Node.__init__(self, 'surfel_mapper')
@@ -74,6 +81,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         self.refusal: Exception | None = None
         self._session: Session | None = None
         self._config = declare_settings(self)
+        self._filter_files = FilterFiles(self._config, ros_args)
         # reentrant, so that get_state is answered while kernels compile
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
         self._change_state = self._service_change_state.callback
@@ -267,9 +275,9 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         return done
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse values that the configuration refuses."""
+        """Refuse values that the configuration refuses, and invalid filter files."""
         try:
-            self._config.replace(settings_among(parameters))
+            self._changed(self._config, parameters)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -282,11 +290,20 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         of rclpy meanwhile, for example those of QoS: it must not write settings back that it has
         read before they changed.
         """
-        changes = settings_among(parameters)
-        if not changes:
+        if not settings_among(parameters):
             return
-        config = self._config.replace(changes)
+        config = self._changed(self._config, parameters)
         if config != self._config:
             self._config = config
             if self._session is not None:
                 self._session.reconfigure(config)
+
+    def _changed(self, config: Config, parameters: Sequence[Parameter]) -> Config:
+        """Return a configuration with changed settings; raise ConfigError if one is refused."""
+        changes = settings_among(parameters)
+        if isinstance(changes.get('filters'), str):
+            changes['filters'] = self._filter_files.path(changes['filters'])
+        changed = config.replace(changes)
+        if changed.filters and changed.filters != config.filters:
+            check_chain(changed.filters)
+        return changed

@@ -23,13 +23,12 @@ from rclpy.parameter import Parameter
 from surfel_mapper.config import checked, Config, Declaration, declarations, near, read_yaml
 from surfel_mapper.config.parameters_file import parts_of
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.ros.filter_files import PARAMS_FILE
 
 QOS_OVERRIDES = 'qos_overrides.'
 """rclpy declares parameters of this prefix when it subscribes to their topics."""
 
 INT64_MAX = 2**63 - 1
-
-PARAMS_FILE = '--params-file'
 
 FLOATS = {
     Parameter.Type.INTEGER: Parameter.Type.DOUBLE,

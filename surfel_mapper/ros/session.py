@@ -13,7 +13,7 @@ import time
 
 from surfel_mapper.compilation import CompileStage, run_stages
 from surfel_mapper.config import Config
-from surfel_mapper.errors import counted, SurfelMapperError
+from surfel_mapper.errors import ConfigError, counted, SurfelMapperError
 from surfel_mapper.files.atomic import remove_abandoned
 from surfel_mapper.memory import lasting_objects
 from surfel_mapper.pipeline import Mapper, Update
@@ -21,6 +21,7 @@ from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
 from surfel_mapper.pipeline.warm_up import node_stages
 from surfel_mapper.poses import AUTO, SourceChoice
 from surfel_mapper.ros.base_node import BaseNode
+from surfel_mapper.ros.filter_files import fault_of
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.main_thread import TaskQueue
 from surfel_mapper.ros.map_files import directory_of, MapWriter, save_map
@@ -200,7 +201,12 @@ class Session:
 
     def _reconfigure(self) -> None:
         """Pass the newest settings to the mapper; called in the mapping thread."""
-        self.mapper.reconfigure(self.config)
+        try:
+            self.mapper.reconfigure(self.config)
+        except ConfigError:  # the filter file has changed since it was checked
+            fault = fault_of(self.config.filters)
+            text = f'settings not applied: filters: {self.config.filters}: {fault}'
+            self._node.get_logger().error(text)
         self.outputs.expire()
 
 

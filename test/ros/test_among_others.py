@@ -116,6 +116,40 @@ def test_a_parameter_of_no_known_type_is_refused(start, peer, kind):
     node.check()
 
 
+def test_filters_change_while_running_and_bad_files_are_refused(start, peer, tmp_path):
+    node = start('node', *ARGUMENTS, '-p', f'input.filters_directory:={tmp_path}')
+    peer.advertise('/odom', '/points')
+    client = peer.parameters()
+    near, wrong = tmp_path / 'near.yaml', tmp_path / 'wrong.yaml'
+    near.write_text('- MaxDistDataPointsFilter:\n    maxDist: 3.0\n', encoding='utf-8')
+    wrong.write_text('- MaxDistDataPointFilter\n', encoding='utf-8')
+
+    def change(path):
+        found = client.set_parameters([Parameter('filters', value=str(path))])
+        return peer.result(found).results[0]
+
+    messages = drive(3)
+    send(peer, messages[:1])
+    peer.diagnosis({'scans.mapped': 1})
+    for path, reason in (
+        (tmp_path / 'nowhere.yaml', 'cannot be read'),
+        (wrong, 'no valid chain of filters'),
+    ):
+        refused = change(path)
+        assert not refused.successful
+        assert reason in refused.reason
+    assert change(near).successful
+    send(peer, messages[1:2])
+    _, values = peer.diagnosis({'scans.mapped': 2})
+    left_out = int(values['points_left_out.filtered'])
+    assert 1000 < left_out < 4000
+    assert change('').successful
+    send(peer, messages[2:])
+    _, values = peer.diagnosis({'scans.mapped': 3})
+    assert int(values['points_left_out.filtered']) == left_out
+    assert 'Traceback' not in node.output
+
+
 def test_limits_and_rates_change_while_running(start, peer):
     start('node', *ARGUMENTS, '-p', 'publish.normals_rate_hz:=0.0')
     peer.advertise('/odom', '/points')

@@ -63,7 +63,7 @@ def test_each_refusal_has_its_reason_and_the_others_are_set(node, peer):
             'clear.radius_m: -1, expected',
             'clear.box: 2 values',
             'clear.box: 2 values',
-            'filters: read-only',
+            'give the directory of chains at the start',
         ),
         strict=True,
     ):
