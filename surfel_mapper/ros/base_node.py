@@ -12,7 +12,7 @@ the node goes on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import wraps
@@ -115,9 +115,21 @@ class BaseNode(Node):
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **kwargs: Any
     ) -> Service:
         """Create a service."""
+        if srv_type is SetParameters:
+            callback = self._on_set_parameters
         if srv_type is not ChangeState:  # its errors end the node, see MapperNode
             callback = self._answered(srv_name, callback)
         return super().create_service(srv_type, srv_name, callback, **kwargs)
+
+    def set_each(self, parameters: Sequence[Parameter]) -> Sequence[SetParametersResult]:
+        """Set each parameter of a service request, and return the results."""
+        return self.set_parameters([*parameters])  # type: ignore[no-any-return]
+
+    def _on_set_parameters(
+        self, request: SetParameters.Request, response: SetParameters.Response
+    ) -> SetParameters.Response:
+        response.results = self.set_each([*map(Parameter.from_parameter_msg, request.parameters)])
+        return response
 
     def _survived(self, task: str, callback: Callable[..., None]) -> Callable[..., None]:
         """Return a callback whose errors are reported."""

@@ -42,7 +42,7 @@ from surfel_mapper.ros.bond import Bond
 from surfel_mapper.ros.diagnostics import Diagnostics
 from surfel_mapper.ros.filter_files import check_chain, FilterFiles
 from surfel_mapper.ros.main_thread import TaskQueue
-from surfel_mapper.ros.parameters import as_declared, declare_settings, refusal, settings_among
+from surfel_mapper.ros.parameters import as_declared, declare_settings, refusals, settings_among
 from surfel_mapper.ros.session import Session
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -136,9 +136,36 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters from a service request; a refusal names the parameter and the reason."""
         parameters = [as_declared(p) for p in parameter_list]
-        for reason in filter(None, (refusal(self, p) for p in parameters)):
+        for reason in refusals(self, parameters).values():
             return SetParametersResult(successful=False, reason=reason)
         return super().set_parameters_atomically(parameters)
+
+    def set_each(self, parameters: Sequence[Parameter]) -> list[SetParametersResult]:
+        """
+        Set each parameter of a service request that is accepted; return the results.
+
+        Those accepted change the configuration together: at 20 ms for each, 500 would hold all
+        other requests for 10 s. If one name comes several times, its last value counts.
+        """
+        latest = {p.name: as_declared(p) for p in parameters}
+        reasons = refusals(self, [*latest.values()])
+        accepted = [p for p in latest.values() if p.name not in reasons]
+        if not self._check_parameters(accepted).successful:  # conditions on several settings
+            candidates, accepted, config = accepted, [], self._config
+            for parameter in candidates:
+                try:
+                    config = self._changed(config, [parameter])
+                except ConfigError as error:
+                    reasons[parameter.name] = str(error)
+                else:
+                    accepted.append(parameter)
+        result = super().set_parameters_atomically(accepted)
+        if not result.successful:
+            reasons.update((p.name, result.reason) for p in accepted)
+        return [
+            SetParametersResult(successful=p.name not in reasons, reason=reasons.get(p.name, ''))
+            for p in parameters
+        ]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Compile the kernels, then create publishers and services."""

@@ -30,6 +30,9 @@ QOS_OVERRIDES = 'qos_overrides.'
 
 INT64_MAX = 2**63 - 1
 
+MAX_SUGGESTIONS = 10
+"""Unknown names of a request for which a similar one is searched; a search takes 2 ms."""
+
 FLOATS = {
     Parameter.Type.INTEGER: Parameter.Type.DOUBLE,
     Parameter.Type.INTEGER_ARRAY: Parameter.Type.DOUBLE_ARRAY,
@@ -114,25 +117,33 @@ def settings_among(parameters: Iterable[Parameter]) -> dict[str, Any]:
     return {p.name: p.value for p in parameters if p.name in names}
 
 
-def refusal(node: Node, parameter: Parameter) -> str:
+def refusals(node: Node, parameters: Sequence[Parameter]) -> dict[str, str]:
     """
-    Return why a parameter cannot be set on a running node; empty if it can.
+    Return why parameters cannot be set on a running node, by name.
 
-    It is unknown, read-only, of another type or out of bounds.
+    They are unknown, read-only, of another type or out of bounds. The nearest names of unknown
+    ones are searched for MAX_SUGGESTIONS of a request, since a search takes milliseconds.
     """
-    settings, name = {declared.name: declared for declared in declarations()}, parameter.name
-    if not node.has_parameter(name):
-        return f'{name}: no such setting{near(name, settings)}'
-    if node.describe_parameter(name).read_only:
-        return f'{name}: read-only, cannot change while running; set it at the start'
-    if name in settings:
-        try:
-            checked(name, parameter.value, settings[name])
-        except ConfigError as error:
-            return str(error)
-        if parameter.type_.value != node.describe_parameter(name).type:
-            return f'{name}: an empty list of another type'
-    return ''
+    settings = {declared.name: declared for declared in declarations()}
+    reasons: dict[str, str] = {}
+    num_unknown = 0
+    for parameter in parameters:
+        name = parameter.name
+        if not node.has_parameter(name):
+            num_unknown += 1
+            suggestion = near(name, settings) if num_unknown <= MAX_SUGGESTIONS else ''
+            reasons[name] = f'{name}: no such setting{suggestion}'
+        elif node.describe_parameter(name).read_only:
+            reasons[name] = f'{name}: read-only, cannot change while running; set it at the start'
+        elif name in settings:
+            try:
+                checked(name, parameter.value, settings[name])
+            except ConfigError as error:
+                reasons[name] = str(error)
+            else:
+                if parameter.type_.value != node.describe_parameter(name).type:
+                    reasons[name] = f'{name}: an empty list of another type'
+    return reasons
 
 
 def as_declared(parameter: Parameter) -> Parameter:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Requests that set parameters: a result for each."""
+"""Requests that set parameters: one change of the configuration, with a result for each."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
+from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 
 from surfel_mapper.ros.context import context
@@ -35,6 +36,23 @@ def change(peer, pairs):
 
 def values(node, *names):
     return [node.get_parameter(name).value for name in names]
+
+
+def test_five_hundred_parameters_are_one_change(node, peer):
+    events = peer.subscribe(ParameterEvent, '/parameter_events')
+    peer.meet()
+    names = 'clear.radius_m', 'window.max_scans'
+    pairs = [(names[n % 2], n) for n in range(500)]
+
+    assert change(peer, pairs) == [None] * 500
+
+    peer.spin_until(lambda: any(event.changed_parameters for event in events))
+    ((first, second),) = [event.changed_parameters for event in events if event.changed_parameters]
+    assert {first.name: first.value.double_value, second.name: second.value.integer_value} == {
+        'clear.radius_m': 498.0,
+        'window.max_scans': 499,
+    }
+    assert values(node, 'window.max_scans', 'clear.radius_m') == [499, 498.0]
 
 
 def test_each_refusal_has_its_reason_and_the_others_are_set(node, peer):
