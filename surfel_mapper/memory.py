@@ -46,32 +46,15 @@ def keep_freed_memory() -> None:
     bytes(LARGEST)
 
 
-RARELY = 50_000
-"""New objects between two collections while kernels compile; Python's default is 700. Without any
-collection the garbage of the compiler takes 60 MB."""
-
-
-@contextmanager
-def rare_collections() -> Iterator[None]:
-    """Collect garbage rarely in a with-block that compiles kernels."""
-    thresholds = gc.get_threshold()
-    gc.set_threshold(RARELY, *thresholds[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*thresholds)
-
-
 @contextmanager
 def lasting_objects() -> Iterator[None]:
     """
-    Collect garbage rarely in a with-block, and never visit the objects made so far after it.
+    Never visit the objects made until the end of a with-block when garbage is collected.
 
     For the start of a process whose objects stay: imported libraries and compiled kernels.
     """
     try:
-        with rare_collections():
-            yield
+        yield
     finally:
         gc.collect()
         gc.freeze()
