@@ -21,15 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError, FilterError
-from surfel_mapper.filters.base import Filter, Mask, parameter
-from surfel_mapper.filters.kernels.limits import (
-    ALWAYS,
-    BOTH,
-    EITHER,
-    in_wedge,
-    NEVER,
-    outside_box,
-)
+from surfel_mapper.filters.base import Array, Filter, Mask, parameter
+from surfel_mapper.filters.kernels.limits import outside_box
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
 
@@ -209,31 +202,36 @@ class AngleLimit(Filter):
         phi, theta = [self.phi_min_deg, self.phi_max_deg], [self.theta_min_deg, self.theta_max_deg]
         if self.remove_inside:  # above the highest or below the lowest
             phi, theta = phi[::-1], theta[::-1]
-        kinds = [
-            phi_kind(phi[0], below=False),
-            phi_kind(phi[1], below=True),
-            theta_kind(theta[0], below=False),
-            theta_kind(theta[1], below=True),
-        ]
-        cosines = [cosine(limit) if math.isfinite(limit) else 0.0 for limit in (*phi, *theta)]
-        is_beyond = np.empty(len(scan), np.bool_)
-        of_type = np.array(cosines, scan.points.dtype)
-        in_wedge(scan.points.T, of_type, np.array(kinds), not self.remove_inside, is_beyond)
-        return is_beyond
+        x, y, z = scan.points.T
+        with np.errstate(over='ignore', invalid='ignore'):  # of points that are far or infinite
+            planar_sq = x * x + y * y
+            planar, distance = np.sqrt(planar_sq), np.sqrt(planar_sq + z * z)
+            has_phi, has_theta = planar > 0.0, distance > 0.0
+            beyond = [
+                has_phi & phi_beyond(x, y, planar, phi[0], below=False),
+                has_phi & phi_beyond(x, y, planar, phi[1], below=True),
+                has_theta & theta_beyond(z, distance, theta[0], below=False),
+                has_theta & theta_beyond(z, distance, theta[1], below=True),
+            ]
+        test = np.logical_or if self.remove_inside else np.logical_and
+        return np.asarray(test.reduce(beyond))
 
 
-def phi_kind(limit_deg: float, *, below: bool) -> int:
-    """Return the test by which phi, in (-180, 180] deg, is compared with a limit."""
+def phi_beyond(x: Array, y: Array, planar: Array, limit_deg: float, *, below: bool) -> Any:
+    """Return whether phi, in (-180, 180] deg, of points is above a limit, or below it."""
     if not -180.0 <= limit_deg <= 180.0:
-        return ALWAYS if (limit_deg > 180.0) == below else NEVER
-    return BOTH if (limit_deg >= 0.0) != below else EITHER
+        return (limit_deg > 180.0) == below
+    edge = planar * planar.dtype.type(cosine(limit_deg))
+    side = y < 0.0 if below else y >= 0.0
+    return side & (x < edge) if (limit_deg >= 0.0) != below else side | (x > edge)
 
 
-def theta_kind(limit_deg: float, *, below: bool) -> int:
-    """Return the test by which theta, in [0, 180] deg, is compared with a limit."""
+def theta_beyond(z: Array, distance: Array, limit_deg: float, *, below: bool) -> Any:
+    """Return whether theta, in [0, 180] deg, of points is above a limit, or below it."""
     if not 0.0 <= limit_deg <= 180.0:
-        return ALWAYS if (limit_deg > 180.0) == below else NEVER
-    return BOTH
+        return (limit_deg > 180.0) == below
+    edge = distance * distance.dtype.type(cosine(limit_deg))
+    return z > edge if below else z < edge
 
 
 def sine(angle_deg: float) -> float:
