@@ -274,7 +274,7 @@ def test_lost_large_clouds_are_reported_with_a_remedy(start, peer):
                 num_reports = len(reports)
             peer.spin_once()
 
-    publish_until(lambda: 'too_near' in node.output)  # losses count from the first that arrives
+    publish_until(lambda: 'too near' in node.output)  # losses count from the first that arrives
     with node.paused():  # a reader that takes nothing loses what shared memory cannot hold
         for _ in range(10):
             publisher.publish(cloud(next(stamps), large))
