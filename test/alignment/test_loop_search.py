@@ -13,6 +13,7 @@ from surfel_mapper.alignment.loop_search import key_numbers, LoopSearch
 from surfel_mapper.alignment.loops import Loop
 from surfel_mapper.alignment.recognition import Recognition
 from surfel_mapper.errors import DependencyError
+from test import extras
 from test.alignment.circuit import circuit, drifted, gap, SAME_WAY, THERE_AND_BACK
 from test.fields import config_of
 
@@ -25,6 +26,7 @@ def search(scans, poses, **changed):
     return LoopSearch(scans, poses, config.loops, config.registration, voxel_size_m)
 
 
+@extras.needs('map_closures')
 @pytest.mark.parametrize('half_deg', [180.0, 60.0], ids=['full turn', '120 deg'])
 def test_a_loop_in_the_same_direction_closes(half_deg):
     seen = circuit(SAME_WAY)
@@ -39,6 +41,7 @@ def test_a_loop_in_the_same_direction_closes(half_deg):
     np.testing.assert_array_equal(closure.T_map_sensor[0], before[0])
 
 
+@extras.needs('map_closures')
 def test_a_loop_with_the_heading_reversed_closes():
     seen = circuit(THERE_AND_BACK)
     before = drifted(seen.poses)
