@@ -179,6 +179,25 @@ def check_held(whole: ScanMoments, kept: ScanMoments) -> None:
         raise NotInMapError(f'voxel {voxel} does not hold the points of its window')
 
 
+def window_stamps_ns(path: str | Path) -> list[int]:
+    """
+    Return the stamps of the scans of the window in a file that save_map wrote.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is damaged, or of another kind.
+
+    """
+    arrays, attributes = load_state(path)
+    if attributes.get('kind') != KIND or 'scans.stamp_ns' not in arrays:
+        raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
+    with refusing(path):
+        _num_scans(arrays)
+    stamps: list[int] = arrays['scans.stamp_ns'].tolist()
+    return stamps
+
+
 @contextmanager
 def map_errors(path: str | Path) -> Iterator[None]:
     """Name a file in the errors of the map that is made of its content."""

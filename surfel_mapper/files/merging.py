@@ -10,6 +10,7 @@ from pathlib import Path
 
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files.latest_map import EXACT, map_in
+from surfel_mapper.files.map_state import window_stamps_ns
 from surfel_mapper.files.trajectory import read_trajectory, trajectory_beside
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
@@ -64,7 +65,10 @@ def warn_of_repeated_scans(sources: Sequence[Path]) -> None:
 
 
 def stamps_of_map(source: Path) -> set[int]:
-    """Return the stamps of a map's scans, ns, by the trajectory beside it; none without."""
+    """Return the stamps of a map's scans, ns: of the trajectory beside it, or of its window."""
     path = trajectory_beside(source)
-    stamps_ns = None if path is None else read_trajectory(path).stamp_ns
-    return set() if stamps_ns is None else set(stamps_ns.tolist())
+    if path is not None:
+        stamps_ns = read_trajectory(path).stamp_ns
+        return set() if stamps_ns is None else set(stamps_ns.tolist())
+    file = map_in(source, EXACT) or source
+    return set(window_stamps_ns(file)) if file.suffix == '.npz' and file.is_file() else set()
