@@ -35,7 +35,8 @@ TAIL_BYTES = 1 << 16
 
 def decoder(name: str, path: str | Path, extra: str) -> Any:
     """Return the module that reads a file, of an extra of this package; see library."""
-    return library(name, f'reads {Path(path).suffix}', f"'surfel_mapper[{extra}]'")
+    purpose = f'reads {Path(path).suffix} (.ply and .pcd need no package)'
+    return library(name, purpose, f"'surfel_mapper[{extra}]'")
 
 
 @contextmanager
